@@ -1,0 +1,223 @@
+"""The contract: what a policy sees, what it gives, and what stands behind it.
+
+A policy sees one :class:`Observation` and gives one :class:`Action`. Whether sensors, arms and clock behind them
+are simulated, mock, real or replayed shows nowhere in this file. NumPy only.
+
+Conventions (docs/architecture.md): SI units; right-handed frames; ``a_from_b`` maps coordinates in b to a.
+``world``: z up, origin on the lower gel's rest surface. ``sensor``: origin at the centre of the gel's rest surface,
+x along image columns, y along image rows, z out of the gel towards the object. Colours are RGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def _unit_quaternion() -> FloatArray:
+    return np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """A rigid transform ``a_from_b``: the origin and axes of b, written in a. Operations: :mod:`tacsim.pose`."""
+
+    position: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
+    quaternion: FloatArray = field(default_factory=_unit_quaternion)  # (4,) unit, x y z w
+
+    def __post_init__(self) -> None:
+        position = np.array(self.position, dtype=np.float64)
+        quaternion = np.array(self.quaternion, dtype=np.float64)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise ValueError(f"Pose.position must be 3 finite numbers [m], got {self.position!r}")
+        if quaternion.shape != (4,) or not np.isfinite(quaternion).all():
+            raise ValueError(f"Pose.quaternion must be 4 finite numbers (x, y, z, w), got {self.quaternion!r}")
+        norm = float(np.linalg.norm(quaternion))
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(f"Pose.quaternion must have unit length, got length {norm:.6g}")
+        quaternion = quaternion / norm
+        position.flags.writeable = False
+        quaternion.flags.writeable = False
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "quaternion", quaternion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceMap:
+    """What a source knows of its gel surface by itself (the simulator's fast path), on the canonical grid."""
+
+    height: NDArray[np.float32]  # (h, w) displacement into the gel, positive where pressed [m]
+    gradient: NDArray[np.float32]  # (h, w, 2) (d height/dx, d height/dy) [-]
+    flow: NDArray[np.float32] | None  # (m, n, 2) in-plane displacement at the marker lattice, sensor x, y [m]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TactileFrame:
+    """What any source delivers: the picture as the camera gave it."""
+
+    image: NDArray[np.uint8]  # (H, W, 3) RGB
+    time: float  # exposure time on the rig's monotonic clock [s]
+    index: int  # frame counter; a gap = dropped frames
+    surface: SurfaceMap | None = None  # only from sources that know it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TactileObservation:
+    """Canonical touch: what a policy sees, the same for every source. What a sensor does not deliver is None."""
+
+    image: NDArray[np.uint8]  # (H, W, 3) clip(128 + 128 (I - I0) / mean(I0)) over the canonical area
+    gradient: NDArray[np.float32] | None  # (h, w, 2) surface slope [-]
+    height: NDArray[np.float32] | None  # (h, w) into the gel, 0 at the contact-free rim [m]
+    contact: NDArray[np.bool_]  # (h, w)
+    valid: NDArray[np.bool_]  # (h, w) False where the sensor has no gel or no pixels
+    flow: NDArray[np.float32] | None  # (m, n, 2) tactile flow [m]
+    time: float  # exposure time [s]
+    age: float  # time of the observation minus time of exposure [s]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmState:
+    """One controller package of an arm. ``pose``, ``twist`` and ``wrench`` speak of one frame: the sensor that the arm
+    carries (the tool, if it carries none)."""
+
+    pose: Pose  # world_from_sensor
+    twist: FloatArray  # (6,) linear then angular velocity of the sensor, world axes [m/s, rad/s]
+    wrench: FloatArray  # (6,) what the object does to the sensor, about its origin, sensor axes [N, N m]
+    joints: FloatArray | None  # (n,) joint angles [rad]
+    time: float  # [s]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    tactile: Mapping[str, TactileObservation]  # by sensor name
+    arms: Mapping[str, ArmState]  # by arm name
+    time: float  # [s]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Action:
+    """Desired sensor pose in world at the end of the control period, by arm name; None (or absent) holds."""
+
+    tool: Mapping[str, Pose | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What only a simulation knows. Tasks may use it, policies never see it."""
+
+    height: float  # z-extent of the body, particle radius included [m]
+    position: FloatArray  # (3,) centre of mass, world [m]
+    points: NDArray[np.float32]  # (n, 3) body particles, world [m]
+    poses: Mapping[str, Pose]  # world_from_sensor
+
+
+@dataclass(frozen=True, slots=True)
+class SensorSpec:
+    """What one tactile source delivers."""
+
+    image_shape: tuple[int, int]  # rows, columns of the native frame
+    height: bool  # gradient and height are delivered
+    flow: bool  # tactile flow is delivered
+    arm: str | None  # the arm that carries it
+
+
+@dataclass(frozen=True, slots=True)
+class RigSpec:
+    """What a rig delivers."""
+
+    sensors: Mapping[str, SensorSpec]
+    arms: tuple[str, ...]
+    truth: bool
+    period: float  # control period [s]
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a task or policy asks of a rig."""
+
+    sensors: frozenset[str] = frozenset()
+    arms: frozenset[str] = frozenset()
+    height: bool = False
+    flow: bool = False
+    truth: bool = False
+
+    def missing(self, spec: RigSpec) -> list[str]:
+        """What `spec` does not deliver, each as a phrase for a person; empty when all is there."""
+        lacking = [f"sensor '{name}'" for name in sorted(self.sensors - set(spec.sensors))]
+        lacking += [f"arm '{name}'" for name in sorted(self.arms - set(spec.arms))]
+        for name, sensor in spec.sensors.items():
+            if self.height and not sensor.height:
+                lacking.append(f"surface height of sensor '{name}' (it has no photometric calibration)")
+            if self.flow and not sensor.flow:
+                lacking.append(f"tactile flow of sensor '{name}' (it has no markers)")
+        if self.truth and not spec.truth:
+            lacking.append("ground truth of the body (only simulation has it)")
+        return lacking
+
+
+class IncompatibleRig(ValueError):
+    """A task or policy needs what the rig does not deliver."""
+
+
+class EndOfEpisode(Exception):
+    """A replayed source has no further frame."""
+
+
+class TactileSource(Protocol):
+    """One tactile sensor: simulated, camera or recorded."""
+
+    @property
+    def spec(self) -> SensorSpec: ...
+    def read(self, timeout: float) -> TactileFrame:
+        """The newest frame. Raises TimeoutError after `timeout` [s], EndOfEpisode when a recording is over."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Arm(Protocol):
+    """One arm that carries a sensor: simulated, UR or recorded."""
+
+    def state(self) -> ArmState: ...
+    def command(self, target: Pose | None) -> Pose | None:
+        """Asks for `target` (None holds); returns what is really sent after the limits, None when nothing is executed."""
+        ...
+
+    def stop(self) -> None: ...
+    def recover(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class Clock(Protocol):
+    """The rig's one clock: simulation advances physics in `tick`, hardware sleeps to its deadline."""
+
+    @property
+    def period(self) -> float: ...
+    def now(self) -> float: ...
+    def tick(self) -> None: ...
+
+
+class Normaliser(Protocol):
+    """Native frame of one sensor -> canonical observation."""
+
+    def take_reference(self, frame: TactileFrame) -> None:
+        """Makes `frame`, taken without contact, the reference I0."""
+        ...
+
+    def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Observation in, action out."""
+
+    @property
+    def needs(self) -> Needs: ...
+    def reset(self) -> None: ...
+    def __call__(self, observation: Observation) -> Action: ...

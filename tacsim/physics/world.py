@@ -1,0 +1,76 @@
+"""What a simulated world is, whatever scheme moves it, and how one is made from a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import Pose, Truth
+from tacsim.scene import GelSurface, Scene
+
+
+@dataclass(frozen=True, slots=True)
+class MoveStats:
+    """How one quasi-static motion went."""
+
+    substeps: int  # explicit substeps of motion and hold together
+    hold: int  # of which hold
+    residual: float  # largest relative force imbalance or force change at the end [-]
+    settled: bool  # residual <= the scene's tolerance
+    overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
+    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped)
+
+
+class World(Protocol):
+    """Gels, and what they touch. Sensors are driven; everything else follows. SI units, world frame.
+
+    At construction the gels are undeformed and touch nothing: `lower` at the identity pose, `upper` half-turned about x
+    above the body with a clear gap, `indenter` (in a scene with one) clear of the gel.
+    """
+
+    @property
+    def sensors(self) -> tuple[str, ...]: ...
+    def pose(self, name: str) -> Pose:
+        """world_from_sensor (or world_from_indenter for "indenter")."""
+        ...
+
+    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+        """Drives the named frames to their targets along a ramped straight path, then holds until settled.
+
+        Raises SimulationDiverged (tacsim.physics.health) when no step size gives a finite state.
+        """
+        ...
+
+    def wrench(self, name: str) -> NDArray[np.float64]:
+        """(6,) what the object does to the sensor, about the sensor origin, sensor axes [N, N m]."""
+        ...
+
+    def surface(self, name: str) -> GelSurface: ...
+    def truth(self) -> Truth | None:
+        """None in a scene without a body."""
+        ...
+
+    def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        """A copy of the whole state, as named arrays."""
+        ...
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
+
+
+def make_world(scene: Scene) -> World:
+    """The world of a scene: `seed` (one shared MPM grid), a rigid press, or two gels round a body."""
+    if scene.physics == "seed":
+        from tacsim.physics.seed import SeedWorld
+
+        return SeedWorld(scene)
+    if scene.indenter is not None:
+        from tacsim.physics.press import PressWorld
+
+        return PressWorld(scene)
+    from tacsim.physics.hybrid import HybridWorld
+
+    return HybridWorld(scene)

@@ -1,0 +1,102 @@
+"""What a rig file may say: clock, scene, task, arms, sensors. No global type: each driver is chosen by itself."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from tacsim.optics.geometry import CanonicalGrid, SensorModel
+from tacsim.quantity import Facts, Force, Length, Time
+from tacsim.scene import Scene
+
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+class SimArmFacts(Facts):
+    """A sensor carrier of the simulation: goes exactly where it is told, at the scene's quasi-static speed."""
+
+    driver: Literal["sim"]
+
+
+class ReplayArmFacts(Facts):
+    """Arm states of a recording: an episode (.mcap), or a CSV file with a row a frame."""
+
+    driver: Literal["replay"]
+    source: str | None = None
+    force_column: str = "force_N"  # normal force, positive when pressed [N]
+    width_column: str | None = "gripper_width_m"  # opening of a parallel gripper [m]
+
+
+class SimSensorFacts(Facts):
+    driver: Literal["sim"]
+    arm: Name
+    model: SensorModel = SensorModel()
+
+
+class ReplaySensorFacts(Facts):
+    """Recorded frames: an episode (.mcap), a folder of images, or a video."""
+
+    driver: Literal["replay"]
+    source: str | None = None
+    arm: Name | None = None
+    fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # of a folder of images
+    corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
+    size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)
+    reference: str | None = None  # picture without contact; None: the first frame
+
+    # corners: gel corners in the image [px], top left, top right, bottom right, bottom left; None: the whole image.
+    # size: width and height of the gel between those corners [m].
+
+
+ArmFacts = Annotated[SimArmFacts | ReplayArmFacts, Field(discriminator="driver")]
+SensorFacts = Annotated[SimSensorFacts | ReplaySensorFacts, Field(discriminator="driver")]
+
+
+class SqueezeFacts(Facts):
+    """Squeeze the body to a height: distance = |height - goal|; actions move both sensors along world z."""
+
+    kind: Literal["squeeze"]
+    scene: Scene = Scene()
+    goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3  # largest motion of one sensor in a control step [m]
+    touch_force: Annotated[Force, Field(gt=0)] = 0.05  # reset approaches until this [N]
+    success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
+    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3  # reward = -distance / reward_scale
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
+
+
+class RepositionFacts(Facts):
+    """Move the body in the plane: distance = |position - goal|_2; actions move the upper sensor in world x, y."""
+
+    kind: Literal["reposition"]
+    scene: Scene = Scene()
+    goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
+    touch_force: Annotated[Force, Field(gt=0)] = 0.3
+    success: Annotated[Length, Field(gt=0)] = 0.1e-3
+    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40
+
+
+TaskFacts = Annotated[SqueezeFacts | RepositionFacts, Field(discriminator="kind")]
+
+
+class RigFacts(Facts):
+    """One rig file."""
+
+    name: str
+    clock: Literal["sim", "replay"]
+    period: Annotated[Time, Field(gt=0)] = 0.1  # control period [s]
+    task: TaskFacts | None = None
+    scene: Scene | None = None  # overrides the task's scene
+    arms: dict[Name, ArmFacts] = {}
+    sensors: dict[Name, SensorFacts] = Field(min_length=1)
+    canonical: CanonicalGrid = CanonicalGrid()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for name, sensor in self.sensors.items():
+            if sensor.arm is not None and sensor.arm not in self.arms:
+                raise ValueError(f"sensors.{name}.arm: no arm '{sensor.arm}'; arms are {', '.join(self.arms) or '(none)'}")
+        return self

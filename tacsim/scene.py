@@ -1,0 +1,173 @@
+"""Facts of a simulated scene: gels, body, indenter, friction, accuracy; and numbers derived from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from tacsim.quantity import Angle, Facts, Length, Pressure
+
+Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
+PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
+
+# particle spacing and gel element size [m] of each preset
+PRESETS = {"draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3)}
+
+
+class GelMaterial(Facts):
+    """Elastic gel (neo-Hookean)."""
+
+    youngs_modulus: Annotated[Pressure, Field(gt=0)] = 0.145e6
+    poisson_ratio: PoissonRatio = 0.48
+    source: str = ""
+
+
+class BodyMaterial(Facts):
+    """Elastoplastic body: Hencky elasticity, von Mises yield. Give the yield as a stress or as the seed's strain k; neither = elastic."""
+
+    youngs_modulus: Annotated[Pressure, Field(gt=0)] = 0.5e6
+    poisson_ratio: PoissonRatio = 0.45
+    yield_stress: Annotated[Pressure, Field(gt=0)] | None = None
+    yield_norm: Literal["uniaxial", "frobenius"] = "uniaxial"
+    yield_strain: Annotated[float, Field(gt=0, lt=1)] | None = None  # k = sigma_y / (2 mu), Frobenius norm
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _one_yield(self) -> Self:
+        if self.yield_stress is not None and self.yield_strain is not None:
+            raise ValueError("give yield_stress or yield_strain, not both")
+        return self
+
+    @property
+    def elastic_limit(self) -> float:
+        """Largest Frobenius norm of the deviatoric Hencky strain, k [-]; infinite for an elastic body.
+
+        The return mapping bounds |dev tau|_F = 2 mu k; in uniaxial stress |dev tau|_F = sqrt(2/3) sigma.
+        """
+        if self.yield_strain is not None:
+            return self.yield_strain
+        if self.yield_stress is None:
+            return math.inf
+        mu, _ = lame(self)
+        frobenius = self.yield_stress * (math.sqrt(2.0 / 3.0) if self.yield_norm == "uniaxial" else 1.0)
+        return frobenius / (2.0 * mu)
+
+
+def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
+    """Lamé constants (mu, lambda) [Pa]."""
+    modulus, nu = material.youngs_modulus, material.poisson_ratio
+    return modulus / (2 * (1 + nu)), modulus * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+class Gel(Facts):
+    """One elastic gel pad, bonded to its backing; the housing is a rigid plane round it, `housing` below its surface."""
+
+    size: Size3 = (20e-3, 20e-3, 4e-3)  # x, y, thickness [m]
+    material: GelMaterial = GelMaterial()
+    housing: Annotated[Length, Field(ge=0)] | None = 0.3e-3  # None: no housing
+
+
+class Box(Facts):
+    shape: Literal["box"] = "box"
+    size: Size3 = (10e-3, 10e-3, 10e-3)  # [m]
+
+
+class Sphere(Facts):
+    shape: Literal["sphere"] = "sphere"
+    radius: Annotated[Length, Field(gt=0)] = 5e-3  # [m]
+
+
+class Cylinder(Facts):
+    """Upright cylinder: axis along z."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    radius: Annotated[Length, Field(gt=0)] = 5e-3  # [m]
+    height: Annotated[Length, Field(gt=0)] = 10e-3  # [m]
+
+
+class Mesh(Facts):
+    """Closed triangle mesh (STL, in millimetres unless `scale` says otherwise)."""
+
+    shape: Literal["stl"] = "stl"
+    path: str
+    scale: Annotated[float, Field(gt=0)] = 1e-3  # [m per file unit]
+
+
+Shape = Annotated[Box | Sphere | Cylinder | Mesh, Field(discriminator="shape")]
+
+
+class Body(Facts):
+    """The plasticine between the sensors."""
+
+    geometry: Shape = Box()
+    material: BodyMaterial = BodyMaterial()
+
+
+class Indenter(Facts):
+    """A rigid body pressed on one gel; no particles are needed for it."""
+
+    geometry: Shape = Sphere(radius=4e-3)
+    friction: Annotated[float, Field(ge=0, le=5)] = 0.6
+    yaw: Angle = 0.0
+
+
+class Settling(Facts):
+    """The quasi-static controller: how fast motion is driven and when a state counts as settled."""
+
+    mach: Annotated[float, Field(gt=0, le=0.3)] = 0.05  # peak speed of driven motion / wave speed
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance and change of force per check, relative
+    max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
+
+
+class Scene(Facts):
+    """What is simulated. Either a `body` between two gels, or a rigid `indenter` on the lower gel alone."""
+
+    name: str = "scene"
+    physics: Literal["hybrid", "seed"] = "hybrid"
+    preset: Literal["draft", "standard"] = "draft"
+    particle_spacing: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
+    element_size: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
+    gel: Gel = Gel()
+    body: Body | None = Body()
+    indenter: Indenter | None = None
+    friction: dict[Literal["lower", "upper"], Annotated[float, Field(ge=0, le=5)]] = {"lower": 0.6, "upper": 0.6}
+    settling: Settling = Settling()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.body is None) == (self.indenter is None):
+            raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
+        if self.physics == "seed" and self.indenter is not None:
+            raise ValueError("physics 'seed' has no rigid indenter; use physics 'hybrid'")
+        return self
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        return ("lower", "upper") if self.indenter is None else ("lower",)
+
+    @property
+    def spacing(self) -> float:
+        """Particle spacing h_p [m]; the grid spacing is twice as large."""
+        return PRESETS[self.preset][0] if self.particle_spacing is None else self.particle_spacing
+
+    @property
+    def element(self) -> float:
+        """Edge of a gel element h_g [m]."""
+        return PRESETS[self.preset][1] if self.element_size is None else self.element_size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GelSurface:
+    """Displacement of a gel's top surface at the nodes of its own lattice, in the sensor frame.
+
+    Between nodes the surface is the C1 quadratic B-spline with these control values (contact and renderer use the same).
+    """
+
+    displacement: NDArray[np.float32]  # (nx, ny, 3) [m]; x grows with the first index, y with the second
+    spacing: float  # [m]
+    origin: tuple[float, float]  # x, y of node (0, 0) at rest, sensor frame [m]

@@ -41,7 +41,8 @@ class Pose:
         norm = float(np.linalg.norm(quaternion))
         if abs(norm - 1.0) > 1e-3:
             raise ValueError(f"Pose.quaternion must have unit length, got length {norm:.6g}")
-        quaternion = quaternion / norm
+        if abs(norm - 1.0) > 1e-15:  # else keep the bits: a recorded pose reads back unchanged
+            quaternion = quaternion / norm
         position.flags.writeable = False
         quaternion.flags.writeable = False
         object.__setattr__(self, "position", position)

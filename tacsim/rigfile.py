@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
 from tacsim.quantity import Facts, Force, Length, Time
@@ -98,5 +99,10 @@ class RigFacts(Facts):
     def _consistent(self) -> Self:
         for name, sensor in self.sensors.items():
             if sensor.arm is not None and sensor.arm not in self.arms:
-                raise ValueError(f"sensors.{name}.arm: no arm '{sensor.arm}'; arms are {', '.join(self.arms) or '(none)'}")
+                raise PydanticCustomError(
+                    "no_such_arm",
+                    "no arm '{arm}'; allowed: {arms}",
+                    # `at`: the entry to blame, below this model (tacsim.config shows its line)
+                    {"arm": sensor.arm, "arms": ", ".join(self.arms) or "(none)", "at": ("sensors", name, "arm")},
+                )
         return self

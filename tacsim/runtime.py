@@ -3,6 +3,8 @@
 A second ``ti.init`` in one process crashes it, and fork after a start hangs: hence one owner, and spawn for workers.
 """
 
+import contextlib
+import io
 import os
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
@@ -18,7 +20,9 @@ def start(arch: str = "cpu", threads: int | None = None) -> str:
     global _started
     if _started is None:
         options = {} if threads is None else {"cpu_max_num_threads": threads}
-        ti.init(arch=getattr(ti, arch), default_fp=ti.f32, offline_cache=True, log_level=ti.ERROR, **options)
+        # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
+        with contextlib.redirect_stdout(io.StringIO()):
+            ti.init(arch=getattr(ti, arch), default_fp=ti.f32, offline_cache=True, log_level=ti.ERROR, **options)
         _started = arch
     elif _started != arch:
         raise RuntimeError(f"Taichi already runs on '{_started}' in this process; start another process for '{arch}'")

@@ -144,6 +144,9 @@ class Scene(Facts):
             raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
         if self.physics == "seed" and self.indenter is not None:
             raise ValueError("physics 'seed' has no rigid indenter; use physics 'hybrid'")
+        missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
+        if missing:
+            raise ValueError(f"friction of the surface '{missing[0]}' is missing; give both lower and upper")
         return self
 
     @property

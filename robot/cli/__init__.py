@@ -1,0 +1,52 @@
+"""The `tacsim` command. One file a group of commands; what is heavy is imported inside the commands."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from robot.cli.errors import Guarded
+from robot.cli.look import doctor, schema
+from robot.cli.run import replay, run
+from robot.cli.simulate import press, reproduce
+
+app = typer.Typer(
+    name="tacsim",
+    cls=Guarded,
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Example: [bold]tacsim run --task squeeze --out runs/first[/]   "
+    "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
+)
+for command in (run, press, reproduce, replay, schema, doctor):
+    # typer takes the first line of help from the docstring, and the example from the epilog
+    text, _, example = (command.__doc__ or "").partition("Example:")
+    app.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib import metadata
+
+        try:
+            typer.echo(f"tacsim {metadata.version('tacsim')}")
+        except metadata.PackageNotFoundError:
+            typer.echo("tacsim, not installed (run from its sources)")
+        raise typer.Exit
+
+
+@app.callback()
+def tacsim(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """A sim-to-real bridge for robots that feel with optical tactile sensors: simulate, observe, act, record, replay."""
+
+
+def main() -> None:
+    """Entry point of the `tacsim` command."""
+    app()

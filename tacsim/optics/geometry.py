@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from tacsim.quantity import Facts, Length
 
 Channel = Annotated[float, Field(ge=0, le=4)]
 Rgb = tuple[Channel, Channel, Channel]
+
+
+def _colour_or_picture(value: Any) -> str:
+    return "picture" if isinstance(value, str) else "colour"
+
+
+Background = Annotated[
+    Annotated[Rgb, Tag("colour")] | Annotated[str, Tag("picture")], Discriminator(_colour_or_picture)
+]
 
 
 class SensorGeometry(Facts):
@@ -30,7 +39,7 @@ class SensorGeometry(Facts):
 
 
 class Light(Facts):
-    """One directional light."""
+    """One directional light. Lights stand behind the gel like the camera: z, which points out of the gel, is not positive."""
 
     direction: tuple[float, float, float]  # from the surface towards the light, sensor axes, any length
     colour: Rgb
@@ -41,16 +50,36 @@ class Light(Facts):
     def _has_direction(self) -> Self:
         if sum(c * c for c in self.direction) < 1e-12:
             raise ValueError("direction must not be zero")
+        if self.direction[2] > 0:
+            raise ValueError(f"direction z is {self.direction[2]:g}, but lights stand behind the gel, where z is negative")
         return self
 
 
-class Lighting(Facts):
-    """Phong illumination: ambient + sum over lights of diffuse and specular parts (Gomes et al. 2021, as the seed uses)."""
+# Three lights a third of a turn apart, 24 degrees above the gel's plane: red from the right, green from the lower left,
+# blue from the upper left of the image.
+THREE_LIGHTS = (
+    Light(direction=(1.0, 0.0, -0.45), colour=(1.0, 0.10, 0.08)),
+    Light(direction=(-0.5, 0.87, -0.45), colour=(0.08, 1.0, 0.12)),
+    Light(direction=(-0.5, -0.87, -0.45), colour=(0.10, 0.12, 1.0)),
+)
 
-    lights: tuple[Light, ...] = Field(default=(), max_length=64)
-    ambient: Channel = 0.0
+
+class Lighting(Facts):
+    """Phong illumination: ambient + sum over lights of diffuse and specular parts (Gomes et al. 2021, as the seed uses).
+
+    With a background the picture is background + shade(n) - shade(flat gel); without one it is ambient + shade(n).
+    """
+
+    lights: tuple[Light, ...] = Field(default=THREE_LIGHTS, max_length=64)
+    ambient: Channel = 0.0  # grey level of unlit gel; only without a background
     shininess: Annotated[float, Field(ge=1, le=1000)] = 10.0
-    background: Rgb | str = (0.42, 0.44, 0.46)  # colour of the untouched gel, or the path of a picture
+    background: Background | None = (0.42, 0.44, 0.46)  # colour of the untouched gel, or the path of a picture
+
+    @model_validator(mode="after")
+    def _one_base(self) -> Self:
+        if self.ambient > 0 and self.background is not None:
+            raise ValueError("ambient has no effect beside a background; set background to null, or ambient to 0")
+        return self
 
 
 class Markers(Facts):

@@ -8,9 +8,13 @@ from dataclasses import dataclass, field
 from tacsim.interface import Action, ArmState, Pose, RigSpec, TactileFrame
 
 
+class EpisodeError(ValueError):
+    """A file is no episode, or what it holds is damaged or beyond the limits."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One control step: the action, and what the rig delivered after it. Step 0 is the state after reset, without action."""
+    """One control step: the action, and what the rig delivered after it. Step 0 follows reset and has no action."""
 
     index: int
     time: float  # of the observation, rig clock [s]

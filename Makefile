@@ -1,0 +1,78 @@
+# `make run` and `make test` do all the set-up: virtual environment, installation, then the work.
+# Both take PYTHON=python3.12; ARGS goes to the command: make run ARGS="--task reposition".
+
+PYTHON ?= python3
+PYTHONS ?= python3.11 python3.12 python3.13
+ARGS ?=
+
+BIN := .venv/bin
+VERSION := $(shell $(PYTHON) -c 'import sys; print("%d%d" % sys.version_info[:2])' 2>/dev/null)
+CONSTRAINTS := constraints/py$(VERSION).txt
+INSTALL := $(BIN)/python -m pip install -qq --no-input --disable-pip-version-check -c $(CONSTRAINTS)
+# One stamp a Python version: another PYTHON, or a changed pyproject or constraints file, installs anew.
+CORE := .venv/installed-core-$(VERSION)
+DEV := .venv/installed-dev-$(VERSION)
+
+.DEFAULT_GOAL := help
+.PHONY: help run test check test-all test-extras lock clean python
+# Two installations into one environment must not run at once.
+.NOTPARALLEL:
+
+help:
+	@echo "make run          install, then squeeze plasticine between two tactile sensors   (ARGS=\"--task reposition\")"
+	@echo "make test         install with dev extras, then lint, types, import contract, tests   (ARGS=\"-k rig\")"
+	@echo "make check        the same without the tests"
+	@echo "make test-all     make test, then the long runs"
+	@echo "make test-extras  tests that need heavy extras"
+	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
+	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
+	@echo "Choose a Python with PYTHON=python3.12 (3.11, 3.12 or 3.13; default: python3)."
+
+run: $(CORE)
+	@$(BIN)/tacsim run $(ARGS)
+
+check: $(DEV)
+	@$(BIN)/ruff check -q .
+	@$(BIN)/ruff format -q --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-logo
+
+test: check
+	@$(BIN)/python -m pytest -q $(ARGS)
+
+test-all: test
+	@$(BIN)/python -m pytest -q -m slow $(ARGS)
+
+test-extras:
+	@echo "No heavy extras yet: nothing to test."
+
+lock:
+	@for each in $(PYTHONS); do \
+	  if $$each -c 'import pip' >/dev/null 2>&1; then $$each constraints/lock.py || exit 1; \
+	  else echo "$$each: not found (or without pip), its constraints stay as they are"; fi; \
+	done
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist
+
+# Stands before each installation: a clear word about the Python, and an environment made by that Python.
+python:
+	@test -n "$(VERSION)" || { echo "make: cannot run '$(PYTHON)'. Install Python 3.11 to 3.13, or name one: make PYTHON=python3.12"; exit 1; }
+	@case "$(VERSION)" in 311|312|313) ;; *) \
+	  echo "make: tacsim needs Python 3.11, 3.12 or 3.13, but '$(PYTHON)' is $$($(PYTHON) -V 2>&1). Name another: make PYTHON=python3.12"; exit 1;; esac
+	@test "$$($(BIN)/python -c 'import sys; print("%d%d" % sys.version_info[:2])' 2>/dev/null)" = "$(VERSION)" || { \
+	  echo "Making a virtual environment in .venv ($$($(PYTHON) -V))"; rm -rf .venv; $(PYTHON) -m venv .venv; }
+
+$(CORE): pyproject.toml $(CONSTRAINTS) | python
+	@echo "Installing tacsim into .venv (a few minutes the first time)"
+	@$(INSTALL) -e .
+	@touch $@
+
+$(DEV): pyproject.toml $(CONSTRAINTS) | python
+	@echo "Installing tacsim and its development tools into .venv (a few minutes the first time)"
+	@$(INSTALL) -e '.[dev]'
+	@touch $@ $(CORE)
+
+# Only reached when this Python has no constraints file; `python` says why.
+constraints/py%.txt: | python
+	@echo "make: $@ is missing; make lock writes it" && exit 1

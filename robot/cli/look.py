@@ -1,0 +1,60 @@
+"""`tacsim schema` and `tacsim doctor`: what may be said, and what the machine is like."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from robot import doctor as machine
+
+MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
+
+
+def schema(
+    kind: Annotated[str, typer.Argument(help="What the file describes, for example rig or scene.")] = "rig",
+) -> None:
+    """Print the JSON schema of a configuration file; editors complete and check YAML with it.
+
+    Example: tacsim schema rig > rig.schema.json
+    """
+    import json
+
+    from tacsim.config import json_schema
+
+    typer.echo(json.dumps(json_schema(kind), indent=2))
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Check Python, packages, OpenCV, Taichi and the machine; exit code 1 if something must be mended.
+
+    Example: tacsim doctor --json
+    """
+    import json
+
+    from robot import doctor as machine
+
+    checks = machine.examine()
+    report = machine.as_json(checks)
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+    else:
+        _print_checks(checks)
+    raise typer.Exit(0 if report["ok"] else 1)
+
+
+def _print_checks(checks: list[machine.Check]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for check in checks:
+        words = Text(check.found)
+        if check.advice:
+            words.append(f"\n→ {check.advice}", style="italic")
+        table.add_row(MARKS[check.state], check.name, words)
+    Console().print(table)

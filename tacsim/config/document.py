@@ -1,0 +1,295 @@
+"""YAML text -> a tree of nodes that know where they were written. Nothing is executed, sizes are checked first.
+
+A careful subset of YAML: numbers, booleans and null as in YAML 1.2 (so ``1e5`` is a number, ``no`` and ``12:30`` are
+texts); no anchors, aliases, merge keys, tags or duplicate keys; at most 1 MB, 32 levels and 50,000 values.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import stat
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+
+from tacsim.config.errors import ConfigError, Place, Problem
+
+MAX_BYTES = 1_000_000
+MAX_DEPTH = 32
+MAX_NODES = 50_000  # of one load, referenced files included
+_MAX_DIGITS = 64  # of a whole number
+
+_FLOAT = re.compile(
+    r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$|[-+]?\.(?:inf|Inf|INF)$|\.(?:nan|NaN|NAN)$"
+)
+_RESOLVERS = (  # tag, pattern, first characters: the core schema of YAML 1.2
+    ("bool", re.compile(r"(?:true|True|TRUE|false|False|FALSE)$"), "tTfF"),
+    ("null", re.compile(r"(?:null|Null|NULL|~|)$"), ["n", "N", "~", ""]),
+    ("int", re.compile(r"[-+]?[0-9]+$"), "-+0123456789"),
+    ("float", _FLOAT, "-+.0123456789"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A value of a configuration file, and where it comes from."""
+
+    value: bool | int | float | str | dict[str, Node] | list[Node] | None
+    place: Place  # of the key, if it has one
+    folder: Path  # relative references written here start from this folder
+    text: str = ""  # a scalar as it was written
+    broken: bool = False  # a problem of this node is already reported; say nothing more about it
+
+    @property
+    def items(self) -> dict[str, Node]:
+        """The entries of a mapping; empty for anything else."""
+        return self.value if isinstance(self.value, dict) else {}
+
+    @property
+    def is_empty(self) -> bool:
+        return self.value is None and not self.broken
+
+
+@dataclass(slots=True)
+class Reading:
+    """What one load has met so far."""
+
+    problems: list[Problem] = field(default_factory=list)
+    sources: list[Path] = field(default_factory=list)
+    nodes: int = 0
+
+    def report(self, place: Place, key: str, text: str) -> None:
+        self.problems.append(Problem(place, key, text))
+
+    def raise_problems(self) -> None:
+        """Raises ConfigError when there is any problem."""
+        if self.problems:
+            raise ConfigError(self.problems)
+
+
+class _Refused(yaml.MarkedYAMLError):
+    """Valid YAML that a configuration must not use."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Composes nodes within the limits; raises _Refused with the place of what is not allowed."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # type: ignore[misc]  # PyYAML declares none, but has one
+
+    def __init__(self, text: str, room: int) -> None:
+        super().__init__(text)
+        self.room = room
+        self.depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event = self.peek_event()  # type: ignore[no-untyped-call]
+        self.room -= 1
+        self.depth += 1
+        fault = None
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+            fault = "anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name"
+        elif getattr(event, "tag", None) is not None:
+            fault = f"tags are not allowed ({event.tag}); leave it out"
+        elif self.depth > MAX_DEPTH:
+            fault = f"nested too deeply; at most {MAX_DEPTH} levels are allowed"
+        elif self.room < 0:
+            fault = f"too many values; at most {MAX_NODES} are allowed, referenced files included"
+        if fault is not None:
+            raise _Refused(problem=fault, problem_mark=event.start_mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes plainly, and quotes every text that _Loader would read as a number."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+for _tag, _pattern, _first in _RESOLVERS:
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, list(_first))
+    _Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, list(_first))
+
+
+def dump(data: Any) -> str:
+    """Plain data (mappings, lists, scalars) as YAML that :func:`parse_text` reads back to the same."""
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return text
+
+
+def read_text(path: Path, refuse: Callable[[str], None], reading: Reading) -> str | None:
+    """The text of a file, checked before and while reading; None after a reported problem.
+
+    `refuse` reports what is wrong with the file as such, at the place that refers to it.
+    """
+    try:
+        mode = path.stat()
+        if stat.S_ISDIR(mode.st_mode):
+            raise _Unreadable("is a folder; give a YAML file")
+        if not stat.S_ISREG(mode.st_mode):
+            raise _Unreadable("is no regular file; give a YAML file")
+        if mode.st_size > MAX_BYTES:
+            raise _Unreadable(f"has {mode.st_size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:.0f} MB is allowed")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise _Unreadable(f"grew over {MAX_BYTES / 1e6:.0f} MB while it was read")
+        reading.sources.append(path)
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        what = f"byte 0x{content[error.start]:02x} is not UTF-8; save the file as UTF-8 text"
+        reading.report(Place(shown(path), line), "", what)
+    except _Unreadable as error:
+        refuse(f"'{shown(path)}' {error}")
+    except FileNotFoundError:
+        refuse(f"there is no file '{shown(path)}'")
+    except (OSError, ValueError) as error:
+        what = getattr(error, "strerror", None) or str(error)
+        refuse(f"cannot read '{shown(path)}': {what}")
+    return None
+
+
+class _Unreadable(Exception):
+    """Why a file is not opened at all."""
+
+
+def shown(path: Path) -> str:
+    """`path` as a person would write it: relative to the current folder where it lies below it."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return str(path)
+
+
+def parse_text(text: str, source: str, folder: Path, reading: Reading, place: Place | None = None) -> Node:
+    """The tree of a YAML text. Problems go to `reading`; what cannot be read becomes a broken node.
+
+    `place`: said of everything in the text (an override); without it each node has its own line in `source`.
+    """
+    start = place or Place(source, 1)
+    broken = Node(None, start, folder, broken=True)
+    loader = None
+    try:
+        loader = _Loader(text, MAX_NODES - reading.nodes)
+        root = loader.get_single_node()
+    except yaml.reader.ReaderError as error:
+        character = text[error.position : error.position + 1]
+        what = f"not valid YAML: the character {character!a} is not allowed"
+        reading.report(place or Place(source, text.count("\n", 0, error.position) + 1), "", what)
+        return broken
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        what = error.problem or error.context or "cannot be read"
+        if not isinstance(error, _Refused):
+            what = "not valid YAML: " + ", ".join(part for part in (error.context, error.problem) if part)
+        reading.report(place or Place(source, mark.line + 1 if mark else 1), "", what)
+        return broken
+    except (ValueError, OverflowError) as error:  # PyYAML's own, for \U escapes and %YAML versions that are too large
+        line = loader.line + 1 if loader is not None else 1
+        reading.report(place or Place(source, line), "", f"not valid YAML: {error}")
+        return broken
+    finally:
+        if loader is not None:
+            reading.nodes = MAX_NODES - loader.room
+            loader.dispose()
+    if root is None:
+        return Node(None, start, folder)
+    return _convert(root, _Origin(source, folder, place, reading), (), None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Origin:
+    source: str
+    folder: Path
+    place: Place | None
+    reading: Reading
+
+    def at(self, node: yaml.Node) -> Place:
+        return self.place or Place(self.source, node.start_mark.line + 1)
+
+
+def _convert(node: yaml.Node, origin: _Origin, path: tuple[str, ...], key_place: Place | None) -> Node:
+    place = key_place or origin.at(node)
+    if isinstance(node, yaml.MappingNode):
+        entries = {key: _convert(child, origin, (*path, key), at) for key, child, at in _entries(node, origin, path)}
+        return Node(entries, place, origin.folder)
+    if isinstance(node, yaml.SequenceNode):
+        items = [_convert(child, origin, (*path, str(i)), None) for i, child in enumerate(node.value)]
+        return Node(items, place, origin.folder)
+    text = str(node.value)
+    value, fault = _scalar(node.tag.rpartition(":")[2], text)
+    if fault:
+        origin.reading.report(place, ".".join(path), fault)
+    return Node(None if fault else value, place, origin.folder, text=text, broken=bool(fault))
+
+
+def _entries(node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]) -> Iterator[tuple[str, yaml.Node, Place]]:
+    """Key, value and place of each entry that can be used; the others are reported."""
+    first: dict[str, Place] = {}
+    for key_node, child in node.value:
+        place = origin.at(key_node)
+        if not isinstance(key_node, yaml.ScalarNode):
+            origin.reading.report(place, ".".join(path), "a key must be a plain text, not a list or a mapping")
+            continue
+        key = str(key_node.value)
+        dotted = ".".join((*path, key))
+        if key == "<<":
+            origin.reading.report(place, dotted, "merge keys are not allowed; use 'extends: NAME' instead")
+        elif _scalar("str", key)[1]:
+            origin.reading.report(place, ".".join(path), f"the key {key!a} is no Unicode text")
+        elif key in first:
+            origin.reading.report(place, dotted, f"the key is there twice, first at {first[key]}; keep one")
+        else:
+            first[key] = place
+            yield key, child, place
+
+
+def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
+    """Value of a scalar, and what is wrong with it (empty: nothing)."""
+    if tag == "null":
+        return None, ""
+    if tag == "bool":
+        return text.lower() == "true", ""
+    if tag == "int" and len(text) <= _MAX_DIGITS:
+        return int(text), ""
+    if tag in ("int", "float"):
+        number = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+        return number, "" if math.isfinite(number) else f"{text} is not finite; give a finite number"
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return None, f"{text!a} is no Unicode text (it holds half of a surrogate pair)"
+    return text, ""
+
+
+def as_json(node: Node) -> str:
+    """The tree as JSON. Whole floats become integers: ``1e5`` is as good a count as ``100000``."""
+    return json.dumps(_plain(node))
+
+
+def _plain(node: Node) -> Any:
+    value = node.value
+    if isinstance(value, dict):
+        return {key: _plain(child) for key, child in value.items()}
+    if isinstance(value, list):
+        return [_plain(child) for child in value]
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    return value
+
+
+def from_plain(data: Any, place: Place, folder: Path) -> Node:
+    """A tree of plain data (a model's defaults) that counts as written at `place`."""
+    if isinstance(data, dict):
+        return Node({str(key): from_plain(value, place, folder) for key, value in data.items()}, place, folder)
+    if isinstance(data, list):
+        return Node([from_plain(value, place, folder) for value in data], place, folder)
+    return Node(data, place, folder, text=str(data))

@@ -1,0 +1,63 @@
+"""What is wrong with a configuration, and where. All problems are collected, then raised as one ConfigError."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+_SHOWN = 30  # a broken file can have thousands of problems; the first ones tell
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where something was written: a line of a file, or the command line (``--set key=value``, which has no line)."""
+
+    source: str
+    line: int | None = None
+
+    def __str__(self) -> str:
+        return self.source if self.line is None else f"{self.source}:{self.line}"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong, at `place`, in the value with the dotted `key` (empty: the whole file)."""
+
+    place: Place
+    key: str
+    text: str
+
+    def __str__(self) -> str:
+        return printable(": ".join(part for part in (str(self.place), self.key, self.text) if part))
+
+
+class ConfigError(ValueError):
+    """The configuration cannot be used. ``str(error)`` is all to print: lines ``file:line: key: what``."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        sources = list(dict.fromkeys(problem.place.source for problem in problems))
+        self.problems = tuple(
+            sorted(dict.fromkeys(problems), key=lambda p: (sources.index(p.place.source), p.place.line or 0))
+        )
+        lines = [str(problem) for problem in self.problems[:_SHOWN]]
+        if len(self.problems) > _SHOWN:
+            lines.append(f"... and {len(self.problems) - _SHOWN} more problems")
+        super().__init__("\n".join(lines))
+
+
+def printable(text: str, limit: int = 600) -> str:
+    """`text` safe for any terminal: one line, control characters escaped, the middle of a very long one left out."""
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    if len(text) <= limit:
+        return text
+    return f"{text[: limit // 2]} ... {text[-limit // 2 :]}"
+
+
+def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+    """ "; did you mean 'x'?" when one of `allowed` is close to `word`, else an empty text."""
+    if len(word) > 100:  # comparing takes quadratic time, and nothing allowed is that long
+        return ""
+    by_lower = {name.lower(): name for name in allowed}
+    close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
+    return f"; did you mean '{by_lower[close[0]]}'?" if close else ""

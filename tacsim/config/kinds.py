@@ -1,0 +1,104 @@
+"""The kinds of configuration files, the folder where they live, and how a name becomes a path."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from tacsim.config.errors import did_you_mean
+from tacsim.optics.geometry import SensorModel
+from tacsim.rigfile import RepositionFacts, RigFacts, SqueezeFacts, TaskFacts
+from tacsim.scene import BodyMaterial, GelMaterial, Scene
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of file: ``configs/<folder>/<name>.yaml`` holds one of `models`."""
+
+    name: str
+    folder: str
+    models: tuple[type[BaseModel], ...]
+    annotation: Any
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind("rig", "rigs", (RigFacts,), RigFacts),
+        Kind("task", "tasks", (SqueezeFacts, RepositionFacts), TaskFacts),
+        Kind("scene", "scenes", (Scene,), Scene),
+        Kind("sensor", "sensors", (SensorModel,), SensorModel),
+        Kind("material", "materials", (GelMaterial, BodyMaterial), GelMaterial | BodyMaterial),
+    )
+}
+
+
+class NotFound(ValueError):
+    """A reference that leads to no file; the text says why, and what there is instead."""
+
+
+@cache
+def config_root() -> Path:
+    """The folder of the shipped configuration: inside an installed package, or ``configs/`` of a checkout.
+
+    Raises FileNotFoundError when there is neither (a broken installation).
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "_configs", package.parent / "configs"):
+        if (folder / "rigs").is_dir():
+            return folder
+    raise FileNotFoundError(f"no configuration at {package / '_configs'}; install tacsim again")
+
+
+def names(kind: str) -> list[str]:
+    """Sorted names of the shipped files of a kind: rig, task, scene, sensor, material. Raises KeyError on another."""
+    return sorted(path.stem for path in (config_root() / KINDS[kind].folder).glob("*.yaml"))
+
+
+def kind_of(models: Sequence[type[BaseModel]]) -> Kind | None:
+    """The kind of file that may stand for one of `models` by its name."""
+    for kind in KINDS.values():
+        if models and set(models) <= set(kind.models):
+            return kind
+    return None
+
+
+def is_name(text: str) -> bool:
+    return _NAME.fullmatch(text) is not None
+
+
+def named(kind: Kind, name: str) -> Path:
+    """The shipped file of that name. Raises NotFound."""
+    path = config_root() / kind.folder / f"{name}.yaml"
+    if path.is_file():
+        return path
+    known = names(kind.name)
+    raise NotFound(f"no {kind.name} '{name}'; allowed: {', '.join(known) or '(none)'}{did_you_mean(name, known)}")
+
+
+def referred(kind: Kind, reference: str, folder: Path) -> Path:
+    """The file that `reference`, written in a file of `folder`, means. Raises NotFound.
+
+    A name is a shipped file of that kind; a path ends in .yaml and leads below `folder` or below the shipped
+    configuration, symbolic links followed.
+    """
+    if is_name(reference):
+        return named(kind, reference)
+    if not reference.endswith((".yaml", ".yml")) or "\0" in reference:
+        known = ", ".join(names(kind.name))
+        raise NotFound(f"{reference!r} is no {kind.name}; allowed: a name ({known}), or a path ending in .yaml")
+    try:
+        path = (folder / reference).resolve()
+    except (OSError, RuntimeError) as error:  # a loop of symbolic links
+        raise NotFound(f"cannot follow {reference!r}: {error}") from None
+    if not any(path.is_relative_to(home.resolve()) for home in (folder, config_root())):
+        raise NotFound(f"{reference!r} leads outside; allowed: files below the referring file's own folder or configs/")
+    return path

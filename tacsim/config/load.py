@@ -1,0 +1,158 @@
+"""Loading: read, expand references, lay overrides over, validate; all problems of a load are raised together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from tacsim.config.annotation import default, models
+from tacsim.config.document import Node, Reading, as_json, dump, from_plain
+from tacsim.config.errors import ConfigError, Place, Problem
+from tacsim.config.kinds import NotFound, is_name, kind_of, named
+from tacsim.config.messages import report_errors
+from tacsim.config.overrides import Override, apply, parse_override
+from tacsim.config.references import read_file
+from tacsim.optics.geometry import SensorModel
+from tacsim.rigfile import RigFacts, TaskFacts
+from tacsim.scene import Scene
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedRig:
+    """A rig file, resolved."""
+
+    facts: RigFacts
+    text: str  # all of it in one YAML text, every default and reference written out; load_rig reads it back to `facts`
+    sources: tuple[Path, ...]  # the files it was read from
+
+
+def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
+    """Reads a rig by its name ("sim") or path.
+
+    `task` (a name or path) replaces the file's task. `overrides` are texts ``key.sub=value``; those of ``task`` are
+    applied first. If anything in the rig is simulated, ``scene`` then is the effective scene: the rig's own, else the
+    task's, so ``scene.preset=standard`` works either way. In a rig without a simulated part it is None.
+
+    Raises ConfigError with every problem found.
+    """
+    reading = Reading()
+    root = _open(RigFacts, rig, reading)
+    if task is not None:
+        place = Place(f"--task {task}")
+        root = apply(root, RigFacts, Override(("task",), Node(task, place, Path.cwd(), text=task)), reading)
+    given = [parsed for text in overrides if (parsed := parse_override(text, reading)) is not None]
+    of_task = [override for override in given if override.path[0] == "task"]
+    of_rest = [override for override in given if override.path[0] != "task"]
+    for override in of_task:
+        root = apply(root, RigFacts, override, reading)
+        if override.path[:2] == ("task", "scene") and _has(root, "scene"):
+            what = f"this rig has a scene of its own, which is used; say {'.'.join(override.path[1:])}"
+            reading.report(override.place, ".".join(override.path), what)
+    own_scene = _has(root, "scene") or any(override.path[0] == "scene" for override in of_rest)
+    root = _adopt_scene(root)
+    for override in of_rest:
+        root = apply(root, RigFacts, override, reading)
+    root = _settle_scene(root, own_scene, reading)
+    facts = _validate(RigFacts, root, reading)
+    text = "# A rig, resolved: every reference and default written out, SI units.\n" + dump(
+        facts.model_dump(mode="json")
+    )
+    return LoadedRig(facts, text, tuple(dict.fromkeys(reading.sources)))
+
+
+def _has(root: Node, key: str) -> bool:
+    return key in root.items and root.items[key].value is not None
+
+
+def _simulated(root: Node) -> bool:
+    parts = [*_entries(root, "arms"), *_entries(root, "sensors")]
+    return any(part.items["driver"].value == "sim" for part in parts if "driver" in part.items)
+
+
+def _entries(root: Node, key: str) -> list[Node]:
+    return list(root.items[key].items.values()) if key in root.items else []
+
+
+def _adopt_scene(root: Node) -> Node:
+    """The task's scene becomes the rig's, where the rig has none."""
+    task = root.items.get("task")
+    if _has(root, "scene") or task is None or not task.items:
+        return root
+    scene = task.items.get("scene") or from_plain(default(TaskFacts, task, "scene"), task.place, task.folder)
+    return root if scene.is_empty else replace(root, value={**root.items, "scene": scene})
+
+
+def _settle_scene(root: Node, own_scene: bool, reading: Reading) -> Node:
+    if root.broken or not isinstance(root.value, dict):
+        return root
+    if _simulated(root):
+        root = _adopt_scene(root)  # an override may have taken it away
+        if not _has(root, "scene") and not root.items.get("task", root).broken:
+            what = "is missing: something here has driver 'sim'; allowed: a scene, or a task (which has one)"
+            reading.report(root.place, "scene", what)
+        return root
+    if own_scene and _has(root, "scene"):
+        what = "no arm and no sensor of this rig has driver 'sim', so nothing is simulated; leave scene out"
+        reading.report(root.items["scene"].place, "scene", what)
+    return replace(root, value={name: entry for name, entry in root.items.items() if name != "scene"})
+
+
+def load(model: type[Model], source: str | Path, overrides: Sequence[str] = ()) -> Model:
+    """Reads one configuration file into its model; `source` is a name of that kind, or a path. Raises ConfigError."""
+    facts: Model = _load(model, source, overrides)
+    return facts
+
+
+def load_scene(source: str | Path, overrides: Sequence[str] = ()) -> Scene:
+    """Reads a scene. Raises ConfigError."""
+    return load(Scene, source, overrides)
+
+
+def load_sensor(source: str | Path, overrides: Sequence[str] = ()) -> SensorModel:
+    """Reads a sensor. Raises ConfigError."""
+    return load(SensorModel, source, overrides)
+
+
+def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskFacts:
+    """Reads a task of any kind. Raises ConfigError."""
+    facts: TaskFacts = _load(TaskFacts, source, overrides)
+    return facts
+
+
+def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
+    reading = Reading()
+    root = _open(annotation, source, reading)
+    for text in overrides:
+        override = parse_override(text, reading)
+        if override is not None:
+            root = apply(root, annotation, override, reading)
+    return _validate(annotation, root, reading)
+
+
+def _open(annotation: Any, source: str | Path, reading: Reading) -> Node:
+    """The expanded tree of the file that a person named on the command line: any path, or a shipped file's name."""
+    place = Place(str(source))
+    kind = kind_of(models(annotation))
+    try:
+        path = named(kind, source) if kind is not None and isinstance(source, str) and is_name(source) else Path(source)
+    except NotFound as error:
+        raise ConfigError([Problem(place, "", str(error))]) from None
+    return read_file(path, annotation, reading, lambda what: reading.report(place, "", what))
+
+
+def _validate(annotation: Any, root: Node, reading: Reading) -> Any:
+    """The model of a tree. Raises ConfigError with every problem, those of reading included."""
+    facts = None
+    if not root.broken:
+        try:
+            facts = TypeAdapter(annotation).validate_json(as_json(root), strict=True)
+        except ValidationError as error:
+            report_errors(error, root, annotation, reading)
+    reading.raise_problems()
+    return facts

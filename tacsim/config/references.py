@@ -1,0 +1,129 @@
+"""References between files: a name, a path or ``extends: NAME`` becomes the mapping that it stands for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tacsim.config.annotation import child, models, variant
+from tacsim.config.document import Node, Reading, parse_text, read_text, shown
+from tacsim.config.errors import Place
+from tacsim.config.kinds import Kind, NotFound, kind_of, referred
+
+_MAX_CHAIN = 16  # files that refer to each other in a row
+
+
+def expand(node: Node, annotation: Any, reading: Reading, key: str = "", chain: tuple[Path, ...] = ()) -> Node:
+    """The tree with every reference replaced by what it refers to. Expanding twice changes nothing."""
+    kind = kind_of(models(annotation))
+    if kind is not None and isinstance(node.value, str):
+        return follow(node, kind, annotation, reading, key, chain)
+    if kind is not None and "extends" in node.items:
+        node = _extend(node, kind, annotation, reading, key, chain)
+    if isinstance(node.value, dict):
+        return replace(
+            node,
+            value={
+                name: expand(entry, child(annotation, node, name), reading, join(key, name), chain)
+                for name, entry in node.value.items()
+            },
+        )
+    if isinstance(node.value, list):
+        entries = [
+            expand(entry, child(annotation, node, index), reading, join(key, index), chain)
+            for index, entry in enumerate(node.value)
+        ]
+        return replace(node, value=entries)
+    return node
+
+
+def follow(
+    node: Node, kind: Kind, annotation: Any, reading: Reading, key: str, chain: tuple[Path, ...], said: str = ""
+) -> Node:
+    """The expanded content of the file that a text node refers to; a broken node after a reported problem.
+
+    `key` is the place of the content in the tree, `said` that of the reference where it is another (``extends``).
+    """
+    refuse = partial(reading.report, node.place, said or key)
+    try:
+        path = referred(kind, str(node.value), node.folder)
+    except NotFound as error:
+        refuse(str(error))
+        return _broken(node)
+    return read_file(path, annotation, reading, refuse, key, chain)
+
+
+def read_file(
+    path: Path,
+    annotation: Any,
+    reading: Reading,
+    refuse: Callable[[str], None],
+    key: str = "",
+    chain: tuple[Path, ...] = (),
+) -> Node:
+    """The expanded content of a file. `refuse` reports that it cannot be read, at the place that refers to it."""
+    broken = Node(None, Place(shown(path), 1), path.parent, broken=True)
+    path = Path(os.path.abspath(path))  # not resolved: messages name the file as it was asked for
+    resolved = path.resolve()
+    if resolved in chain:
+        circle = " -> ".join(shown(step) for step in (*chain[chain.index(resolved) :], resolved))
+        refuse(f"the reference goes round in a circle: {circle}; break it in one of them")
+        return broken
+    if len(chain) >= _MAX_CHAIN:
+        refuse(f"more than {_MAX_CHAIN} files refer to each other in a row; shorten the chain")
+        return broken
+    text = read_text(path, refuse, reading)
+    if text is None:
+        return broken
+    root = parse_text(text, shown(path), path.parent, reading)
+    if root.is_empty:
+        reading.report(root.place, key, "the file is empty; allowed: a mapping of keys to values")
+        return broken
+    return expand(root, annotation, reading, key, (*chain, resolved))
+
+
+def _extend(node: Node, kind: Kind, annotation: Any, reading: Reading, key: str, chain: tuple[Path, ...]) -> Node:
+    """``{extends: NAME, more: keys}``: the referenced mapping, the node's own entries merged over it."""
+    entries = dict(node.items)
+    reference = entries.pop("extends")
+    if not isinstance(reference.value, str):
+        if not reference.broken:
+            reading.report(reference.place, join(key, "extends"), f"allowed: the name of a {kind.name}, or a path")
+        return _broken(node)
+    target = follow(reference, kind, annotation, reading, key, chain, said=join(key, "extends"))
+    if target.broken:
+        return target
+    return merge(target, replace(node, value=entries), annotation)
+
+
+def merge(below: Node, above: Node, annotation: Any) -> Node:
+    """`above` laid over `below`: mappings entry by entry, anything else (and any other reference) replaces."""
+    if not isinstance(below.value, dict) or not isinstance(above.value, dict) or "extends" in above.value:
+        return above
+    entries = dict(below.value)
+    for name, entry in above.value.items():
+        inner = child(annotation, above, name) or child(annotation, below, name)
+        entries[name] = merge(entries[name], entry, inner) if name in entries else entry
+    return drop_strangers(below, replace(above, value=entries), annotation, keep=set(above.value))
+
+
+def drop_strangers(old: Node, new: Node, annotation: Any, keep: set[str]) -> Node:
+    """A change of variant (``shape: sphere`` over a box) drops the keys that only the old one has (``size``)."""
+    before, after = variant(annotation, old), variant(annotation, new)
+    if before is None or after is None or before is after:
+        return new
+    strangers = set(before.model_fields) - set(after.model_fields) - keep
+    return replace(new, value={name: entry for name, entry in new.items.items() if name not in strangers})
+
+
+def join(key: str, name: str | int) -> str:
+    """Dotted key of an entry."""
+    return f"{key}.{name}" if key else str(name)
+
+
+def _broken(node: Node) -> Node:
+    return replace(node, value=None, broken=True)

@@ -1,0 +1,131 @@
+"""Observation -> flat dict of arrays, vector -> Action: what learning code sees of the contract.
+
+Keys carry no dots: `tactile_upper`, `height_upper`, `pose_upper` ... All values are SI. What a sensor does not deliver
+has no key.
+
+| key             | array                                                                             |
+|-----------------|-----------------------------------------------------------------------------------|
+| tactile_SENSOR  | (H, W, 3) uint8, normalised difference image                                      |
+| contact_SENSOR  | (h, w) int8, 0 or 1                                                               |
+| valid_SENSOR    | (h, w) int8, 0 or 1                                                               |
+| height_SENSOR   | (h, w) float32 [m]                                                                |
+| gradient_SENSOR | (h, w, 2) float32 [-]                                                             |
+| flow_SENSOR     | (m, n, 2) float32 [m]                                                             |
+| pose_ARM        | (9,) float32, relative to the pose at reset: position [m], two columns of rotation |
+| twist_ARM       | (6,) float32 [m/s, rad/s]                                                         |
+| wrench_ARM      | (6,) float32 [N, N m]                                                             |
+| joints_ARM      | (n,) float32 [rad]                                                                |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import Action, ArmState, Observation, Pose, TactileObservation
+from tacsim.limits import ActionError
+from tacsim.tasks.task import Axis
+
+Flat = dict[str, NDArray[Any]]
+
+# Largest magnitude of each kind of float key: far beyond what is physical here, so that a value outside is an error.
+BOUNDS = {
+    "height": 0.05,  # [m]
+    "gradient": 100.0,  # [-]
+    "flow": 0.05,  # [m]
+    "pose": 10.0,  # [m], and rotation columns within 1
+    "twist": 100.0,  # [m/s, rad/s]
+    "wrench": 1e4,  # [N, N m]
+    "joints": 4 * math.pi,  # [rad]
+}
+
+
+def flatten(observation: Observation, start: Mapping[str, Pose]) -> Flat:
+    """The observation as a flat dict of fresh arrays; `start` holds each arm's pose at reset."""
+    flat: Flat = {}
+    for name, touch in observation.tactile.items():
+        flat |= {f"{key}_{name}": value for key, value in _touch(touch).items()}
+    for name, arm in observation.arms.items():
+        flat |= {f"{key}_{name}": value for key, value in _arm(arm, start[name]).items()}
+    return flat
+
+
+def _touch(touch: TactileObservation) -> Flat:
+    flat: Flat = {
+        "tactile": touch.image.copy(),
+        "contact": touch.contact.astype(np.int8),
+        "valid": touch.valid.astype(np.int8),
+    }
+    optional = {"height": touch.height, "gradient": touch.gradient, "flow": touch.flow}
+    return flat | {key: value.astype(np.float32) for key, value in optional.items() if value is not None}
+
+
+def _arm(arm: ArmState, start: Pose) -> Flat:
+    moved = se3.relative(start, arm.pose)
+    pose = np.concatenate([moved.position, se3.two_columns(moved)])
+    flat: Flat = {"pose": pose, "twist": arm.twist, "wrench": arm.wrench}
+    if arm.joints is not None:
+        flat["joints"] = arm.joints
+    return {key: value.astype(np.float32) for key, value in flat.items()}
+
+
+def space_of(flat: Flat) -> spaces.Dict:
+    """The Gymnasium space that `flat` and everything flattened from the same rig lies in."""
+    return spaces.Dict({key: _space(key, value) for key, value in flat.items()})
+
+
+def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
+    if value.dtype == np.uint8:
+        return spaces.Box(0, 255, value.shape, np.uint8)
+    if value.dtype == np.int8:
+        return spaces.MultiBinary(value.shape)
+    bound = BOUNDS[key.split("_", 1)[0]]
+    return spaces.Box(-bound, bound, value.shape, np.float32)
+
+
+def action_space(axes: Sequence[Axis]) -> spaces.Box:
+    """Box(-1, 1) with one component for each free axis."""
+    return spaces.Box(-1.0, 1.0, (len(axes),), np.float32)
+
+
+def action_from(
+    vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+) -> Action:
+    """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept.
+
+    Raises ActionError for a wrong shape, a component that is not finite, or one outside [-1, 1].
+    """
+    values = np.asarray(vector, dtype=np.float64)
+    if values.shape != (len(axes),):
+        raise ActionError(f"action must have shape ({len(axes)},), one number for each free axis, got {values.shape}")
+    # The margin admits 1.0 in any float precision.
+    if not np.isfinite(values).all() or float(np.abs(values).max(initial=0.0)) > 1.0 + 1e-6:
+        raise ActionError(
+            f"action components must be finite and within [-1, 1], got {values.tolist()}; "
+            "bound the policy's output (gymnasium.wrappers.ClipAction does it)"
+        )
+    positions = {axis.arm: np.array(poses[axis.arm].position) for axis in axes}
+    for axis, value in zip(axes, values, strict=True):
+        positions[axis.arm] += value * max_step * np.array(axis.direction)
+    return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
+
+
+def vector_from(
+    action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
+) -> NDArray[np.float32]:
+    """Inverse of `action_from`: the free part of an action as a vector; an arm that holds gives zeros.
+
+    Motion outside the free axes is not in the vector; components of larger steps lie outside [-1, 1].
+    """
+    values = np.zeros(len(axes), dtype=np.float32)
+    for i, axis in enumerate(axes):
+        target = action.tool.get(axis.arm)
+        if target is not None:
+            values[i] = (target.position - poses[axis.arm].position) @ np.array(axis.direction) / max_step
+    return values

@@ -1,0 +1,71 @@
+"""Regular grids of points on the gel, in sensor x, y: the pixels of an image, the cells of the canonical grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.optics.geometry import CanonicalGrid, SensorGeometry
+
+
+@dataclass(frozen=True, slots=True)
+class PixelGrid:
+    """`rows` x `columns` points; column j lies at ``x = x0 + j * pitch``, row i at ``y = y0 + i * pitch``, sensor frame."""
+
+    rows: int
+    columns: int
+    pitch: float  # [m]
+    x0: float  # x of column 0 [m]
+    y0: float  # y of row 0 [m]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return (self.rows, self.columns)
+
+    @property
+    def x(self) -> NDArray[np.float64]:
+        """(columns,) [m]"""
+        return self.x0 + self.pitch * np.arange(self.columns)
+
+    @property
+    def y(self) -> NDArray[np.float64]:
+        """(rows,) [m]"""
+        return self.y0 + self.pitch * np.arange(self.rows)
+
+    def points(self) -> NDArray[np.float64]:
+        """(rows, columns, 2) x, y of every point [m]"""
+        return np.stack(np.meshgrid(self.x, self.y), axis=-1)
+
+    def within(self, size: tuple[float, float]) -> NDArray[np.bool_]:
+        """(rows, columns) True where a point lies on a gel of `size` (x, y) [m], centred on the sensor axis."""
+        margin = 1e-9
+        inside_x = np.abs(self.x) <= size[0] / 2 + margin
+        inside_y = np.abs(self.y) <= size[1] / 2 + margin
+        return inside_y[:, None] & inside_x[None, :]
+
+    def refined(self, factor: int) -> PixelGrid:
+        """The same area with `factor` x `factor` points for each one."""
+        pitch = self.pitch / factor
+        shift = (pitch - self.pitch) / 2
+        return PixelGrid(self.rows * factor, self.columns * factor, pitch, self.x0 + shift, self.y0 + shift)
+
+
+def image_grid(geometry: SensorGeometry) -> PixelGrid:
+    """The pixels of a sensor's own image."""
+    u0, v0 = geometry.principal
+    pitch = geometry.pixel_pitch
+    return PixelGrid(geometry.height, geometry.width, pitch, -u0 * pitch, -v0 * pitch)
+
+
+def canonical_cells(grid: CanonicalGrid) -> PixelGrid:
+    """The cells of the canonical grid: where height, gradient and masks lie."""
+    x0 = -(grid.columns - 1) / 2 * grid.pitch
+    y0 = -(grid.rows - 1) / 2 * grid.pitch
+    return PixelGrid(grid.rows, grid.columns, grid.pitch, x0, y0)
+
+
+def canonical_image(grid: CanonicalGrid) -> PixelGrid:
+    """The pixels of the canonical image: `image_scale` x `image_scale` for each cell."""
+    return canonical_cells(grid).refined(grid.image_scale)

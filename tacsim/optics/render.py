@@ -1,0 +1,131 @@
+"""Gel surface -> RGB image by Phong shading, the method of Gomes et al. (RA-L 2021) that the seed paper uses.
+
+Camera and lights stand behind the gel, on its -z side. There a surface pressed in by `height` has the unit normal
+
+    n = (-dh/dx, -dh/dy, -1) / sqrt(1 + |grad h|^2)
+
+and shows ``ambient + sum over lights of colour * (diffuse * n.l + specular * (r.v)^shininess)`` with the light's direction
+l, the mirrored ray r = 2 (n.l) n - l and the view v = (0, 0, -1); no shadows. All is float32 until the last step.
+A dent is a bump to this camera: its right flank (dh/dx < 0) faces a light on the right (+x) and takes that colour.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.optics.geometry import Light, Lighting, SensorModel
+from tacsim.optics.grid import PixelGrid, image_grid
+from tacsim.optics.markers import check_fits, draw_markers
+from tacsim.optics.spline import line_matrices
+from tacsim.optics.surface import sample_surface
+from tacsim.scene import GelSurface
+
+Float32 = NDArray[np.float32]
+
+# Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
+# 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
+TEXTURE_PITCH = 0.12e-3
+LARGEST_PICTURE = 64 * 2**20  # of a background file [bytes]
+
+
+class Renderer:
+    """Makes the images of one simulated sensor. All that does not change from frame to frame is computed once.
+
+    The texture stays where it is in the image: reference and contact frames share it, also under sideways motion.
+    Raises ValueError when markers do not fit on the gel or the background picture does not fit the image.
+    """
+
+    def __init__(self, model: SensorModel, gel_size: tuple[float, float]) -> None:
+        """`gel_size`: x, y [m]."""
+        self.model = model
+        self._grid = image_grid(model.geometry)
+        self._markers = model.markers
+        if model.markers is not None:
+            check_fits(model.markers, gel_size)
+        self._texture = texture_gradient(self._grid, gel_size, model.texture, model.texture_seed)
+        self._unlit = unlit_image(model.lighting, self._grid.shape)
+
+    def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
+        gradient = sample_surface(surface, self._grid).gradient + self._texture
+        image = shade(gradient, self.model.lighting)
+        image += self._unlit
+        if self._markers is not None:
+            image = draw_markers(image, surface, self._markers, self.model.geometry)
+        np.clip(image, 0.0, 1.0, out=image)
+        image *= 255.0
+        image += 0.5
+        return image.astype(np.uint8)
+
+
+def shade(gradient: Float32, lighting: Lighting) -> Float32:
+    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2); 1 is white. Exactly the same for lights in
+    any order: they are summed in an order of their own."""
+    import cv2
+
+    slope_x, slope_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
+    facing = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)  # n . v
+    channels = [np.zeros(slope_x.shape, dtype=np.float32) for _ in range(3)]
+    for light in sorted(lighting.lights, key=_order):
+        lx, ly, lz = (np.float32(c) for c in light.direction / np.linalg.norm(light.direction))
+        lit = np.maximum((slope_x * -lx + slope_y * -ly - lz) * facing, np.float32(0.0))  # n . l
+        brightness = lit * np.float32(light.diffuse)
+        if light.specular > 0:
+            mirrored = np.maximum(2.0 * lit * facing + lz, np.float32(0.0))  # r . v, as l . v = -lz
+            brightness += np.float32(light.specular) * cv2.pow(mirrored, lighting.shininess)
+        for channel, colour in zip(channels, light.colour, strict=True):
+            channel += brightness * np.float32(colour)
+    return np.asarray(cv2.merge(channels), dtype=np.float32)
+
+
+def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
+    """(H, W, 3) what the picture shows beside the shaded lights: ambient, or background - shade(flat gel)."""
+    if lighting.background is None:
+        return np.full((*shape, 3), lighting.ambient, dtype=np.float32)
+    if isinstance(lighting.background, str):
+        background = read_background(lighting.background, shape)
+    else:
+        background = np.broadcast_to(np.array(lighting.background, dtype=np.float32), (*shape, 3))
+    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    return background - flat
+
+
+def read_background(path: str, shape: tuple[int, int]) -> Float32:
+    """(H, W, 3) RGB picture in 0..1. Raises ValueError when it cannot be read or is not H x W."""
+    import cv2
+
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"lighting.background: no file '{path}'")
+    if file.stat().st_size > LARGEST_PICTURE:
+        raise ValueError(f"lighting.background: '{path}' has {file.stat().st_size} bytes, at most {LARGEST_PICTURE} are read")
+    picture = cv2.imread(path, cv2.IMREAD_COLOR)
+    if picture is None:
+        raise ValueError(f"lighting.background: '{path}' is no picture that OpenCV reads (PNG, JPEG, TIFF ...)")
+    if picture.shape[:2] != shape:
+        raise ValueError(
+            f"lighting.background: '{path}' is {picture.shape[1]} x {picture.shape[0]} px, the sensor's image is "
+            f"{shape[1]} x {shape[0]}; resize it"
+        )
+    return picture[..., ::-1].astype(np.float32) / np.float32(255.0)
+
+
+def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: float, seed: int) -> Float32:
+    """(H, W, 2) slopes of the gel's texture: a random surface with standard deviation `deviation` [m], fixed by `seed`;
+    0 outside the gel. Control values are independent normal numbers; the spline of such has 11/20 of their spread."""
+    nodes_x, nodes_y = (int(np.ceil(size / TEXTURE_PITCH)) + 3 for size in gel_size)
+    noise = np.random.default_rng(seed).standard_normal((nodes_y, nodes_x)).astype(np.float32) * (deviation * 20.0 / 11.0)
+    value_x, slope_x = line_matrices(grid.x / TEXTURE_PITCH + (nodes_x - 1) / 2, nodes_x)
+    value_y, slope_y = line_matrices(grid.y / TEXTURE_PITCH + (nodes_y - 1) / 2, nodes_y)
+    by_x = (value_y @ noise) @ slope_x.T
+    by_y = (slope_y @ noise) @ value_x.T
+    gradient = np.stack([by_x, by_y], axis=-1) / TEXTURE_PITCH
+    gradient[~grid.within(gel_size)] = 0.0
+    return gradient.astype(np.float32)
+
+
+def _order(light: Light) -> tuple[float, ...]:
+    return (*light.direction, *light.colour, light.diffuse, light.specular)

@@ -1,0 +1,119 @@
+"""The quasi-static controller: ramped motion of driven frames, then a hold until the measured residual is small.
+
+Materials are rate-independent, so only the path counts. What writes false plastic strain into the body is the jerk at
+start and stop, not the speed; hence every motion starts and ends with zero velocity and zero acceleration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import Pose
+from tacsim.physics.world import MoveStats
+from tacsim.scene import Settling
+
+MM = 1e3
+PEAK = 1.875  # peak slope of the quintic ramp over its mean
+CHECK = 20  # substeps between two looks at the residual
+FORCE_FLOOR = 2e-3  # [N] residuals are relative to the contact force, but never to less than this
+
+
+def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quintic 0 -> 1 with zero first and second derivative at both ends (minimum jerk, Flash & Hogan 1985)."""
+    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+
+
+@dataclass(frozen=True)
+class Path:
+    """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1]."""
+
+    start: Sequence[Pose]
+    end: Sequence[Pose]
+    substeps: int
+    dt: float
+
+    def drive(self, first: int, last: int, refine: int = 1) -> NDArray[np.float32]:
+        """(n, frames, 6, 3) f32 for substeps first..last, each cut in `refine`: rows of R, position [mm], velocity, angular velocity."""
+        knots = np.arange(first * refine, last * refine + 1) / (max(self.substeps, 1) * refine)
+        s = ramp(np.clip(knots, 0.0, 1.0))
+        out = np.empty((len(s) - 1, len(self.start), 6, 3))
+        step = self.dt / refine
+        for index, (a, b) in enumerate(zip(self.start, self.end, strict=True)):
+            position = (a.position + s[:, None] * (b.position - a.position)) * MM
+            turn_from = Rotation.from_quat(a.quaternion)
+            vector = (Rotation.from_quat(b.quaternion) * turn_from.inv()).as_rotvec()
+            out[:, index, :3] = (Rotation.from_rotvec(s[1:, None] * vector) * turn_from).as_matrix()
+            out[:, index, 3] = position[1:]
+            out[:, index, 4] = np.diff(position, axis=0) / step
+            out[:, index, 5] = np.diff(s)[:, None] * vector / step
+        return np.ascontiguousarray(out, np.float32)
+
+
+def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float) -> Path:
+    """A path whose fastest point moves at peak Mach `mach`; `lever` [mm] turns rotation into speed at the gel's rim."""
+    length = 0.0
+    for a, b in zip(start, end, strict=True):
+        turn = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).magnitude()
+        length = max(length, float(np.linalg.norm(b.position - a.position)) * MM + turn * lever)
+    substeps = math.ceil(PEAK * length / (mach * dt)) if length > 0 else 0
+    return Path(start, end, substeps, dt)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw."""
+
+    contact: NDArray[np.float64]  # (gels, 3)
+    backing: NDArray[np.float64]  # (gels, 3)
+    overlap: float  # [mm]
+    guard_hits: int
+
+
+def residual(now: Reading, before: Reading, balanced: bool) -> float:
+    """Largest force imbalance, or change since the last look, relative to the largest contact force [-].
+
+    `balanced`: the contact forces of all gels must add up to zero (a free body between them).
+    """
+    scale = max(float(np.abs(now.contact).max()), FORCE_FLOOR)
+    parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
+    if balanced:
+        parts.append(np.abs(now.contact.sum(axis=0)).max())
+    return float(max(parts)) / scale
+
+
+def move_and_settle(
+    path: Path, settling: Settling, advance: Callable[[Path, int, int], Reading], *, balanced: bool
+) -> MoveStats:
+    """Runs `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
+    reading: Reading | None = None
+    hits = 0
+    for first in range(0, path.substeps, CHECK):
+        reading = advance(path, first, min(first + CHECK, path.substeps))
+        hits += reading.guard_hits
+    rest = Path(path.end, path.end, 0, path.dt)
+    held, worst = 0, math.inf
+    while held < settling.max_substeps:
+        count = min(CHECK, settling.max_substeps - held)
+        before, reading = reading, advance(rest, 0, count)
+        held += count
+        hits += reading.guard_hits
+        if before is not None:
+            worst = residual(reading, before, balanced)
+            if worst <= settling.tolerance:
+                break
+    overlap = 0.0 if reading is None else reading.overlap / MM
+    return MoveStats(path.substeps + held, held, worst, worst <= settling.tolerance, overlap, hits)
+
+
+def merged(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:
+    """Where every driven frame ends. Raises KeyError for a frame that is not driven."""
+    unknown = sorted(set(targets) - set(poses))
+    if unknown:
+        raise KeyError(f"no driven frame {', '.join(unknown)}; this world drives {', '.join(poses)}")
+    return {**poses, **targets}

@@ -1,0 +1,145 @@
+"""Material laws inside kernels: neo-Hookean gel; Hencky elasticity with von Mises return mapping for the plasticine.
+
+Symmetric 3x3 matrices are stored as 6 numbers (xx, yy, zz, xy, xz, yz). Polynomials of one symmetric matrix commute
+and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenvalues, no branch near equal ones.
+The same laws in float64 NumPy: tacsim/physics/reference.py.
+"""
+
+from tacsim.runtime import ti
+
+vec3 = ti.types.vector(3, ti.f32)
+vec4 = ti.types.vector(4, ti.f32)
+vec6 = ti.types.vector(6, ti.f32)
+mat3 = ti.types.matrix(3, 3, ti.f32)
+
+
+@ti.func
+def full(s):
+    return mat3([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
+
+
+@ti.func
+def product(a, b):
+    """a b of two commuting symmetric matrices."""
+    return vec6(
+        a[0] * b[0] + a[3] * b[3] + a[4] * b[4],
+        a[3] * b[3] + a[1] * b[1] + a[5] * b[5],
+        a[4] * b[4] + a[5] * b[5] + a[2] * b[2],
+        a[0] * b[3] + a[3] * b[1] + a[4] * b[5],
+        a[0] * b[4] + a[3] * b[5] + a[4] * b[2],
+        a[3] * b[4] + a[1] * b[5] + a[5] * b[2],
+    )
+
+
+@ti.func
+def plus_identity(s, c):
+    """s + c I."""
+    return vec6(s[0] + c, s[1] + c, s[2] + c, s[3], s[4], s[5])
+
+
+@ti.func
+def minors(s):
+    """Sum of the principal 2x2 minors (second invariant)."""
+    return s[0] * s[1] - s[3] * s[3] + s[0] * s[2] - s[4] * s[4] + s[1] * s[2] - s[5] * s[5]
+
+
+@ti.func
+def determinant(s):
+    return (
+        s[0] * (s[1] * s[2] - s[5] * s[5]) - s[3] * (s[3] * s[2] - s[5] * s[4]) + s[4] * (s[3] * s[5] - s[1] * s[4])
+    )
+
+
+@ti.func
+def inverse(s):
+    c0 = s[1] * s[2] - s[5] * s[5]
+    c3 = s[4] * s[5] - s[3] * s[2]
+    c4 = s[3] * s[5] - s[4] * s[1]
+    r = 1.0 / (s[0] * c0 + s[3] * c3 + s[4] * c4)
+    return r * vec6(c0, s[0] * s[2] - s[4] * s[4], s[0] * s[1] - s[3] * s[3], c3, c4, s[3] * s[4] - s[0] * s[5])
+
+
+@ti.func
+def frobenius(s):
+    return ti.sqrt(s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + 2.0 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5]))
+
+
+@ti.func
+def log1p(x):
+    """ln(1 + x), accurate in f32 for small x: 2 artanh(x / (2 + x)) by its series."""
+    y = 0.0
+    if ti.abs(x) < 0.4:
+        z = x / (2.0 + x)
+        q = z * z
+        y = 2.0 * z * (1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q * (1.0 / 9.0 + q / 11.0)))))
+    else:
+        y = ti.log(1.0 + x)
+    return y
+
+
+@ti.func
+def log_pade(a):
+    """log(I + a) by the [3/3] Padé approximant; relative error below 1.4e-5 for |a| up to 0.5."""
+    a2 = product(a, a)
+    a3 = product(a2, a)
+    return product(
+        60.0 * a + 60.0 * a2 + 11.0 * a3, inverse(plus_identity(90.0 * a + 36.0 * a2 + 3.0 * a3, 60.0))
+    )
+
+
+@ti.func
+def square_root(a):
+    """r with (I + r)^2 = I + a, by the Denman-Beavers iteration (quadratic; a > -I)."""
+    y = plus_identity(a, 1.0)
+    z = vec6(1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    for _ in range(8):
+        y, z = 0.5 * (y + inverse(z)), 0.5 * (z + inverse(y))
+    return plus_identity(y, -1.0)
+
+
+@ti.func
+def logarithm(a):
+    """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
+    scale = 1.0
+    root = a
+    for _ in range(3):
+        if frobenius(root) > 0.5:
+            root = square_root(root)
+            scale *= 2.0
+    return scale * log_pade(root)
+
+
+@ti.func
+def exponential_minus_identity(x):
+    """exp(x) - I by its Taylor series to 4th order; |x| <= 2k after a return, error below |x|^5 / 120."""
+    x2 = product(x, x)
+    return x + 0.5 * x2 + product(x2, x * (1.0 / 6.0) + x2 * (1.0 / 24.0))
+
+
+@ti.func
+def hencky_return(e, mu, bulk, limit):
+    """Hencky elasticity with von Mises return mapping (seed paper, eq. 1 and 2), on e = b_e - I.
+
+    e: trial elastic left Cauchy-Green strain minus identity; limit: k = sigma_y / (2 mu), Frobenius norm.
+    Returns the elastic e after the return, and the Kirchhoff stress tau = 2 mu dev(eps) + K ln(J) I.
+    """
+    log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
+    shrink = ti.exp(-2.0 / 3.0 * log_j)
+    strain = 0.5 * logarithm(plus_identity(e * shrink, shrink - 1.0))  # of the volume-preserving part
+    strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
+    norm = frobenius(strain)
+    elastic = e
+    if norm > limit:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
+        strain *= limit / norm
+        growth = exponential_minus_identity(2.0 * strain)
+        volume = 1.0 / shrink
+        elastic = plus_identity(growth * volume, volume - 1.0)
+    return elastic, plus_identity(2.0 * mu * strain, bulk * log_j)
+
+
+@ti.func
+def convect(e, d):
+    """e of f b f^T, with f = I + d and b = I + e, without forming I (keeps small strains exact in f32)."""
+    m = d + d @ full(e)
+    t = m + m.transpose() + m @ d.transpose()
+    return e + vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])

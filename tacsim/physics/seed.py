@@ -1,0 +1,276 @@
+"""The seed paper's scheme: gels and plasticine as particles on one shared MLS-MPM grid.
+
+Faithful in what it simulates; around it stands the same quasi-static controller as for the hybrid world. What belongs
+to the scheme itself: bodies stick to each other (no friction coefficient), begin to push across an air gap of about
+1.5 grid cells, and a gel has no housing. Sensors may move along and turn about world z, and may not tilt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import Pose, Truth
+from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle, plan
+from tacsim.physics.health import Health, SimulationDiverged, as_float32, attempt
+from tacsim.physics.world import MoveStats
+from tacsim.runtime import start
+from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
+from tacsim.shapes import particles
+
+Float32 = NDArray[np.float32]
+
+CELL = 2  # grid spacing / particle spacing: 8 particles a cell
+COURANT = 0.5  # dt / (grid spacing / wave speed); unstable from 1.0
+REACH = 1.5  # [cells] gap at which contact through the grid begins
+GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
+BODY_DAMPING = 0.2  # rate against the driven motion [c / mm]
+SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
+STRETCH = (0.72, 1.2)  # vertical spacing of the grid / dx that is kept before the number of layers changes
+MARGIN = 3  # [cells] of grid round the particles
+TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
+ELASTIC = 1e30  # elastic limit of a body that does not yield
+HALF_TURN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of the upper sensor at yaw 0
+
+MPA = 1e-6  # Pa -> MPa
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where a gel's particles rest in its sensor's frame: (nx, ny, nz) of them, z downwards from the surface [mm]."""
+
+    count: tuple[int, int, int]
+    spacing: float
+    layer: float  # spacing along z, so that the layers fill the thickness
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        nx, ny, nz = self.count
+        x, y = (np.arange(nx) - (nx - 1) / 2) * self.spacing, (np.arange(ny) - (ny - 1) / 2) * self.spacing
+        z = -(np.arange(nz) + 0.5) * self.layer
+        return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def gel_lattice(gel: Gel, spacing: float) -> Lattice:
+    """The lattice nearest to the gel's size; laterally it may miss it by half a spacing, its thickness is exact."""
+    nx, ny, nz = (max(round(length / spacing), 1) for length in gel.size)
+    return Lattice((nx, ny, nz), spacing * MM, gel.size[2] * MM / nz)
+
+
+def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
+    """Kernel constants of a material for particles of `volume` [mm^3]; density lambda + 2 mu makes the wave speed 1."""
+    from tacsim.physics.seed_kernels import Solid
+
+    mu, lam = (modulus * MPA for modulus in lame(material))
+    limit = min(material.elastic_limit, ELASTIC) if isinstance(material, BodyMaterial) else ELASTIC
+    return Solid(mass=(lam + 2 * mu) * volume, volume=volume, mu=mu, lam=lam, limit=limit)
+
+
+class SeedWorld:
+    """World of a scene with a body, by the seed's scheme. Raises ValueError in a scene without a body."""
+
+    sensors: tuple[str, ...] = ("lower", "upper")
+
+    def __init__(self, scene: Scene) -> None:
+        if scene.body is None:
+            raise ValueError("physics 'seed' simulates a body between two gels; this scene has none (use 'hybrid')")
+        start()
+        self.scene = scene
+        h = scene.spacing * MM
+        self._dx, self._dt = CELL * h, COURANT * CELL * h
+        self._lattice = gel_lattice(scene.gel, scene.spacing)
+        self._gel = solid(scene.gel.material, h * h * self._lattice.layer)
+        self._body = solid(scene.body.material, h**3)
+        self._initialise(particles(scene.body.geometry, scene.spacing) * MM)
+
+    def _initialise(self, body: NDArray[np.float64]) -> None:
+        """Stage 1 of the scheme: undeformed particles at rest, a clear gap between body and gels."""
+        h, gap = self._lattice.spacing, REACH * self._dx
+        body = body + [0.0, 0.0, gap + h / 2 - body[:, 2].min()]
+        self._poses = {
+            "lower": Pose(),
+            "upper": Pose(np.array([0.0, 0.0, (body[:, 2].max() + h / 2 + gap) / MM]), HALF_TURN),
+        }
+        rest = self._lattice.points
+        gels = [_rotation(p).apply(rest) + p.position * MM for p in self._poses.values()]
+        self._gels = len(rest)
+        self._x = np.concatenate([*gels, body]).astype(np.float32)
+        n = len(self._x)
+        self._v = np.zeros((n, 3), np.float32)
+        self._c = np.zeros((n, 3, 3), np.float32)
+        self._f = np.tile(np.eye(3, dtype=np.float32), (n, 1, 1))
+        self._stress = np.zeros((n, 3, 3), np.float32)
+        self._aside = np.zeros(n, np.int32)  # 1 = left the grid, takes no part
+        self._motion = np.array([0, 0, 0, body[:, 2].min(), body[:, 2].max()], np.float32)  # see kernels
+        self._momentum, self._gain = np.zeros((2, 3), np.float32), np.zeros((2, 3), np.float32)
+        self._backing = np.zeros((2, 6), np.float32)
+        room = self._poses["upper"].position[2] + 2 * self.scene.gel.size[2]
+        self._cells = np.array([round(room * MM / self._dx)], np.int32)  # layers of the grid between the backings
+        self._grid = np.zeros((1, 1, 1, 4), np.float32)
+        as_float32([a for a in self._arrays().values() if a.dtype != np.int32])
+
+    # ------------------------------------------------------------------ state
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {
+            "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "deformation_gradient": self._f,
+            "stress": self._stress, "aside": self._aside, "body_motion": self._motion,
+            "gel_momentum": self._momentum, "gel_gain": self._gain, "backing": self._backing, "layers": self._cells,
+        }  # fmt: skip
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        state = {name: a.copy() for name, a in self._arrays().items()}
+        state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
+        return state
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Raises ValueError if `state` is no snapshot of such a world."""
+        arrays = {**self._arrays(), "poses": np.empty((2, 7))}
+        for name, a in arrays.items():
+            if name not in state or state[name].shape != a.shape:
+                found = state[name].shape if name in state else "nothing"
+                raise ValueError(f"snapshot: '{name}' must have shape {a.shape}, found {found}; is it of this scene?")
+        for name, a in self._arrays().items():
+            a[...] = state[name]
+        self._poses = {name: Pose(p[:3], p[3:]) for name, p in zip(self.sensors, state["poses"], strict=True)}
+
+    def pose(self, name: str) -> Pose:
+        return self._poses[name]
+
+    def wrench(self, name: str) -> NDArray[np.float64]:
+        """(6,) what the gel does to its backing: what the object does to the gel, once the gel is at rest."""
+        reaction = self._backing[self.sensors.index(name)].astype(np.float64)
+        to_sensor = _rotation(self._poses[name]).inv()
+        return np.concatenate([to_sensor.apply(reaction[:3]), to_sensor.apply(reaction[3:]) / MM])
+
+    def surface(self, name: str) -> GelSurface:
+        """Displacement of the top layer of particles, half a layer below the rest surface."""
+        nx, ny, _ = self._lattice.count
+        moved = (self._in_sensor(name) - self._lattice.points).reshape(nx, ny, -1, 3)[:, :, 0] / MM
+        h = self.scene.spacing
+        return GelSurface(moved.astype(np.float32), h, (-(nx - 1) / 2 * h, -(ny - 1) / 2 * h))
+
+    def _in_sensor(self, name: str) -> NDArray[np.float64]:
+        """Particles of a gel in its sensor's frame [mm]."""
+        first, pose = self.sensors.index(name) * self._gels, self._poses[name]
+        x = self._x[first : first + self._gels].astype(np.float64)
+        return np.asarray(_rotation(pose).inv().apply(x - pose.position * MM))
+
+    def truth(self) -> Truth:
+        """Of the body's particles in play; those set aside are left out."""
+        x = self._body_points()
+        height = (float(np.ptp(x[:, 2])) + self._lattice.spacing) / MM
+        return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, x / np.float32(MM), dict(self._poses))
+
+    def _body_points(self) -> Float32:
+        body = slice(2 * self._gels, None)
+        return self._x[body][self._aside[body] == 0]
+
+    # ----------------------------------------------------------------- motion
+
+    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+        """See World. Raises ValueError for a tilted target, or one that leaves the gels less than half their thickness."""
+        end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
+        self._check_room(end)
+        lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
+        path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
+        before = self.snapshot()
+        try:
+            stats = move_and_settle(path, self.scene.settling, self._advance, balanced=True)
+        except SimulationDiverged:
+            self.restore(before)
+            raise
+        self._poses = end
+        return stats
+
+    def _upright(self, name: str, pose: Pose) -> Pose:
+        """`pose` without a tilt of up to TILT, which the scheme can't follow."""
+        if name not in self.sensors:
+            raise KeyError(f"no sensor '{name}'; this world has {', '.join(self.sensors)}")
+        flip = Rotation.identity() if name == "lower" else Rotation.from_quat(HALF_TURN)
+        turn = (Rotation.from_quat(pose.quaternion) * flip.inv()).as_matrix()
+        tilt = float(np.arctan2(np.hypot(turn[0, 2], turn[1, 2]), turn[2, 2]))
+        if tilt > TILT:
+            raise ValueError(
+                f"physics 'seed' cannot tilt a sensor: '{name}' was asked to tilt by {np.degrees(tilt):.3g} deg "
+                f"(limit {np.degrees(TILT):.2g} deg); keep its z axis along world z, or use physics 'hybrid'"
+            )
+        yaw = Rotation.from_euler("z", np.arctan2(turn[1, 0], turn[0, 0]))
+        return Pose(pose.position, (yaw * flip).as_quat())
+
+    def _check_room(self, poses: Mapping[str, Pose]) -> None:
+        thickness = self.scene.gel.size[2]
+        room = float(poses["upper"].position[2] - poses["lower"].position[2])
+        if room < -thickness:
+            raise ValueError(
+                f"the gels' rest surfaces would overlap by {-room * MM:.3g} mm, which leaves each gel less than half of "
+                f"its {thickness * MM:.3g} mm; keep the upper sensor at least {-thickness * MM:.3g} mm above the lower"
+            )
+
+    def _advance(self, path: Path, first: int, last: int) -> Reading:
+        """Substeps first to last of a path, in one launch; with a smaller step if that goes wrong."""
+        aside = int(self._aside.sum())
+        x0, y0 = self._fit_grid(path, first, last)
+
+        def launch(refine: int) -> Health:
+            health = Health.array()
+            self._launch(path.drive(first, last, refine), self._dt / refine, x0, y0, health)
+            return Health.read(health)
+
+        where = f"substeps {first} to {last} of a motion of {path.substeps}"
+        attempt(self._arrays(), launch, lambda: where)
+        backing = self._backing[:, :3].astype(np.float64)
+        left = int(self._aside.sum()) - aside
+        return Reading(backing + self._gain, backing, self._overlap(path, last), left)
+
+    def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
+        from tacsim.physics.seed_kernels import Step, advance
+
+        thickness = self.scene.gel.size[2] * MM
+        step = Step(
+            dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._cells[0]), gels=self._gels,
+            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING,
+        )  # fmt: skip
+        advance(
+            self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive,
+            self._motion, self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
+        )  # fmt: skip
+
+    def _fit_grid(self, path: Path, first: int, last: int) -> tuple[float, float]:
+        """Makes the grid cover the particles and what they can reach; returns x, y of node (0, 0), multiples of the cell.
+
+        Between the backings the number of layers is kept as long as their spacing stays within STRETCH: a change of it
+        shifts nodes against the contact surfaces, which shows as a small jump of force.
+        """
+        from tacsim.physics.seed_kernels import PAD
+
+        faces = path.drive(first, last)[:, :, 3, 2]
+        room = faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM
+        if not STRETCH[0] * self._dx < room.min() / self._cells[0] <= room.max() / self._cells[0] < STRETCH[1] * self._dx:
+            self._cells[0] = max(round(float(room.mean()) / self._dx), 1)
+        gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
+        low, high = gels.min(axis=0), gels.max(axis=0)
+        side = SIDE * float((high - low).max())
+        if len(body):
+            low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
+            high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
+        margin = MARGIN * self._dx + 2 * self.scene.settling.mach * (last - first) * self._dt
+        corner = np.floor((low - margin) / self._dx)
+        nodes = np.ceil((high + margin) / self._dx) - corner + 1
+        shape = (int(nodes[0]), int(nodes[1]), int(self._cells[0]) + 2 * PAD + 1)
+        if self._grid.shape[:3] != shape:
+            self._grid = np.zeros((*shape, 4), np.float32)
+        return float(corner[0] * self._dx), float(corner[1] * self._dx)
+
+    def _overlap(self, path: Path, last: int) -> float:
+        """Deepest body particle below the gels' top layer of particles, surfaces half a spacing out of each [mm]."""
+        return 0.0
+
+
+def _rotation(pose: Pose) -> Rotation:
+    return Rotation.from_quat(pose.quaternion)

@@ -1,0 +1,91 @@
+"""Pictures in and out of files: lossless PNG for the recorder; PNG, JPEG and BMP in, sizes checked before decoding."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import TactileFrame
+from tacsim.record.episode import EpisodeError
+
+MAX_SIDE = 4096  # [px] of a picture, each way
+FORMATS = ("PNG", "JPEG", "BMP")
+_REFERENCE = "reference/{}.png"  # attachment with the contact-free picture of a sensor
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """Lossless PNG of an (H, W, 3) uint8 RGB picture. Raises ValueError for any other shape, type or size."""
+    import cv2
+
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"image must be (H, W, 3) uint8 RGB, got {image.shape} {image.dtype}")
+    _check_size(image.shape[1], image.shape[0], "image")
+    # OpenCV's default (level 1, run lengths) is twice as fast as asking for level 1, which also resets the strategy.
+    written, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not written:
+        raise ValueError(f"OpenCV could not encode an image of shape {image.shape}")
+    return data.tobytes()
+
+
+def decode_image(data: bytes, what: str, formats: tuple[str, ...] = FORMATS) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB picture of an encoded one with 8 bits a channel.
+
+    Raises EpisodeError that names `what`, for unreadable data and for pictures beyond MAX_SIDE (before decoding them).
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data), formats=formats) as picture:
+            _check_size(*picture.size, what)
+            if picture.mode not in ("RGB", "RGBA", "L", "P"):
+                raise EpisodeError(f"{what}: pixel type '{picture.mode}'; 8 bits a channel are read, grey or colour")
+            return np.array(picture.convert("RGB"))
+    except EpisodeError:
+        raise
+    except Exception as failure:  # a decoder that is fed damaged bytes may raise anything
+        raise EpisodeError(f"{what}: no readable picture ({', '.join(formats)}): {failure}") from failure
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB picture of a file. Raises EpisodeError that names the file."""
+    try:
+        size = path.stat().st_size
+        if size > 4 * MAX_SIDE * MAX_SIDE:  # more than any uncompressed picture within the limit needs
+            raise EpisodeError(f"{path}: {size} bytes is too much for a picture of at most {MAX_SIDE} x {MAX_SIDE}")
+        data = path.read_bytes()
+    except OSError as failure:
+        raise EpisodeError(f"{path}: cannot be read: {failure.strerror}") from failure
+    return decode_image(data, str(path))
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(rows, columns) of a picture file, from its header alone. Raises EpisodeError that names the file."""
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=FORMATS) as picture:
+            columns, rows = picture.size
+    except Exception as failure:  # as above
+        raise EpisodeError(f"{path}: no readable picture ({', '.join(FORMATS)}): {failure}") from failure
+    _check_size(columns, rows, str(path))
+    return rows, columns
+
+
+def reference_attachments(references: Mapping[str, TactileFrame]) -> dict[str, bytes]:
+    """Contact-free frames by sensor, as attachments of an episode; a replay normalises with them."""
+    return {_REFERENCE.format(name): encode_png(frame.image) for name, frame in references.items()}
+
+
+def reference_image(attachments: Mapping[str, bytes], sensor: str) -> NDArray[np.uint8] | None:
+    """The (H, W, 3) contact-free picture of a sensor among an episode's attachments; None when there is none."""
+    name = _REFERENCE.format(sensor)
+    return decode_image(attachments[name], f"attachment '{name}'") if name in attachments else None
+
+
+def _check_size(columns: int, rows: int, what: str) -> None:
+    if not (0 < columns <= MAX_SIDE and 0 < rows <= MAX_SIDE):
+        raise EpisodeError(f"{what}: {columns} x {rows} pixels; at least 1 and at most {MAX_SIDE} are allowed each way")

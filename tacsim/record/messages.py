@@ -1,0 +1,226 @@
+"""A control step <-> the messages that hold it. Lossless: what is decoded equals what was encoded bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.timestamp_pb2 import Timestamp
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from tacsim.interface import Action, ArmState, Pose, SurfaceMap, TactileFrame
+from tacsim.record.episode import EpisodeError, Step
+from tacsim.record.images import decode_image, encode_png
+from tacsim.record.schemas import (
+    ARM_SCHEMA,
+    STEP_SCHEMA,
+    STEP_TOPIC,
+    ArmMessage,
+    FrameMessage,
+    PoseMessage,
+    StepMessage,
+)
+
+_FLOAT = np.dtype("<f4")
+_SURFACE_FIELDS = ("height", "gradient_x", "gradient_y")
+_FLOW_FIELDS = ("flow_x", "flow_y")
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """One message of a step."""
+
+    topic: str
+    schema: str | type[Message]  # name of a JSON schema, or a protobuf message class
+    time: int  # when its content was true, rig clock [ns]
+    data: bytes
+
+
+def nanoseconds(seconds: float) -> int:
+    """Rig time [s] as MCAP time [ns]. Raises ValueError for times that MCAP cannot hold."""
+    if not 0.0 <= seconds < 9e9:
+        raise ValueError(f"time {seconds} s is outside 0 ... 9e9 s; rig clocks start at 0 or later")
+    return round(seconds * 1e9)
+
+
+def encode_step(step: Step, pitch: float) -> list[Encoded]:
+    """All messages of a step, the one that makes it complete last. `pitch` of the surface grid is for viewers [m].
+
+    Raises ValueError for arrays of the wrong type or shape and for negative times.
+    """
+    messages: list[Encoded] = []
+    for name, frame in step.frames.items():
+        messages += _encode_frame(name, frame, pitch)
+    for name, arm in step.arms.items():
+        messages += _encode_arm(name, arm)
+    record = StepMessage(
+        index=int(step.index),
+        time=step.time,
+        seconds=step.seconds,
+        reward=step.reward,
+        distance=step.distance,
+        info={key: float(value) for key, value in step.info.items()},
+        action=None if step.action is None else _pose_messages(step.action.tool),
+        sent=_pose_messages(step.sent),
+        frames={name: _frame_message(frame) for name, frame in step.frames.items()},
+        arms=tuple(step.arms),
+    )
+    messages.append(Encoded(STEP_TOPIC, STEP_SCHEMA, nanoseconds(step.time), record.model_dump_json().encode()))
+    return messages
+
+
+def decode_step(data: bytes, messages: Mapping[str, bytes], sensors: Container[str] | None = None) -> Step:
+    """The step of a /step message and the other messages of that step by topic. Raises EpisodeError.
+
+    Args:
+        sensors: only their frames are decoded and returned; None: all.
+    """
+    try:
+        record = StepMessage.model_validate_json(data)
+        names = [name for name in record.frames if sensors is None or name in sensors]
+        return Step(
+            index=record.index,
+            time=record.time,
+            frames={name: _decode_frame(name, record.frames[name], messages) for name in names},
+            arms={name: _decode_arm(name, messages) for name in record.arms},
+            action=None if record.action is None else Action(_poses(record.action)),
+            sent=_poses(record.sent),
+            reward=record.reward,
+            distance=record.distance,
+            info=record.info,
+            seconds=record.seconds,
+        )
+    except EpisodeError:
+        raise
+    except KeyError as missing:
+        raise EpisodeError(f"a step names the message {missing}, which is not there") from missing
+    except (ValidationError, DecodeError, ValueError) as failure:
+        raise EpisodeError(f"a step cannot be decoded: {failure}") from failure
+
+
+def _encode_frame(name: str, frame: TactileFrame, pitch: float) -> Iterator[Encoded]:
+    time = nanoseconds(frame.time)
+    stamp = _timestamp(time)
+    image = CompressedImage(timestamp=stamp, frame_id=name, data=encode_png(frame.image), format="png")
+    yield Encoded(f"/{name}/image", CompressedImage, time, image.SerializeToString())
+    if frame.surface is None:
+        return
+    surface = frame.surface
+    width = pitch * surface.height.shape[-1]  # [m] of the whole map
+    cells = _join(name, _SURFACE_FIELDS, surface.height[..., None], surface.gradient)
+    yield Encoded(f"/{name}/surface", Grid, time, _encode_grid(name, stamp, cells, _SURFACE_FIELDS, width))
+    if surface.flow is not None:
+        cells = _join(name, _FLOW_FIELDS, surface.flow)
+        yield Encoded(f"/{name}/flow", Grid, time, _encode_grid(name, stamp, cells, _FLOW_FIELDS, width))
+
+
+def _decode_frame(name: str, record: FrameMessage, messages: Mapping[str, bytes]) -> TactileFrame:
+    image = CompressedImage.FromString(messages[f"/{name}/image"])
+    surface = None
+    if record.surface:
+        cells = _decode_grid(messages[f"/{name}/surface"], _SURFACE_FIELDS)
+        flow = _decode_grid(messages[f"/{name}/flow"], _FLOW_FIELDS) if record.flow else None
+        surface = SurfaceMap(height=cells[..., 0].copy(), gradient=cells[..., 1:].copy(), flow=flow)
+    pixels = decode_image(image.data, f"/{name}/image", formats=("PNG",))
+    return TactileFrame(image=pixels, time=record.time, index=record.index, surface=surface)
+
+
+def _frame_message(frame: TactileFrame) -> FrameMessage:
+    flow = frame.surface is not None and frame.surface.flow is not None
+    return FrameMessage(time=frame.time, index=int(frame.index), surface=frame.surface is not None, flow=flow)
+
+
+def _join(name: str, fields: tuple[str, ...], *arrays: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(h, w, fields) float32 from arrays that share (h, w). Refuses what could not be kept bit for bit."""
+    shapes = ", ".join(f"{array.shape} {array.dtype}" for array in arrays)
+    rows_columns = {array.shape[:2] for array in arrays}
+    channels = sum(array.shape[-1] for array in arrays)
+    if any(array.dtype != np.float32 or array.ndim != 3 or array.size == 0 for array in arrays):
+        raise ValueError(f"{'/'.join(fields)} of sensor '{name}' must be float32 maps, got {shapes}")
+    if len(rows_columns) != 1 or channels != len(fields):
+        raise ValueError(f"{'/'.join(fields)} of sensor '{name}' do not belong together: {shapes}")
+    return np.concatenate(arrays, axis=-1)
+
+
+def _encode_grid(
+    name: str, stamp: Timestamp, cells: NDArray[np.float32], fields: tuple[str, ...], width: float
+) -> bytes:
+    rows, columns, channels = cells.shape
+    stride = channels * _FLOAT.itemsize
+    pitch = width / columns
+    grid = Grid(timestamp=stamp, frame_id=name, column_count=columns, row_stride=columns * stride, cell_stride=stride)
+    grid.cell_size.x = grid.cell_size.y = pitch
+    grid.pose.position.x, grid.pose.position.y = -columns * pitch / 2, -rows * pitch / 2
+    grid.pose.orientation.w = 1.0
+    for number, field in enumerate(fields):
+        grid.fields.add(name=field, offset=number * _FLOAT.itemsize, type=PackedElementField.FLOAT32)
+    grid.data = cells.astype(_FLOAT, copy=False).tobytes()
+    return grid.SerializeToString()
+
+
+def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
+    grid = Grid.FromString(data)
+    layout = tuple((field.name, field.offset, field.type) for field in grid.fields)
+    expected = tuple((name, i * _FLOAT.itemsize, PackedElementField.FLOAT32) for i, name in enumerate(fields))
+    stride = len(fields) * _FLOAT.itemsize
+    columns = grid.column_count
+    if layout != expected or grid.cell_stride != stride or grid.row_stride != columns * stride or columns == 0:
+        raise EpisodeError(f"a grid of {'/'.join(fields)} has another layout: {layout}")
+    if len(grid.data) == 0 or len(grid.data) % grid.row_stride:
+        raise EpisodeError(f"a grid of {'/'.join(fields)} has {len(grid.data)} bytes, rows have {grid.row_stride}")
+    cells = np.frombuffer(grid.data, dtype=_FLOAT).reshape(-1, columns, len(fields))
+    return cells.astype(np.float32)
+
+
+def _encode_arm(name: str, arm: ArmState) -> Iterator[Encoded]:
+    time = nanoseconds(arm.time)
+    pose = PoseInFrame(timestamp=_timestamp(time), frame_id="world")
+    place, turn = pose.pose.position, pose.pose.orientation
+    place.x, place.y, place.z = arm.pose.position.tolist()
+    turn.x, turn.y, turn.z, turn.w = arm.pose.quaternion.tolist()
+    yield Encoded(f"/{name}/pose", PoseInFrame, time, pose.SerializeToString())
+    joints = None if arm.joints is None else tuple(arm.joints.tolist())
+    record = ArmMessage(
+        twist=tuple(arm.twist.tolist()), wrench=tuple(arm.wrench.tolist()), joints=joints, time=arm.time
+    )
+    yield Encoded(f"/{name}/arm", ARM_SCHEMA, time, record.model_dump_json().encode())
+
+
+def _decode_arm(name: str, messages: Mapping[str, bytes]) -> ArmState:
+    pose = PoseInFrame.FromString(messages[f"/{name}/pose"]).pose
+    record = ArmMessage.model_validate_json(messages[f"/{name}/arm"])
+    place, turn = pose.position, pose.orientation
+    return ArmState(
+        pose=Pose(np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])),
+        twist=np.array(record.twist),
+        wrench=np.array(record.wrench),
+        joints=None if record.joints is None else np.array(record.joints, dtype=np.float64),
+        time=record.time,
+    )
+
+
+def _pose_messages(poses: Mapping[str, Pose | None]) -> dict[str, PoseMessage | None]:
+    return {
+        name: None
+        if pose is None
+        else PoseMessage(position=tuple(pose.position.tolist()), quaternion=tuple(pose.quaternion.tolist()))
+        for name, pose in poses.items()
+    }
+
+
+def _poses(records: Mapping[str, PoseMessage | None]) -> dict[str, Pose | None]:
+    return {
+        name: None if record is None else Pose(np.array(record.position), np.array(record.quaternion))
+        for name, record in records.items()
+    }
+
+
+def _timestamp(time: int) -> Timestamp:
+    return Timestamp(seconds=time // 10**9, nanos=time % 10**9)

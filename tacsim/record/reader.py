@@ -1,0 +1,151 @@
+"""Episodes from files, finished or not: as a whole, or step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata
+
+from tacsim.interface import TactileFrame
+from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
+from tacsim.record.messages import decode_step
+from tacsim.record.recovery import read_records
+from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, unsealed
+
+MAX_MEMORY = 4 << 30  # [bytes] of arrays in one episode in memory
+
+
+def read_episode(path: Path | str, *, max_memory: int = MAX_MEMORY) -> Episode:
+    """The whole episode. Of an unfinished or damaged file: all steps before the end or damage, `complete` False.
+
+    Raises EpisodeError: no such file, no episode, content beyond the limits (`max_memory` [bytes] of decoded arrays).
+    """
+    with EpisodeFile(path) as file:
+        episode = Episode(meta=file.meta)
+        memory = 0
+        for step in file.steps():
+            memory += sum(_memory(frame) for frame in step.frames.values())
+            if memory > max_memory:
+                raise EpisodeError(f"{path}: more than {max_memory} bytes decoded at step {step.index}; use iter_steps")
+            episode.steps.append(step)
+        episode.complete, episode.dropped = file.complete, file.dropped
+        return episode
+
+
+def iter_steps(path: Path | str) -> Iterator[Step]:
+    """The steps of an episode, one at a time in memory. Raises EpisodeError like `read_episode`."""
+    with EpisodeFile(path) as file:
+        yield from file.steps()
+
+
+class EpisodeFile:
+    """An open episode file: facts at once, steps one by one.
+
+    Args:
+        path: of the file.
+        sensors: only their frames are decoded; None: all.
+
+    Raises EpisodeError.
+    """
+
+    def __init__(self, path: Path | str, sensors: Container[str] | None = None) -> None:
+        self.path = Path(path)
+        self.complete = False  # after the last step: the file has its footer and all steps it claims
+        self.dropped = 0  # after the last step
+        self._sensors = sensors
+        self._closing: dict[str, int] | None = None
+        try:
+            if not self.path.is_file():
+                raise EpisodeError(f"{self.path}: no such file")
+            self._file = self.path.open("rb")
+        except OSError as failure:
+            raise EpisodeError(f"{self.path}: cannot be opened: {failure.strerror}") from failure
+        try:
+            self._records = read_records(self._file, self.path.stat().st_size, str(self.path))
+            self.meta = self._read_meta()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _read_meta(self) -> EpisodeMeta:
+        """Facts and attachments stand before the first step."""
+        found: tuple[EpisodeMeta, tuple[str, ...]] | None = None
+        attachments: dict[str, bytes] = {}
+        for record in self._records:
+            if isinstance(record, Metadata) and record.name == META:
+                found = decode_meta(record.metadata, str(self.path))
+            elif isinstance(record, Attachment):
+                attachments[record.name] = record.data
+            elif not isinstance(record, Header):
+                break
+            if found is not None and set(found[1]) <= set(attachments):
+                return replace(found[0], attachments=attachments)
+        if found is None:
+            raise EpisodeError(f"{self.path}: no episode: its facts are missing or damaged (metadata '{META}')")
+        missing = sorted(set(found[1]) - set(attachments))
+        raise EpisodeError(f"{self.path}: attachment '{missing[0]}' is missing or damaged")
+
+    def steps(self) -> Iterator[Step]:
+        """The steps that follow, in order; ends at the end of the file or at the first damage."""
+        topics: dict[int, str] = {}
+        pending: dict[str, bytes] = {}
+        count = 0
+        for record in self._records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Metadata) and record.name == CLOSE:
+                self._closing = _closing(record)
+            elif isinstance(record, Footer):
+                self._close_account(count)
+            elif isinstance(record, Message):
+                if record.channel_id not in topics:
+                    return
+                topic = topics[record.channel_id]
+                if topic != STEP_TOPIC:
+                    pending[topic] = record.data
+                    continue
+                if record.sequence != count % 2**32:  # a damaged record hid a step: what follows does not belong here
+                    return
+                try:
+                    yield decode_step(record.data, pending, self._sensors)
+                except EpisodeError as failure:
+                    raise EpisodeError(f"{self.path}: step number {count}: {failure}") from failure
+                pending.clear()
+                count += 1
+
+    def _close_account(self, count: int) -> None:
+        if self._closing is not None:
+            self.complete = self._closing["steps"] == count
+            self.dropped = self._closing["dropped"]
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _closing(record: Metadata) -> dict[str, int] | None:
+    """Numbers of the closing record; None when it is damaged."""
+    try:
+        values = unsealed(record.metadata, CLOSE)
+        return {key: int(values[key]) for key in ("steps", "dropped")}
+    except (EpisodeError, KeyError, ValueError):
+        return None
+
+
+def _memory(frame: TactileFrame) -> int:
+    """Bytes of the arrays of a frame."""
+    if frame.surface is None:
+        return frame.image.nbytes
+    flow = 0 if frame.surface.flow is None else frame.surface.flow.nbytes
+    return frame.image.nbytes + frame.surface.height.nbytes + frame.surface.gradient.nbytes + flow

@@ -1,0 +1,205 @@
+"""The recorder: control steps go into an MCAP file as they happen, on a thread of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mimetypes
+import queue
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
+
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+from tacsim.record.episode import EpisodeMeta, Step
+from tacsim.record.messages import encode_step, nanoseconds
+from tacsim.record.schemas import CLOSE, FORMAT, JSON_SCHEMAS, MAX_ATTACHMENT, META, encode_meta, sealed
+
+_ONE_CHUNK = 1 << 40  # [bytes] a chunk ends with its step, never by size
+
+
+class Recorder:
+    """Writes an episode. The control loop hands over steps and never waits; encoding and disk are on another thread.
+
+    Each step is one chunk, flushed to the operating system: what was flushed is readable after a kill. Facts and
+    attachments are written at once, so a killed recording has them too. When the disk fills up (or a step cannot be
+    encoded) the recording ends, the reason is in `error`, and what was flushed stays readable.
+
+    The arrays of a step must not change after `write`: they are encoded later.
+
+    Args:
+        path: of the new file.
+        meta: facts and attachments of the episode.
+        capacity: steps that may wait; beyond it whole steps are dropped and counted.
+        pitch: of the canonical grid [m]; viewers draw the surface maps with it.
+
+    Raises:
+        FileExistsError: an existing file is never overwritten.
+        OSError: the file cannot be created or written.
+        ValueError: an attachment is larger than 64 MiB.
+    """
+
+    def __init__(self, path: Path | str, meta: EpisodeMeta, *, capacity: int = 64, pitch: float = 0.25e-3) -> None:
+        for name, content in meta.attachments.items():
+            if len(content) > MAX_ATTACHMENT:
+                raise ValueError(f"attachment '{name}' has {len(content)} bytes; at most {MAX_ATTACHMENT} are allowed")
+        if capacity < 1:
+            raise ValueError(f"capacity must be at least 1 step, got {capacity}")
+        self.path = Path(path)
+        self._pitch = pitch
+        self._queue: queue.Queue[Step | None] = queue.Queue(capacity)
+        self._change = threading.Condition()  # guards the four below
+        self._accepted = self._handled = self._dropped = self._written = 0
+        self._error: Exception | None = None
+        self._closed = False
+        self._schemas: dict[str | type[Message], int] = {}
+        self._channels: dict[str, int] = {}
+        self._file = open_new(self.path)
+        try:
+            self._writer = _start(self._file, meta)
+        except BaseException:  # nothing of use is in the file yet
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self.path.unlink(missing_ok=True)
+            raise
+        self._thread = threading.Thread(target=self._run, name=f"recorder {self.path.name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def written(self) -> int:
+        """Steps that are in the file, flushed."""
+        with self._change:
+            return self._written
+
+    @property
+    def dropped(self) -> int:
+        """Steps that are not in the file: the queue was full, or the recording had ended with an error."""
+        with self._change:
+            return self._dropped
+
+    @property
+    def error(self) -> Exception | None:
+        """What ended the recording early: OSError from the disk, ValueError from a step that cannot be encoded."""
+        return self._error
+
+    def write(self, step: Step) -> bool:
+        """Hands over a step, never blocks. False: it was dropped (see `error`). Raises ValueError when closed."""
+        if self._closed:
+            raise ValueError(f"the recorder of '{self.path}' is closed")
+        with self._change:
+            try:
+                if self._error is not None:
+                    raise queue.Full
+                self._queue.put_nowait(step)
+            except queue.Full:
+                self._dropped += 1
+                return False
+            self._accepted += 1
+            return True
+
+    def flush(self, timeout: float = 10.0) -> bool:
+        """Waits until all steps handed over are in the file (or dropped); False when `timeout` [s] was too short."""
+        with self._change:
+            goal = self._accepted
+            return self._change.wait_for(lambda: self._handled >= goal, timeout)
+
+    def close(self) -> None:
+        """Writes what is waiting, finishes the file and closes it. Errors of the disk are in `error`."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(None)  # waits for room; the thread always makes some
+        self._thread.join()
+        try:
+            if not isinstance(self._error, OSError):  # else the file is broken off and has to stay so
+                self._finish()
+            self._file.close()
+        except OSError as failure:
+            self._error = self._error or failure
+            with contextlib.suppress(OSError):
+                self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        while (step := self._queue.get()) is not None:
+            try:
+                if self._error is None:
+                    self._append(step)
+            except Exception as failure:  # recording must not end the control loop
+                self._error = failure
+            with self._change:
+                if self._error is None:
+                    self._written += 1
+                else:
+                    self._dropped += 1
+                self._handled += 1
+                self._change.notify_all()
+
+    def _append(self, step: Step) -> None:
+        messages = encode_step(step, self._pitch)  # all of it, before any of it is in the file
+        time = nanoseconds(step.time)
+        for message in messages:
+            channel = self._channel(message.topic, message.schema)
+            # All at the step's time: readers that sort by time keep their order. `written` shows a missing step.
+            self._writer.add_message(channel, time, message.data, message.time, sequence=self._written)
+        _flush(self._writer)
+
+    def _channel(self, topic: str, schema: str | type[Message]) -> int:
+        if topic not in self._channels:
+            encoding = MessageEncoding.JSON if isinstance(schema, str) else MessageEncoding.Protobuf
+            self._channels[topic] = self._writer.register_channel(topic, encoding, self._schema(schema))
+        return self._channels[topic]
+
+    def _schema(self, schema: str | type[Message]) -> int:
+        if schema not in self._schemas:
+            if isinstance(schema, str):
+                text = _json_schema(schema)
+                self._schemas[schema] = self._writer.register_schema(schema, SchemaEncoding.JSONSchema, text)
+            else:
+                self._schemas[schema] = register_schema(self._writer, schema)
+        return self._schemas[schema]
+
+    def _finish(self) -> None:
+        facts = {"steps": str(self._written), "dropped": str(self._dropped)}
+        if self._error is not None:
+            facts["error"] = str(self._error)
+        self._writer.add_metadata(CLOSE, sealed(facts))
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+
+def open_new(path: Path) -> BinaryIO:
+    """A new file for writing. Raises FileExistsError, OSError."""
+    return path.open("xb")
+
+
+def _start(file: BinaryIO, meta: EpisodeMeta) -> Writer:
+    # Uncompressed: the pictures are PNG already, and a reader needs no defence against decompression bombs.
+    writer = Writer(file, chunk_size=_ONE_CHUNK, compression=CompressionType.NONE)
+    writer.start(library=f"tacsim episode {FORMAT}")
+    writer.add_metadata(META, encode_meta(meta))
+    for name, content in meta.attachments.items():
+        media = mimetypes.guess_type(name)[0] or "application/octet-stream"
+        writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media, data=content)
+    _flush(writer)
+    return writer
+
+
+def _flush(writer: Writer) -> None:
+    """The chunk in progress goes to the file, the file to the operating system."""
+    writer.flush()  # type: ignore[no-untyped-call]
+
+
+def _json_schema(name: str) -> bytes:
+    return json.dumps({"title": name, **JSON_SCHEMAS[name].model_json_schema()}).encode()

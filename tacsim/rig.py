@@ -1,0 +1,168 @@
+"""A rig: sensors, arms and a clock behind one contract. One code path for simulated, mock, real and replayed rigs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Protocol, Self
+
+from tacsim.interface import (
+    Action,
+    Arm,
+    ArmState,
+    Clock,
+    IncompatibleRig,
+    Needs,
+    Normaliser,
+    Observation,
+    Pose,
+    RigSpec,
+    TactileFrame,
+    TactileSource,
+    Truth,
+)
+from tacsim.limits import ActionError
+
+
+class Start(Protocol):
+    """What brings a rig to the start of an episode; `Rig.reset` calls the two in this order."""
+
+    def clear(self, seed: int) -> Mapping[str, TactileFrame]:
+        """Takes the gels clear of everything and returns one frame of each sensor without contact: the references I0."""
+        ...
+
+    def touch(self) -> None:
+        """Brings the gels into gentle contact with the body, where there is something to touch."""
+        ...
+
+
+class Rig:
+    """What a policy acts on. `tacsim.rig.Rig` never asks what kind of sensors and arms it holds.
+
+    Args:
+        name: for messages and records.
+        sensors, arms: by name.
+        normalisers: one for each sensor.
+        start: brings the rig to the start of an episode.
+        truth: the body as only a simulation knows it; None on rigs without.
+        diagnostics: numbers about the last control step for the record, e.g. the settle residual.
+        read_timeout: how long to wait for a frame [s].
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        sensors: Mapping[str, TactileSource],
+        arms: Mapping[str, Arm],
+        clock: Clock,
+        normalisers: Mapping[str, Normaliser],
+        start: Start,
+        truth: Callable[[], Truth | None] | None = None,
+        diagnostics: Callable[[], Mapping[str, float]] = dict,
+        read_timeout: float = 1.0,
+    ) -> None:
+        if set(normalisers) != set(sensors):
+            raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
+        self.name = name
+        self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
+        self._normalisers, self._start, self._truth = dict(normalisers), start, truth
+        self._diagnostics, self._timeout = diagnostics, read_timeout
+        self._frames: Mapping[str, TactileFrame] = {}
+        self._references: Mapping[str, TactileFrame] = {}
+        specs = {sensor: source.spec for sensor, source in sensors.items()}
+        self.spec = RigSpec(sensors=specs, arms=tuple(arms), truth=truth is not None, period=clock.period)
+        # A sensor that no arm carries may be addressed by its own name: the action is recorded, nothing moves.
+        self._addressable = set(arms) | {sensor for sensor, spec in specs.items() if spec.arm is None}
+
+    @property
+    def frames(self) -> Mapping[str, TactileFrame]:
+        """Native frames of the last observation, by sensor; empty before the first."""
+        return self._frames
+
+    @property
+    def references(self) -> Mapping[str, TactileFrame]:
+        """Native frames without contact that the last reset took, by sensor; empty before the first reset."""
+        return self._references
+
+    def require(self, needs: Needs, who: str) -> None:
+        """Raises IncompatibleRig with the difference when `who` needs what this rig does not deliver."""
+        missing = needs.missing(self.spec)
+        if missing:
+            has = f"sensors {', '.join(self.spec.sensors)}; arms {', '.join(self.spec.arms) or '(none)'}"
+            raise IncompatibleRig(f"{who} cannot run on rig '{self.name}': it lacks {'; '.join(missing)}. It has {has}")
+
+    def reset(self, seed: int = 0) -> Observation:
+        """References without contact, then gentle contact: the start of an episode. Same seed, same start."""
+        self._references = dict(self._start.clear(seed))
+        for name, normaliser in self._normalisers.items():
+            normaliser.take_reference(self._references[name])
+        self._start.touch()
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """What the sensors and arms say now. Raises TimeoutError without a frame, EndOfEpisode after a recording."""
+        frames = {name: sensor.read(self._timeout) for name, sensor in self._sensors.items()}
+        arms: dict[str, ArmState] = {name: arm.state() for name, arm in self._arms.items()}
+        now = self._clock.now()
+        tactile = {name: self._normalisers[name](frame, now) for name, frame in frames.items()}
+        self._frames = frames
+        return Observation(tactile=tactile, arms=arms, time=now)
+
+    def step(self, action: Action) -> tuple[Observation, Mapping[str, Pose | None]]:
+        """One control period: commands the arms, lets the clock run, observes.
+
+        Returns the observation and what each arm was really sent (None: nothing was executed).
+        Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged.
+        """
+        self._check(action.tool)
+        sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self._arms.items()}
+        self._clock.tick()
+        return self.observe(), sent
+
+    def _check(self, tool: Mapping[str, object]) -> None:
+        for name, target in tool.items():
+            if name not in self._addressable:
+                names = ", ".join(sorted(self._addressable)) or "(none)"
+                raise ActionError(f"action for '{name}', but rig '{self.name}' moves only: {names}")
+            if target is not None and not isinstance(target, Pose):
+                raise ActionError(f"action for '{name}' must be a tacsim.interface.Pose or None, got {target!r}")
+
+    def truth(self) -> Truth | None:
+        """The body as only a simulation knows it; for tasks, never for policies."""
+        return None if self._truth is None else self._truth()
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """Numbers about the last control step, e.g. the residual of the simulation's settling."""
+        return self._diagnostics()
+
+    def stop(self) -> None:
+        """Stops all arms, each even when another fails to stop."""
+        _each([arm.stop for arm in self._arms.values()])
+
+    def close(self) -> None:
+        """Stops the arms and closes everything, each even when another fails."""
+        arms = [step for arm in self._arms.values() for step in (arm.stop, arm.close)]
+        _each([*arms, *(sensor.close for sensor in self._sensors.values())])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _each(calls: list[Callable[[], None]]) -> None:
+    """Runs all calls, then raises what failed."""
+    failures: list[Exception] = []
+    for call in calls:
+        try:
+            call()
+        except Exception as failure:  # every arm must get its stop
+            failures.append(failure)
+    if len(failures) == 1:
+        raise failures[0]
+    if failures:
+        raise ExceptionGroup("several parts of the rig failed to stop or close", failures)

@@ -1,0 +1,274 @@
+"""The simulator behind the contract: one World seen as sensors, arms and a clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap, TactileFrame, Truth
+from tacsim.physics.world import MoveStats, World
+from tacsim.scene import GelSurface
+
+CLEARANCE = 0.05e-3  # gap that the first, fast part of an approach leaves [m]
+FIRST_STEP = 0.1e-3  # of the slow part [m]
+TOUCH_TOLERANCE = 0.2  # the touch force may be exceeded by this fraction
+MOST_MOVES = 80  # of one approach
+SMALLEST_STEP = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
+
+
+class NoTouch(RuntimeError):
+    """The approach at reset found no gentle contact."""
+
+
+class SimClock:
+    """Simulated time. `tick` drives all arms to what they were commanded and advances time by one period.
+
+    `version` counts the states of the world, so that a picture is rendered once a state.
+    """
+
+    def __init__(self, world: World, period: float) -> None:
+        self._world = world
+        self._period = period
+        self._targets: dict[str, Pose] = {}
+        self._time = 0.0
+        self.version = 0
+        self.stats: MoveStats | None = None  # of the last tick that moved
+        self.velocities: Mapping[str, FloatArray] = {}  # (6,) mean of the last period, world axes [m/s, rad/s]
+
+    @property
+    def period(self) -> float:
+        return self._period
+
+    def now(self) -> float:
+        return self._time
+
+    def target(self, frame: str, pose: Pose) -> None:
+        """Where `frame` shall be at the end of the period."""
+        self._targets[frame] = pose
+
+    def forget(self) -> None:
+        """Drops what was commanded and not yet driven."""
+        self._targets = {}
+
+    def tick(self) -> None:
+        """Raises SimulationDiverged. A world that is settled and commanded to stay is left as it is."""
+        targets, self._targets = self._targets, {}
+        before = {frame: self._world.pose(frame) for frame in targets}
+        if targets or (self.stats is not None and not self.stats.settled):
+            self.stats = self._world.move(targets)
+        self.velocities = {
+            frame: se3.difference(old, self._world.pose(frame)) / self._period for frame, old in before.items()
+        }
+        self._time += self._period
+        self.version += 1
+
+    def restart(self, stats: MoveStats | None = None) -> None:
+        """Time zero, with a world that was put there from outside."""
+        self._time, self._targets, self.velocities, self.stats = 0.0, {}, {}, stats
+        self.version += 1
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """How the last move went: see tacsim.physics.world.MoveStats."""
+        stats = self.stats
+        if stats is None:
+            return {}
+        return {
+            "substeps": float(stats.substeps),
+            "residual": stats.residual,
+            "settled": float(stats.settled),
+            "overlap": stats.overlap,
+            "guard_hits": float(stats.guard_hits),
+        }
+
+
+class SimArm:
+    """Carries one frame of the world (a sensor, or "indenter") exactly where it is told.
+
+    `limit` is the guard that a real arm would have: target and present pose -> pose allowed; it may raise.
+    """
+
+    def __init__(self, world: World, clock: SimClock, frame: str, limit: Callable[[Pose, Pose], Pose]) -> None:
+        self._world, self._clock, self._frame, self._limit = world, clock, frame, limit
+
+    def state(self) -> ArmState:
+        return ArmState(
+            pose=self._world.pose(self._frame),
+            twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
+            wrench=np.array(self._world.wrench(self._frame), dtype=np.float64),
+            joints=None,
+            time=self._clock.now(),
+        )
+
+    def command(self, target: Pose | None) -> Pose | None:
+        """Takes effect at the next tick; None holds. Returns the pose after the limits."""
+        if target is None:
+            return None
+        allowed = self._limit(target, self._world.pose(self._frame))
+        self._clock.target(self._frame, allowed)
+        return allowed
+
+    def stop(self) -> None:
+        self._clock.forget()
+
+    def recover(self) -> None:
+        """A simulated arm has no faults to recover from."""
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class SimSensor:
+    """One simulated tactile sensor; a picture is rendered only when it is read, and once a state of the world.
+
+    Args:
+        render: gel surface -> (H, W, 3) uint8 RGB.
+        sample: gel surface -> height, gradient and flow on the canonical grid.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        clock: SimClock,
+        frame: str,
+        spec: SensorSpec,
+        render: Callable[[GelSurface], NDArray[np.uint8]],
+        sample: Callable[[GelSurface], SurfaceMap],
+    ) -> None:
+        self._world, self._clock, self._frame, self._spec = world, clock, frame, spec
+        self._render, self._sample = render, sample
+        self._newest: TactileFrame | None = None
+        self._version = -1  # of the world in the newest frame
+        self._index = 0
+
+    @property
+    def spec(self) -> SensorSpec:
+        return self._spec
+
+    def read(self, timeout: float) -> TactileFrame:
+        """The picture of the world as it is now; simulation never times out."""
+        if self._newest is None or self._version != self._clock.version:
+            surface = self._world.surface(self._frame)
+            self._newest = TactileFrame(
+                image=self._render(surface), time=self._clock.now(), index=self._index, surface=self._sample(surface)
+            )
+            self._version, self._index = self._clock.version, self._index + 1
+        return self._newest
+
+    def restart(self) -> None:
+        """Counts frames from zero again."""
+        self._newest, self._index = None, 0
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class SimStart:
+    """Start of a simulated episode: the world's initial state, and the approach to gentle contact.
+
+    Args:
+        touch_force: normal force that ends the approach [N]; None leaves the gels clear.
+        placement: the gels start at most this far beside the body in world x and y, drawn from the seed [m].
+    """
+
+    def __init__(
+        self,
+        world: World,
+        clock: SimClock,
+        sensors: Mapping[str, SimSensor],
+        touch_force: float | None,
+        placement: float = 0.0,
+    ) -> None:
+        self._world, self._clock, self._sensors = world, clock, sensors
+        self._touch_force, self._placement = touch_force, placement
+        self._initial = world.snapshot()
+        self._offset = np.zeros(2)
+        # The last approach: where it started from, and the state it ended in. The same start gives the same end.
+        self._touched: tuple[FloatArray, Mapping[str, NDArray[Any]], MoveStats | None] | None = None
+
+    def clear(self, seed: int) -> Mapping[str, TactileFrame]:
+        self._world.restore(self._initial)
+        self._offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
+        if self._offset.any():
+            shift = np.append(self._offset, 0.0)
+            poses = {name: self._world.pose(name) for name in self._world.sensors}
+            self._world.move({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
+        self._clock.restart()
+        for sensor in self._sensors.values():
+            sensor.restart()
+        return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}
+
+    def touch(self) -> None:
+        """Raises NoTouch when no gentle contact is found."""
+        if self._touch_force is None:
+            return
+        if self._touched is None or not np.array_equal(self._touched[0], self._offset):
+            stats = approach(self._world, self._touch_force)
+            self._touched = (self._offset, self._world.snapshot(), stats)
+        else:
+            self._world.restore(self._touched[1])
+        self._clock.restart(self._touched[2])
+
+
+def approach(world: World, touch_force: float) -> MoveStats | None:
+    """Moves all sensors along their own z towards the body until the smallest of their normal forces reaches `touch_force` [N].
+
+    A fast part closes the gaps that are known; then steps whose length is found by the secant rule. A step that presses
+    harder than touch_force * (1 + TOUCH_TOLERANCE) is taken back, state and all, and made shorter, so that the body
+    keeps no trace of it. Returns how the last move went, None if there was none. Raises NoTouch.
+    """
+    stats = _close_gaps(world)
+    step, force = FIRST_STEP, _least_force(world)
+    for _ in range(MOST_MOVES):
+        if force >= touch_force:
+            return stats
+        before, force_before = world.snapshot(), force
+        stats = _advance(world, dict.fromkeys(world.sensors, step))
+        force = _least_force(world)
+        stiffness = (force - force_before) / step
+        if force > touch_force * (1 + TOUCH_TOLERANCE):
+            world.restore(before)
+            force = force_before
+            # Aim into the allowed band; contact begins somewhere inside the step, so the secant alone may fall short.
+            step *= min(max((touch_force * (1 + TOUCH_TOLERANCE / 2) - force) / (stiffness * step), 0.1), 0.7)
+        elif stiffness > 0:
+            step = min(max((touch_force * (1 + TOUCH_TOLERANCE / 2) - force) / stiffness, step / 4), FIRST_STEP)
+        if step < SMALLEST_STEP:
+            break
+    raise NoTouch(
+        f"approach found no gentle contact: least normal force {force:.4g} N of {touch_force:.4g} N wanted after at most "
+        f"{MOST_MOVES} moves, last step {step:.3g} m. Is the body between the gels (scene.body), and touch_force "
+        "above what the scene's settling tolerance can resolve?"
+    )
+
+
+def _close_gaps(world: World) -> MoveStats | None:
+    """Drives each sensor to CLEARANCE before the body's nearest particle, where a body is known and there is a gap."""
+    truth = world.truth()
+    if truth is None:
+        return None
+    gaps = {name: _gap(truth, world.pose(name)) - CLEARANCE for name in world.sensors}
+    wanted = {name: gap for name, gap in gaps.items() if gap > 0}
+    return _advance(world, wanted) if wanted else None
+
+
+def _gap(truth: Truth, sensor: Pose) -> float:
+    """From the gel's rest surface to the nearest face of the body, along the sensor's z [m]."""
+    points = truth.points.astype(np.float64)
+    radius = 0.5 * (truth.height - float(np.ptp(points[:, 2])))
+    axis = se3.rotation(sensor).as_matrix()[:, 2]
+    return float(((points - sensor.position) @ axis).min()) - radius
+
+
+def _advance(world: World, steps: Mapping[str, float]) -> MoveStats:
+    """Moves each named sensor along its own z by its step [m]."""
+    forward = {name: Pose(np.array([0.0, 0.0, step])) for name, step in steps.items()}
+    return world.move({name: se3.compose(world.pose(name), move) for name, move in forward.items()})
+
+
+def _least_force(world: World) -> float:
+    """Smallest normal force over the sensors, positive when pressed [N]."""
+    return min(-float(world.wrench(name)[2]) for name in world.sensors)

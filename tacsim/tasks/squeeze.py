@@ -1,0 +1,77 @@
+"""Squeeze: bring the body to a desired height by moving both sensors along world z."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacsim.interface import Action, Needs, Observation, Policy, Pose, TactileObservation, Truth
+from tacsim.rigfile import SqueezeFacts
+from tacsim.tasks.task import Axis
+
+REACHED = 0.01e-3  # the scripted policy holds when its estimate is this near the goal [m]
+
+
+@dataclass(frozen=True, slots=True)
+class Squeeze:
+    """distance = |height - goal|, height = z-extent of the body."""
+
+    facts: SqueezeFacts
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(arms=frozenset({"lower", "upper"}), truth=True)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        return (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (0.0, 0.0, 1.0)))
+
+    def distance(self, truth: Truth, start: Truth) -> float:
+        return abs(truth.height - self.facts.goal)
+
+    def scripted(self, *, through: bool = False) -> Policy:
+        return ScriptedSqueeze(self.facts, through)
+
+
+class ScriptedSqueeze:
+    """Closes both sensors alike at half of max_step until the height it feels is the goal, then holds.
+
+    The last step is shortened to end at the goal. With `through` it then goes on at the full rate.
+    """
+
+    def __init__(self, facts: SqueezeFacts, through: bool) -> None:
+        self._goal, self._rate, self._through = facts.goal, facts.max_step / 2, through
+        self._reached = False
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(sensors=frozenset({"lower", "upper"}), arms=frozenset({"lower", "upper"}), height=True)
+
+    def reset(self) -> None:
+        self._reached = False
+
+    def __call__(self, observation: Observation) -> Action:
+        above = felt_height(observation) - self._goal
+        self._reached = self._reached or above <= REACHED
+        if self._reached and not self._through:
+            return Action({"lower": None, "upper": None})
+        step = self._rate if self._reached else min(self._rate, above / 2)
+        up = np.array([0.0, 0.0, step])
+        lower, upper = observation.arms["lower"].pose, observation.arms["upper"].pose
+        return Action(
+            {"lower": Pose(lower.position + up, lower.quaternion), "upper": Pose(upper.position - up, upper.quaternion)}
+        )
+
+
+def felt_height(observation: Observation) -> float:
+    """Height of the body as the sensors feel it [m]: the gap between the gels' rest surfaces plus how deep it is in each."""
+    gap = float(observation.arms["upper"].pose.position[2] - observation.arms["lower"].pose.position[2])
+    return gap + indentation(observation.tactile["lower"]) + indentation(observation.tactile["upper"])
+
+
+def indentation(touch: TactileObservation) -> float:
+    """Greatest depth of the body in the gel [m]; 0 without contact."""
+    if touch.height is None:
+        raise ValueError("indentation: this sensor delivers no surface height")
+    return max(0.0, float(touch.height.max(where=touch.valid, initial=0.0)))

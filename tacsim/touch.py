@@ -1,0 +1,32 @@
+"""What counts as touch: thresholds of the contact mask, and one number for "how much". NumPy only, the same everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import TactileObservation
+
+CONTACT_HEIGHT = 20e-6  # surface pressed deeper than this touches: ten times the usual gel texture of 2 um [m]
+CONTACT_DIFFERENCE = 0.10  # relative change of colour that counts as contact; camera noise is 0.02 to 0.03 [-]
+
+
+def contact_signal(observation: TactileObservation) -> float:
+    """Mean of |I - I0| / mean(I0) over valid pixels and channels [-]: 0 without contact, grows with the press.
+
+    Reads the 8-bit canonical image, so changes beyond a full mean(I0) saturate at 1. Raises ValueError when no pixel is
+    valid or when the image is no whole multiple of the `valid` mask.
+    """
+    valid = pixel_mask(observation.valid, observation.image.shape[:2])
+    if not valid.any():
+        raise ValueError("contact_signal: no valid pixel; does the canonical grid overlap the gel?")
+    return float(np.abs(observation.image[valid].astype(np.int16) - 128).mean() / 128.0)
+
+
+def pixel_mask(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask over grid cells (h, w), spread to the pixels (H, W) of the canonical image. Raises ValueError if H, W are
+    no whole multiple of h, w."""
+    scale = shape[0] // cells.shape[0]
+    if scale < 1 or shape != (cells.shape[0] * scale, cells.shape[1] * scale):
+        raise ValueError(f"image of {shape} pixels is no whole multiple of the canonical grid of {cells.shape} cells")
+    return np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)

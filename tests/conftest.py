@@ -1,0 +1,89 @@
+"""Tests meet simulated hardware only: no socket leaves this machine, no serial port and no camera is opened.
+
+The guards hold in the test's own process; a process that a test starts must be pointed at loopback by the test.
+"""
+
+from __future__ import annotations
+
+import builtins
+import io
+import ipaddress
+import os
+import socket
+from collections.abc import Callable
+from numbers import Integral
+from typing import Any
+
+import pytest
+
+DEVICES = ("/dev/tty", "/dev/video", "/dev/serial")
+
+
+class RealHardware(AssertionError):
+    """A test reached for something outside this machine's memory and disk."""
+
+
+def is_local(address: object) -> bool:
+    """True for loopback addresses and Unix sockets; a host name counts as outside, except localhost."""
+    if not isinstance(address, tuple):
+        return True  # AF_UNIX: a path
+    host = str(address[0])
+    if host in ("localhost", ""):
+        return True
+    try:
+        return ipaddress.ip_address(host.partition("%")[0]).is_loopback
+    except ValueError:
+        return False
+
+
+def _guard_socket(method: Callable[..., Any], address_of: Callable[[tuple[Any, ...]], object]) -> Callable[..., Any]:
+    def guarded(self: socket.socket, *arguments: Any) -> Any:
+        address = address_of(arguments)
+        if not is_local(address):
+            raise RealHardware(f"test opened a socket to {address!r}; only loopback is allowed: use the mock hardware")
+        return method(self, *arguments)
+
+    return guarded
+
+
+def _guard_path(function: Callable[..., Any]) -> Callable[..., Any]:
+    def guarded(file: Any, *arguments: Any, **options: Any) -> Any:
+        if isinstance(file, str | bytes | os.PathLike) and os.fsdecode(file).startswith(DEVICES):
+            raise RealHardware(f"test opened the device {os.fsdecode(file)}: use the mock hardware")
+        return function(file, *arguments, **options)
+
+    return guarded
+
+
+def _guard_camera(capture: type) -> type:
+    class GuardedCapture(capture):  # type: ignore[misc]
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            _refuse_camera(arguments[0] if arguments else options.get("filename", options.get("index")))
+            super().__init__(*arguments, **options)
+
+        def open(self, *arguments: Any, **options: Any) -> Any:
+            _refuse_camera(arguments[0] if arguments else options.get("filename", options.get("index")))
+            return super().open(*arguments, **options)
+
+    return GuardedCapture
+
+
+def _refuse_camera(source: object) -> None:
+    if isinstance(source, Integral) or str(source).startswith(DEVICES):
+        raise RealHardware(f"test opened camera {source!r}: use recorded or simulated frames")
+
+
+@pytest.fixture(autouse=True)
+def no_real_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sockets outside loopback, serial devices and cameras raise RealHardware."""
+    real = socket.socket
+    monkeypatch.setattr(real, "connect", _guard_socket(real.connect, lambda given: given[0]))
+    monkeypatch.setattr(real, "connect_ex", _guard_socket(real.connect_ex, lambda given: given[0]))
+    monkeypatch.setattr(real, "sendto", _guard_socket(real.sendto, lambda given: given[-1]))
+    monkeypatch.setattr(real, "sendmsg", _guard_socket(real.sendmsg, lambda given: given[3] if len(given) > 3 else None))
+    monkeypatch.setattr(builtins, "open", _guard_path(builtins.open))
+    monkeypatch.setattr(io, "open", _guard_path(io.open))
+    monkeypatch.setattr(os, "open", _guard_path(os.open))
+    import cv2
+
+    monkeypatch.setattr(cv2, "VideoCapture", _guard_camera(cv2.VideoCapture))

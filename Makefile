@@ -7,7 +7,7 @@ ARGS ?=
 
 BIN := .venv/bin
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d%d" % sys.version_info[:2])' 2>/dev/null)
-CONSTRAINTS := constraints/py$(VERSION).txt
+CONSTRAINTS := $(wildcard constraints/py$(VERSION).txt)
 INSTALL := $(BIN)/python -m pip install -qq --no-input --disable-pip-version-check -c $(CONSTRAINTS)
 # One stamp a Python version: another PYTHON, or a changed pyproject or constraints file, installs anew.
 CORE := .venv/installed-core-$(VERSION)
@@ -60,6 +60,7 @@ python:
 	@test -n "$(VERSION)" || { echo "make: cannot run '$(PYTHON)'. Install Python 3.11 to 3.13, or name one: make PYTHON=python3.12"; exit 1; }
 	@case "$(VERSION)" in 311|312|313) ;; *) \
 	  echo "make: tacsim needs Python 3.11, 3.12 or 3.13, but '$(PYTHON)' is $$($(PYTHON) -V 2>&1). Name another: make PYTHON=python3.12"; exit 1;; esac
+	@test -n "$(CONSTRAINTS)" || { echo "make: constraints/py$(VERSION).txt is missing; make lock writes it"; exit 1; }
 	@test "$$($(BIN)/python -c 'import sys; print("%d%d" % sys.version_info[:2])' 2>/dev/null)" = "$(VERSION)" || { \
 	  echo "Making a virtual environment in .venv ($$($(PYTHON) -V))"; rm -rf .venv; $(PYTHON) -m venv .venv; }
 
@@ -72,7 +73,3 @@ $(DEV): pyproject.toml $(CONSTRAINTS) | python
 	@echo "Installing tacsim and its development tools into .venv (a few minutes the first time)"
 	@$(INSTALL) -e '.[dev]'
 	@touch $@ $(CORE)
-
-# Only reached when this Python has no constraints file; `python` says why.
-constraints/py%.txt: | python
-	@echo "make: $@ is missing; make lock writes it" && exit 1

@@ -97,7 +97,7 @@ def second_opencv() -> list[Check]:
     found = ", ".join(f"{name} {installed[name]}" for name in others) + f" beside {OPENCV}"
     advice = (
         f"python -m pip uninstall -y {' '.join(others)} && "
-        f"python -m pip install --force-reinstall --no-deps {OPENCV}=={installed.get(OPENCV, '4.*')}"
+        f"python -m pip install --force-reinstall --no-deps {OPENCV}=={installed.get(canonicalize_name(OPENCV), '4.*')}"
     )
     return [Check("one cv2", "fail", found, advice)]
 
@@ -128,7 +128,9 @@ def kernel_cache(folder: Path) -> Check:
     """The folder of compiled kernels: without it every start compiles for tens of seconds."""
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
-        advice = "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
+        advice = (
+            "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
+        )
         return Check("kernel cache", "warn", f"{folder} is not writable", advice)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.exists() else 0
     return Check("kernel cache", "ok", f"{folder}, {size / 1e6:.1f} MB" + ("" if size else " (first run compiles)"))

@@ -75,9 +75,10 @@ def _arm(arm: ArmState, start: Pose) -> Flat:
     return {key: value.astype(np.float32) for key, value in flat.items()}
 
 
-def space_of(flat: Flat) -> spaces.Dict:
+def space_of(flat: Flat) -> spaces.Space[Flat]:
     """The Gymnasium space that `flat` and everything flattened from the same rig lies in."""
-    return spaces.Dict({key: _space(key, value) for key, value in flat.items()})
+    space: spaces.Space[Any] = spaces.Dict({key: _space(key, value) for key, value in flat.items()})
+    return space
 
 
 def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
@@ -89,7 +90,7 @@ def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
     return spaces.Box(-bound, bound, value.shape, np.float32)
 
 
-def action_space(axes: Sequence[Axis]) -> spaces.Box:
+def action_space(axes: Sequence[Axis]) -> spaces.Space[NDArray[np.float32]]:
     """Box(-1, 1) with one component for each free axis."""
     return spaces.Box(-1.0, 1.0, (len(axes),), np.float32)
 

@@ -1,7 +1,8 @@
 """Gymnasium environments: Env = Rig + Task.
 
-Gymnasium 1 finds environments of other packages by a module in the id: ``gymnasium.make("tacsim.env:tacsim/Squeeze-v0")``
-needs no import of tacsim; after ``import tacsim.env`` plain ``gymnasium.make("tacsim/Squeeze-v0")`` does.
+Gymnasium 1 has no plug-ins any more; an id names the module that registers it. So
+``gymnasium.make("tacsim.env:tacsim/Squeeze-v0")`` needs no import of tacsim, and after ``import tacsim.env`` plain
+``gymnasium.make("tacsim/Squeeze-v0")`` does.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         }
         return outcome.reward, info | dict(self.rig.diagnostics())
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones
         are padded with black below."""
         if self.render_mode is None:

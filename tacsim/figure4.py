@@ -174,7 +174,8 @@ def _gel_profile(height: NDArray[np.float32], pitch: float, pose: Pose, plane: f
     sensor = np.stack([x, y, -height.astype(np.float64)], axis=-1)
     world = transform(pose, sensor.reshape(-1, 3)).reshape(rows, columns, 3)
     nearest = np.abs(world[:, :, 1] - plane).argmin(axis=0)
-    return world[nearest, np.arange(columns)]
+    profile: NDArray[np.float64] = world[nearest, np.arange(columns)]
+    return profile
 
 
 def _frame_cut(axes: Axes, trial: Trial) -> None:

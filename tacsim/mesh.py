@@ -212,7 +212,8 @@ def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatA
 
     Exact where it is below `band` [m] (at least one grid spacing). Beyond, the sign is right and the value is the
     distance to the triangle that is nearest to the nearest node in the band: never too small; too large only where
-    several triangles are nearly as near, or where the grid leaves out the nearest part of the surface.
+    several triangles are nearly as near (by half a spacing at most in the tests: the centre of a ball), or where the
+    grid leaves out the nearest part of the surface.
 
     Raises ValueError when no node lies within `band` of the surface.
     """

@@ -20,6 +20,8 @@ UNITS: dict[str, dict[str, float]] = {
     "speed": {"m/s": 1.0, "mm/s": 1e-3},
     "density": {"kg/m^3": 1.0, "g/cm^3": 1e3},
 }
+# pydantic leaves the bounds of a validated number under its own names in the JSON schema.
+_BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
 _NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*(\S*)\s*")
 
@@ -63,14 +65,14 @@ def _parse_text(text: str, kind: str, allowed: str) -> float:
     for other, theirs in UNITS.items():
         if unit in theirs:
             raise ValueError(f"{text!r} is a {other}, not a {kind}; {allowed}")
-    close = [known for known in units if _one_letter_off(unit, known)]
+    close = [known for known in units if unit.lower() == known.lower()]
+    close = close or [known for known in units if _one_letter_off(unit, known)]
     hint = f"; did you mean '{number} {close[0]}'?" if len(close) == 1 else ""
     raise ValueError(f"{text!r}: no unit '{unit}' for a {kind}; {allowed}{hint}")
 
 
 def _one_letter_off(unit: str, known: str) -> bool:
-    """Same length and at most one letter differs, upper and lower case taken as equal."""
-    return len(unit) == len(known) and sum(a != b for a, b in zip(unit.lower(), known.lower(), strict=True)) <= 1
+    return len(unit) == len(known) > 1 and sum(a != b for a, b in zip(unit, known, strict=True)) == 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +88,8 @@ class Quantity:
         units = "|".join(re.escape(unit) for unit in UNITS[self.kind])
         text = {"type": "string", "pattern": rf"^\s*{_NUMBER}\s*({units})?\s*$"}
         si = next(iter(UNITS[self.kind]))
-        return {"description": f"{self.kind} [{si}]", "anyOf": [{"type": "number"}, text]}
+        number = {_BOUNDS.get(key, key): value for key, value in handler(schema).items()}
+        return {"description": f"{self.kind} [{si}]", "anyOf": [number, text]}
 
 
 Length = Annotated[float, Quantity("length")]  # [m]

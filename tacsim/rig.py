@@ -28,7 +28,7 @@ class Start(Protocol):
     """What brings a rig to the start of an episode; `Rig.reset` calls the two in this order."""
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
-        """Takes the gels clear of everything and returns one frame of each sensor without contact: the references I0."""
+        """Takes the gels clear of everything; returns a frame of each sensor without contact, the references I0."""
         ...
 
     def touch(self) -> None:

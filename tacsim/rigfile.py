@@ -8,16 +8,18 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
-from tacsim.quantity import Facts, Force, Length, Time
+from tacsim.quantity import Facts, Force, Length, Speed, Time
 from tacsim.scene import Scene
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 
 class SimArmFacts(Facts):
-    """A sensor carrier of the simulation: goes exactly where it is told, at the scene's quasi-static speed."""
+    """A sensor carrier of the simulation: goes exactly where it is told, within the reach of one control period."""
 
     driver: Literal["sim"]
+    speed: Annotated[Speed, Field(gt=0)] = 20e-3  # longest way of a control period / period [m/s]
+    turn_rate: Annotated[float, Field(gt=0)] = 0.5  # the same for rotation [rad/s]
 
 
 class ReplayArmFacts(Facts):
@@ -62,6 +64,7 @@ class SqueezeFacts(Facts):
     goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
     max_step: Annotated[Length, Field(gt=0)] = 0.2e-3  # largest motion of one sensor in a control step [m]
     touch_force: Annotated[Force, Field(gt=0)] = 0.05  # reset approaches until this [N]
+    placement: Annotated[Length, Field(ge=0)] = 0.0  # reset starts at most this far beside the body, by the seed [m]
     success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3  # reward = -distance / reward_scale
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
@@ -75,6 +78,7 @@ class RepositionFacts(Facts):
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
     max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
     touch_force: Annotated[Force, Field(gt=0)] = 0.3
+    placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.1e-3
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40
@@ -88,7 +92,7 @@ class RigFacts(Facts):
 
     name: str
     clock: Literal["sim", "replay"]
-    period: Annotated[Time, Field(gt=0)] = 0.1  # control period [s]
+    period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
     task: TaskFacts | None = None
     scene: Scene | None = None  # overrides the task's scene
     arms: dict[Name, ArmFacts] = {}
@@ -102,7 +106,11 @@ class RigFacts(Facts):
                 raise PydanticCustomError(
                     "no_such_arm",
                     "no arm '{arm}'; allowed: {arms}",
-                    # `at`: the entry to blame, below this model (tacsim.config shows its line)
-                    {"arm": sensor.arm, "arms": ", ".join(self.arms) or "(none)", "at": ("sensors", name, "arm")},
+                    # `at`: the entry to blame, as pydantic writes locations (tacsim.config shows its line)
+                    {
+                        "arm": sensor.arm,
+                        "arms": ", ".join(self.arms) or "(none)",
+                        "at": ("sensors", name, sensor.driver, "arm"),
+                    },
                 )
         return self

@@ -6,11 +6,14 @@ A second ``ti.init`` in one process crashes it, and fork after a start hangs: he
 import contextlib
 import io
 import os
+import warnings
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
-import taichi as ti
+with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
+    warnings.simplefilter("ignore")
+    import taichi as ti
 
 _started: str | None = None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap, TactileFrame, Truth
+from tacsim.limits import shorten
 from tacsim.physics.world import MoveStats, World
 from tacsim.scene import GelSurface
 
@@ -34,6 +36,7 @@ class SimClock:
         self._world = world
         self._period = period
         self._targets: dict[str, Pose] = {}
+        self._limited: dict[str, bool] = {}  # by frame, of the last period
         self._time = 0.0
         self.version = 0
         self.stats: MoveStats | None = None  # of the last tick that moved
@@ -46,9 +49,10 @@ class SimClock:
     def now(self) -> float:
         return self._time
 
-    def target(self, frame: str, pose: Pose) -> None:
-        """Where `frame` shall be at the end of the period."""
+    def target(self, frame: str, pose: Pose, limited: bool) -> None:
+        """Where `frame` shall be at the end of the period, and whether a guard has changed that."""
         self._targets[frame] = pose
+        self._limited[frame] = limited
 
     def forget(self) -> None:
         """Drops what was commanded and not yet driven."""
@@ -60,6 +64,8 @@ class SimClock:
         before = {frame: self._world.pose(frame) for frame in targets}
         if targets or (self.stats is not None and not self.stats.settled):
             self.stats = self._world.move(targets)
+        elif self.stats is not None:
+            self.stats = replace(self.stats, substeps=0, hold=0)
         self.velocities = {
             frame: se3.difference(old, self._world.pose(frame)) / self._period for frame, old in before.items()
         }
@@ -68,11 +74,11 @@ class SimClock:
 
     def restart(self, stats: MoveStats | None = None) -> None:
         """Time zero, with a world that was put there from outside."""
-        self._time, self._targets, self.velocities, self.stats = 0.0, {}, {}, stats
+        self._time, self._targets, self._limited, self.velocities, self.stats = 0.0, {}, {}, {}, stats
         self.version += 1
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How the last move went: see tacsim.physics.world.MoveStats."""
+        """How the last move went (see tacsim.physics.world.MoveStats), and how many targets the limits shortened."""
         stats = self.stats
         if stats is None:
             return {}
@@ -82,17 +88,19 @@ class SimClock:
             "settled": float(stats.settled),
             "overlap": stats.overlap,
             "guard_hits": float(stats.guard_hits),
+            "shortened": float(sum(self._limited.values())),
         }
 
 
 class SimArm:
     """Carries one frame of the world (a sensor, or "indenter") exactly where it is told.
 
-    `limit` is the guard that a real arm would have: target and present pose -> pose allowed; it may raise.
+    `longest` [m] and `widest` [rad] bound the motion of one control period; what is beyond is shortened, and counted.
     """
 
-    def __init__(self, world: World, clock: SimClock, frame: str, limit: Callable[[Pose, Pose], Pose]) -> None:
-        self._world, self._clock, self._frame, self._limit = world, clock, frame, limit
+    def __init__(self, world: World, clock: SimClock, frame: str, longest: float, widest: float) -> None:
+        self._world, self._clock, self._frame = world, clock, frame
+        self._longest, self._widest = longest, widest
 
     def state(self) -> ArmState:
         return ArmState(
@@ -107,8 +115,8 @@ class SimArm:
         """Takes effect at the next tick; None holds. Returns the pose after the limits."""
         if target is None:
             return None
-        allowed = self._limit(target, self._world.pose(self._frame))
-        self._clock.target(self._frame, allowed)
+        allowed = shorten(target, self._world.pose(self._frame), self._longest, self._widest)
+        self._clock.target(self._frame, allowed, limited=allowed is not target)
         return allowed
 
     def stop(self) -> None:
@@ -214,35 +222,45 @@ class SimStart:
 
 
 def approach(world: World, touch_force: float) -> MoveStats | None:
-    """Moves all sensors along their own z towards the body until the smallest of their normal forces reaches `touch_force` [N].
+    """Moves all sensors along their own z towards the body until the least normal force reaches `touch_force` [N].
 
-    A fast part closes the gaps that are known; then steps whose length is found by the secant rule. A step that presses
-    harder than touch_force * (1 + TOUCH_TOLERANCE) is taken back, state and all, and made shorter, so that the body
-    keeps no trace of it. Returns how the last move went, None if there was none. Raises NoTouch.
+    A fast part closes the gaps that are known; then come small steps. A step that presses harder than
+    touch_force * (1 + TOUCH_TOLERANCE) is taken back, state and all, so that the body keeps no trace of it, and bounds
+    the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
     """
     stats = _close_gaps(world)
-    step, force = FIRST_STEP, _least_force(world)
+    force = _least_force(world)
+    beyond: tuple[float, float] | None = None  # how much farther was too far [m], and the force there [N]
+    step = FIRST_STEP
     for _ in range(MOST_MOVES):
         if force >= touch_force:
             return stats
-        before, force_before = world.snapshot(), force
-        stats = _advance(world, dict.fromkeys(world.sensors, step))
-        force = _least_force(world)
-        stiffness = (force - force_before) / step
-        if force > touch_force * (1 + TOUCH_TOLERANCE):
-            world.restore(before)
-            force = force_before
-            # Aim into the allowed band; contact begins somewhere inside the step, so the secant alone may fall short.
-            step *= min(max((touch_force * (1 + TOUCH_TOLERANCE / 2) - force) / (stiffness * step), 0.1), 0.7)
-        elif stiffness > 0:
-            step = min(max((touch_force * (1 + TOUCH_TOLERANCE / 2) - force) / stiffness, step / 4), FIRST_STEP)
+        step = FIRST_STEP if beyond is None else _next_step(force, beyond, touch_force * (1 + TOUCH_TOLERANCE / 2))
         if step < SMALLEST_STEP:
             break
+        before = world.snapshot()
+        stats = _advance(world, dict.fromkeys(world.sensors, step))
+        reached = _least_force(world)
+        if reached > touch_force * (1 + TOUCH_TOLERANCE):
+            world.restore(before)
+            beyond = (step, reached)
+        else:
+            force = reached
+            beyond = None if beyond is None else (beyond[0] - step, beyond[1])
     raise NoTouch(
-        f"approach found no gentle contact: least normal force {force:.4g} N of {touch_force:.4g} N wanted after at most "
-        f"{MOST_MOVES} moves, last step {step:.3g} m. Is the body between the gels (scene.body), and touch_force "
-        "above what the scene's settling tolerance can resolve?"
+        f"approach found no gentle contact: normal force {force:.4g} N of {touch_force:.4g} N wanted, after at most "
+        f"{MOST_MOVES} moves, the last by {step:.3g} m. Is there a body between the gels, and is touch_force within "
+        "what the scene's settling tolerance resolves?"
     )
+
+
+def _next_step(force: float, beyond: tuple[float, float], wanted: float) -> float:
+    """The step [m] that should give the force `wanted` [N]: force is taken as linear from here to `beyond`; without
+    contact here, from half-way on."""
+    length, force_there = beyond
+    share = (wanted - force) / (force_there - force)
+    share = share if force > 0 else 0.5 + 0.5 * share
+    return length * min(max(share, 0.05), 0.95)
 
 
 def _close_gaps(world: World) -> MoveStats | None:

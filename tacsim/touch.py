@@ -1,4 +1,4 @@
-"""What counts as touch: thresholds of the contact mask, and one number for "how much". NumPy only, the same everywhere."""
+"""What counts as touch: thresholds of the contact mask, and one number for how much there is. NumPy only."""
 
 from __future__ import annotations
 

@@ -40,6 +40,7 @@ def _guard_socket(method: Callable[..., Any], address_of: Callable[[tuple[Any, .
     def guarded(self: socket.socket, *arguments: Any) -> Any:
         address = address_of(arguments)
         if not is_local(address):
+            self.close()  # whoever made it does not expect this error, and would leak it
             raise RealHardware(f"test opened a socket to {address!r}; only loopback is allowed: use the mock hardware")
         return method(self, *arguments)
 
@@ -56,19 +57,25 @@ def _guard_path(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _guard_camera(capture: type) -> type:
-    class GuardedCapture(capture):  # type: ignore[misc]
+    class GuardedCapture:
+        """Holds a capture instead of inheriting: OpenCV's type crashes when it is subclassed."""
+
         def __init__(self, *arguments: Any, **options: Any) -> None:
-            _refuse_camera(arguments[0] if arguments else options.get("filename", options.get("index")))
-            super().__init__(*arguments, **options)
+            _refuse_camera(arguments, options)
+            self._capture = capture(*arguments, **options)
 
         def open(self, *arguments: Any, **options: Any) -> Any:
-            _refuse_camera(arguments[0] if arguments else options.get("filename", options.get("index")))
-            return super().open(*arguments, **options)
+            _refuse_camera(arguments, options)
+            return self._capture.open(*arguments, **options)
+
+        def __getattr__(self, attribute: str) -> Any:
+            return getattr(self._capture, attribute)
 
     return GuardedCapture
 
 
-def _refuse_camera(source: object) -> None:
+def _refuse_camera(arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
+    source = arguments[0] if arguments else options.get("index", options.get("filename"))
     if isinstance(source, Integral) or str(source).startswith(DEVICES):
         raise RealHardware(f"test opened camera {source!r}: use recorded or simulated frames")
 
@@ -80,7 +87,9 @@ def no_real_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(real, "connect", _guard_socket(real.connect, lambda given: given[0]))
     monkeypatch.setattr(real, "connect_ex", _guard_socket(real.connect_ex, lambda given: given[0]))
     monkeypatch.setattr(real, "sendto", _guard_socket(real.sendto, lambda given: given[-1]))
-    monkeypatch.setattr(real, "sendmsg", _guard_socket(real.sendmsg, lambda given: given[3] if len(given) > 3 else None))
+    monkeypatch.setattr(
+        real, "sendmsg", _guard_socket(real.sendmsg, lambda given: given[3] if len(given) > 3 else None)
+    )
     monkeypatch.setattr(builtins, "open", _guard_path(builtins.open))
     monkeypatch.setattr(io, "open", _guard_path(io.open))
     monkeypatch.setattr(os, "open", _guard_path(os.open))

@@ -44,7 +44,7 @@ def tacsim(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
-    """A sim-to-real bridge for robots that feel with optical tactile sensors: simulate, observe, act, record, replay."""
+    """A sim-to-real bridge for robots that feel with optical tactile sensors."""
 
 
 def main() -> None:

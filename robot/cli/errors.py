@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import click
+import typer
 from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
@@ -17,27 +17,26 @@ UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or us
 class Guarded(TyperGroup):
     """The group of all commands: turns exceptions into messages, unless `--debug` stands somewhere on the line."""
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         own = args[: args.index("--")] if "--" in args else args
         ctx.meta["tacsim.debug"] = "--debug" in own
         return super().parse_args(ctx, [word for word in own if word != "--debug"] + args[len(own) :])
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            if ctx.meta["tacsim.debug"]:
-                raise
             complain("interrupted")
-            ctx.exit(INTERRUPTED)
-        except (click.ClickException, click.exceptions.Exit, click.Abort):
-            raise
+            raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
-            if ctx.meta["tacsim.debug"]:
+            of_typer = isinstance(error, typer.Abort) or hasattr(
+                error, "exit_code"
+            )  # wrong usage, Exit: it handles them
+            if of_typer or ctx.meta["tacsim.debug"]:
                 raise
             message, code = explain(error)
             complain(message)
-            ctx.exit(code)
+            raise typer.Exit(code) from None
 
 
 def explain(error: Exception) -> tuple[str, int]:
@@ -46,12 +45,24 @@ def explain(error: Exception) -> tuple[str, int]:
 
     if isinstance(error, ConfigError):
         return str(error), UNUSABLE
+    if isinstance(error, ExceptionGroup):
+        parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
+        return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
     if isinstance(error, OSError):
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
         return f"{where}{error.strerror or error or type(error).__name__}", FAILED
-    if type(error).__module__.partition(".")[0] in OURS:
+    if type(error).__module__.partition(".")[0] in OURS or _raised_by_us(error):
         return str(error) or type(error).__name__, FAILED
     return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", FAILED
+
+
+def _raised_by_us(error: Exception) -> bool:
+    """True for a ValueError that stands in our own code: its text is written for the person who gave the value."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    module = trace.tb_frame.f_globals.get("__name__", "") if trace is not None else ""
+    return isinstance(error, ValueError) and str(module).partition(".")[0] in OURS
 
 
 def complain(message: str) -> None:

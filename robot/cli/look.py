@@ -21,8 +21,10 @@ def schema(
     """
     import json
 
-    from tacsim.config import json_schema
+    from tacsim.config import KINDS, json_schema
 
+    if kind not in KINDS:
+        raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}", param_hint="KIND")
     typer.echo(json.dumps(json_schema(kind), indent=2))
 
 

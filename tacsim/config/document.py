@@ -1,7 +1,7 @@
 """YAML text -> a tree of nodes that know where they were written. Nothing is executed, sizes are checked first.
 
 A careful subset of YAML: numbers, booleans and null as in YAML 1.2 (so ``1e5`` is a number, ``no`` and ``12:30`` are
-texts); no anchors, aliases, merge keys, tags or duplicate keys; at most 1 MB, 32 levels and 50,000 values.
+texts); no anchors, aliases, merge keys, tags or duplicate keys; at most 1 MB, 32 levels and 20,000 values.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing import Any, ClassVar
 
 import yaml
 
-from tacsim.config.errors import ConfigError, Place, Problem
+from tacsim.config.errors import ConfigError, Place, Problem, printable
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
-MAX_NODES = 50_000  # of one load, referenced files included
+MAX_NODES = 20_000  # of one load, referenced files included
 _MAX_DIGITS = 64  # of a whole number
 
 _FLOAT = re.compile(
@@ -53,6 +53,17 @@ class Node:
     @property
     def is_empty(self) -> bool:
         return self.value is None and not self.broken
+
+    def describe(self) -> str:
+        """The value, for a message."""
+        if isinstance(self.value, dict):
+            return "a mapping"
+        if isinstance(self.value, list):
+            return f"a list of {len(self.value)}"
+        if self.value is None:
+            return "nothing (null)"
+        short = printable(self.text, 80)
+        return f"'{short}'" if isinstance(self.value, str) else short
 
 
 @dataclass(slots=True)
@@ -262,7 +273,7 @@ def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
         return int(text), ""
     if tag in ("int", "float"):
         number = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-        return number, "" if math.isfinite(number) else f"{text} is not finite; give a finite number"
+        return number, "" if math.isfinite(number) else f"{printable(text, 80)} is not finite; give a finite number"
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

@@ -61,3 +61,8 @@ def did_you_mean(word: str, allowed: Iterable[str]) -> str:
     by_lower = {name.lower(): name for name in allowed}
     close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
     return f"; did you mean '{by_lower[close[0]]}'?" if close else ""
+
+
+def join(key: str, name: str | int) -> str:
+    """Dotted key of an entry."""
+    return f"{key}.{name}" if key else str(name)

@@ -16,7 +16,7 @@ from tacsim.optics.geometry import SensorModel
 from tacsim.rigfile import RepositionFacts, RigFacts, SqueezeFacts, TaskFacts
 from tacsim.scene import BodyMaterial, GelMaterial, Scene
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*")
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,7 +137,7 @@ def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
 
 def _open(annotation: Any, source: str | Path, reading: Reading) -> Node:
     """The expanded tree of the file that a person named on the command line: any path, or a shipped file's name."""
-    place = Place(str(source))
+    place = Place(str(source) or "(no name)")
     kind = kind_of(models(annotation))
     try:
         path = named(kind, source) if kind is not None and isinstance(source, str) and is_name(source) else Path(source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args, get_origin
 
 from pydantic import ValidationError
@@ -10,8 +10,7 @@ from pydantic_core import ErrorDetails
 
 from tacsim.config.annotation import allowed, child, keys, members, models, split, tag_of, variant
 from tacsim.config.document import Node, Reading
-from tacsim.config.errors import did_you_mean, printable
-from tacsim.config.references import join
+from tacsim.config.errors import did_you_mean, join, printable
 
 _OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
@@ -49,13 +48,15 @@ def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Spot | None
         node = spot.node
         if node.broken:
             return None
-        if len(members(spot.annotation)) > 1:
-            steps.pop(0)
-            spot = Spot(node, _member(spot.annotation, node), spot.key, parent=spot.parent, holder=spot.holder)
-            continue
         step = steps.pop(0)
         if step == "[key]":
-            return Spot(node, spot.annotation, spot.key, of_key=True, parent=spot.parent, holder=spot.holder)
+            return replace(spot, of_key=True)
+        if len(members(spot.annotation)) > 1:
+            member = _member(spot.annotation, node)
+            if member is None:
+                return spot
+            spot = replace(spot, annotation=member)
+            continue
         entry = _entry(node, step)
         inner = child(spot.annotation, node, step)
         if entry is None:
@@ -101,15 +102,15 @@ def _text(detail: ErrorDetails, spot: Spot) -> str:
         return str(context["error"])
     if "at" in context:  # a model's own message
         return detail["msg"]
-    if kind == "literal_error":
+    if kind == "literal_error" and spot.node.text:
         options = [str(option) for part in members(spot.annotation) for option in get_args(split(part)[0])]
         hint = did_you_mean(spot.node.text, options)
-        return f"{describe(spot.node)} is unknown; allowed: {allowed(spot.annotation)}{hint}"
+        return f"{spot.node.describe()} is unknown; allowed: {allowed(spot.annotation)}{hint}"
     if kind in _OUT_OF_RANGE:
         return f"{spot.node.text} is out of range; allowed: {allowed(spot.annotation)}"
     if spot.annotation is None or not members(spot.annotation):
         return printable(detail["msg"])
-    return f"{describe(spot.node)} does not fit; allowed: {allowed(spot.annotation)}"
+    return f"{spot.node.describe()} does not fit; allowed: {allowed(spot.annotation)}"
 
 
 def _unknown_key(detail: ErrorDetails, spot: Spot) -> str:
@@ -131,7 +132,7 @@ def _wrong_length(kind: str, context: dict[str, Any], spot: Spot) -> str:
         return f"{what}; allowed: {limit if limit and fixed == 'a list' else fixed}"
     if isinstance(spot.node.value, dict):
         return f"has {len(spot.node.value)} entries; allowed: at least {context.get('min_length', 1)}"
-    return f"{describe(spot.node)} does not fit; allowed: {allowed(spot.annotation)}"
+    return f"{spot.node.describe()} does not fit; allowed: {allowed(spot.annotation)}"
 
 
 def _wrong_variant(spot: Spot) -> str:
@@ -141,16 +142,4 @@ def _wrong_variant(spot: Spot) -> str:
     if said is None:
         return f"'{name}' is missing; allowed: {name}: {' | '.join(options)}"
     hint = did_you_mean(said.text, options)
-    return f"{name} {describe(said)} is unknown; allowed: {' | '.join(options)}{hint}"
-
-
-def describe(node: Node) -> str:
-    """The value of a node, for a message."""
-    if isinstance(node.value, dict):
-        return "a mapping"
-    if isinstance(node.value, list):
-        return f"a list of {len(node.value)}"
-    if node.value is None:
-        return "nothing (null)"
-    shown = printable(node.text, 80)
-    return f"'{shown}'" if isinstance(node.value, str) else shown
+    return f"{name} {said.describe()} is unknown; allowed: {' | '.join(options)}{hint}"

@@ -8,8 +8,8 @@ from typing import Any
 
 from tacsim.config.annotation import allowed, child, default, keys
 from tacsim.config.document import Node, Reading, from_plain, parse_text
-from tacsim.config.errors import Place, did_you_mean
-from tacsim.config.references import drop_strangers, expand, join
+from tacsim.config.errors import Place, did_you_mean, join
+from tacsim.config.references import drop_strangers, expand
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def _put(node: Node, annotation: Any, override: Override, depth: int, reading: R
         return _put_in_list(node, annotation, override, depth, reading)
     if node.value is not None and not isinstance(node.value, dict):
         where = ".".join(override.path[:depth])
-        what = f"'{where}' is {node.text}, which has no keys" if where else "the file holds no mapping"
+        what = f"'{where}' is {node.describe()}, which has no keys" if where else "the file holds no mapping"
         reading.report(override.place, ".".join(override.path), what)
         return node
     if node.value is None:

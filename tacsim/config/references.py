@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -10,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tacsim.config.annotation import child, models, variant
-from tacsim.config.document import Node, Reading, parse_text, read_text, shown
-from tacsim.config.errors import Place
+from tacsim.config.document import MAX_NODES, Node, Reading, parse_text, read_text, shown
+from tacsim.config.errors import Place, join
 from tacsim.config.kinds import Kind, NotFound, kind_of, referred
 
 _MAX_CHAIN = 16  # files that refer to each other in a row
@@ -67,14 +66,20 @@ def read_file(
 ) -> Node:
     """The expanded content of a file. `refuse` reports that it cannot be read, at the place that refers to it."""
     broken = Node(None, Place(shown(path), 1), path.parent, broken=True)
-    path = Path(os.path.abspath(path))  # not resolved: messages name the file as it was asked for
-    resolved = path.resolve()
+    path = path.absolute()  # not resolved: messages name the file as it was asked for
+    try:
+        resolved = path.resolve()
+    except (OSError, ValueError, RuntimeError) as error:  # a name with a null byte, a loop of symbolic links
+        refuse(f"cannot read '{shown(path)}': {error}")
+        return broken
     if resolved in chain:
         circle = " -> ".join(shown(step) for step in (*chain[chain.index(resolved) :], resolved))
         refuse(f"the reference goes round in a circle: {circle}; break it in one of them")
         return broken
     if len(chain) >= _MAX_CHAIN:
         refuse(f"more than {_MAX_CHAIN} files refer to each other in a row; shorten the chain")
+        return broken
+    if reading.nodes > MAX_NODES:  # said already, and every further file would say it again
         return broken
     text = read_text(path, refuse, reading)
     if text is None:
@@ -92,7 +97,8 @@ def _extend(node: Node, kind: Kind, annotation: Any, reading: Reading, key: str,
     reference = entries.pop("extends")
     if not isinstance(reference.value, str):
         if not reference.broken:
-            reading.report(reference.place, join(key, "extends"), f"allowed: the name of a {kind.name}, or a path")
+            what = f"{reference.describe()} does not fit; allowed: the name of a {kind.name}, or a path"
+            reading.report(reference.place, join(key, "extends"), what)
         return _broken(node)
     target = follow(reference, kind, annotation, reading, key, chain, said=join(key, "extends"))
     if target.broken:
@@ -118,11 +124,6 @@ def drop_strangers(old: Node, new: Node, annotation: Any, keep: set[str]) -> Nod
         return new
     strangers = set(before.model_fields) - set(after.model_fields) - keep
     return replace(new, value={name: entry for name, entry in new.items.items() if name not in strangers})
-
-
-def join(key: str, name: str | int) -> str:
-    """Dotted key of an entry."""
-    return f"{key}.{name}" if key else str(name)
 
 
 def _broken(node: Node) -> Node:

@@ -10,9 +10,6 @@ from pydantic_core import core_schema
 
 from tacsim.config.kinds import KINDS, kind_of, names
 
-# pydantic leaves the bounds of a quantity under its own names.
-_KEYWORDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
-
 
 def json_schema(kind: str = "rig") -> dict[str, Any]:
     """The JSON schema of a kind of file (rig, task, scene, sensor, material), string references and units included.
@@ -28,8 +25,7 @@ def json_schema(kind: str = "rig") -> dict[str, Any]:
     schema = TypeAdapter(KINDS[kind].annotation).json_schema(schema_generator=_Generator, mode="validation")
     schema["$schema"] = _Generator.schema_dialect
     schema["title"] = f"tacsim {kind}"
-    translated: dict[str, Any] = _translate(schema)
-    return translated
+    return schema
 
 
 class _Generator(GenerateJsonSchema):
@@ -58,20 +54,3 @@ class _Generator(GenerateJsonSchema):
         union.pop("discriminator", None)  # OpenAPI's keyword, JSON schema has no such
         union["anyOf"] = union.pop("oneOf")  # a reference by name fits every variant
         return union
-
-
-def _translate(schema: Any, is_schema: bool = True) -> Any:
-    """pydantic's own bound keywords -> JSON schema's, everywhere but in the names of properties and in defaults."""
-    if isinstance(schema, list):
-        return [_translate(entry) for entry in schema]
-    if not isinstance(schema, dict):
-        return schema
-    renamed = {}
-    for key, value in schema.items():
-        if is_schema and key in ("default", "enum", "const", "examples"):
-            renamed[key] = value
-        elif is_schema:
-            renamed[_KEYWORDS.get(key, key)] = _translate(value, is_schema=key not in ("properties", "$defs"))
-        else:
-            renamed[key] = _translate(value)
-    return renamed

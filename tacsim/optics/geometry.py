@@ -39,7 +39,7 @@ class SensorGeometry(Facts):
 
 
 class Light(Facts):
-    """One directional light. Lights stand behind the gel like the camera: z, which points out of the gel, is not positive."""
+    """One directional light. Like the camera it stands behind the gel, on the -z side (z points out of the gel)."""
 
     direction: tuple[float, float, float]  # from the surface towards the light, sensor axes, any length
     colour: Rgb
@@ -51,7 +51,7 @@ class Light(Facts):
         if sum(c * c for c in self.direction) < 1e-12:
             raise ValueError("direction must not be zero")
         if self.direction[2] > 0:
-            raise ValueError(f"direction z is {self.direction[2]:g}, but lights stand behind the gel, where z is negative")
+            raise ValueError(f"direction z is {self.direction[2]:g}: lights stand behind the gel, where z is negative")
         return self
 
 
@@ -65,7 +65,7 @@ THREE_LIGHTS = (
 
 
 class Lighting(Facts):
-    """Phong illumination: ambient + sum over lights of diffuse and specular parts (Gomes et al. 2021, as the seed uses).
+    """Phong illumination: diffuse and specular parts summed over lights (Gomes et al. 2021, as the seed uses).
 
     With a background the picture is background + shade(n) - shade(flat gel); without one it is ambient + shade(n).
     """

@@ -12,7 +12,7 @@ from tacsim.optics.geometry import CanonicalGrid, SensorGeometry
 
 @dataclass(frozen=True, slots=True)
 class PixelGrid:
-    """`rows` x `columns` points; column j lies at ``x = x0 + j * pitch``, row i at ``y = y0 + i * pitch``, sensor frame."""
+    """`rows` x `columns` points, sensor frame: column j at ``x = x0 + j * pitch``, row i at ``y = y0 + i * pitch``."""
 
     rows: int
     columns: int
@@ -27,12 +27,12 @@ class PixelGrid:
     @property
     def x(self) -> NDArray[np.float64]:
         """(columns,) [m]"""
-        return self.x0 + self.pitch * np.arange(self.columns)
+        return self.x0 + self.pitch * np.arange(self.columns, dtype=np.float64)
 
     @property
     def y(self) -> NDArray[np.float64]:
         """(rows,) [m]"""
-        return self.y0 + self.pitch * np.arange(self.rows)
+        return self.y0 + self.pitch * np.arange(self.rows, dtype=np.float64)
 
     def points(self) -> NDArray[np.float64]:
         """(rows, columns, 2) x, y of every point [m]"""

@@ -25,8 +25,8 @@ def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
     if reach[0] > gel_size[0] / 2 or reach[1] > gel_size[1] / 2:
         raise ValueError(
             f"markers: {markers.rows} x {markers.columns} dots at {markers.pitch * 1e3:g} mm need a gel of "
-            f"{reach[0] * 2e3:.2f} x {reach[1] * 2e3:.2f} mm, the gel is {gel_size[0] * 1e3:g} x {gel_size[1] * 1e3:g} mm; "
-            "take fewer rows or columns, or a smaller pitch"
+            f"{reach[0] * 2e3:.2f} x {reach[1] * 2e3:.2f} mm, the gel is {gel_size[0] * 1e3:g} x "
+            f"{gel_size[1] * 1e3:g} mm; take fewer rows or columns, or a smaller pitch"
         )
 
 

@@ -4,13 +4,14 @@ Camera and lights stand behind the gel, on its -z side. There a surface pressed 
 
     n = (-dh/dx, -dh/dy, -1) / sqrt(1 + |grad h|^2)
 
-and shows ``ambient + sum over lights of colour * (diffuse * n.l + specular * (r.v)^shininess)`` with the light's direction
-l, the mirrored ray r = 2 (n.l) n - l and the view v = (0, 0, -1); no shadows. All is float32 until the last step.
+and shows ``ambient + sum over lights of colour * (diffuse * n.l + specular * (r.v)^shininess)`` with the light's
+direction l, the mirrored ray r = 2 (n.l) n - l and the view v = (0, 0, -1); no shadows. It is float32 to the last step.
 A dent is a bump to this camera: its right flank (dh/dx < 0) faces a light on the right (+x) and takes that colour.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,6 @@ Float32 = NDArray[np.float32]
 # Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
 TEXTURE_PITCH = 0.12e-3
-LARGEST_PICTURE = 64 * 2**20  # of a background file [bytes]
 
 
 class Renderer:
@@ -50,27 +50,27 @@ class Renderer:
 
     def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
+        import cv2
+
         gradient = sample_surface(surface, self._grid).gradient + self._texture
         image = shade(gradient, self.model.lighting)
         image += self._unlit
         if self._markers is not None:
             image = draw_markers(image, surface, self._markers, self.model.geometry)
-        np.clip(image, 0.0, 1.0, out=image)
-        image *= 255.0
-        image += 0.5
-        return image.astype(np.uint8)
+        np.maximum(image, 0.0, out=image)
+        return np.asarray(cv2.convertScaleAbs(image, alpha=255.0), dtype=np.uint8)  # rounds, and saturates at white
 
 
 def shade(gradient: Float32, lighting: Lighting) -> Float32:
-    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2); 1 is white. Exactly the same for lights in
-    any order: they are summed in an order of their own."""
+    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2); 1 is white. Exactly the same for lights
+    in any order: they are summed in an order of their own."""
     import cv2
 
     slope_x, slope_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
     facing = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)  # n . v
     channels = [np.zeros(slope_x.shape, dtype=np.float32) for _ in range(3)]
     for light in sorted(lighting.lights, key=_order):
-        lx, ly, lz = (np.float32(c) for c in light.direction / np.linalg.norm(light.direction))
+        lx, ly, lz = (np.float32(c / math.hypot(*light.direction)) for c in light.direction)
         lit = np.maximum((slope_x * -lx + slope_y * -ly - lz) * facing, np.float32(0.0))  # n . l
         brightness = lit * np.float32(light.diffuse)
         if light.specular > 0:
@@ -94,30 +94,27 @@ def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
 
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:
-    """(H, W, 3) RGB picture in 0..1. Raises ValueError when it cannot be read or is not H x W."""
-    import cv2
+    """(H, W, 3) RGB picture in 0..1. Raises ValueError when it cannot be read or is not H x W (before decoding it)."""
+    from PIL import Image
 
-    file = Path(path)
-    if not file.is_file():
-        raise ValueError(f"lighting.background: no file '{path}'")
-    if file.stat().st_size > LARGEST_PICTURE:
-        raise ValueError(f"lighting.background: '{path}' has {file.stat().st_size} bytes, at most {LARGEST_PICTURE} are read")
-    picture = cv2.imread(path, cv2.IMREAD_COLOR)
-    if picture is None:
-        raise ValueError(f"lighting.background: '{path}' is no picture that OpenCV reads (PNG, JPEG, TIFF ...)")
-    if picture.shape[:2] != shape:
-        raise ValueError(
-            f"lighting.background: '{path}' is {picture.shape[1]} x {picture.shape[0]} px, the sensor's image is "
-            f"{shape[1]} x {shape[0]}; resize it"
-        )
-    return picture[..., ::-1].astype(np.float32) / np.float32(255.0)
+    try:
+        with Image.open(Path(path), formats=("PNG", "JPEG", "BMP")) as picture:
+            if picture.size != (shape[1], shape[0]):
+                raise ValueError(
+                    f"lighting.background: '{path}' is {picture.width} x {picture.height} px, the sensor's image is "
+                    f"{shape[1]} x {shape[0]}; resize it"
+                )
+            return np.asarray(picture.convert("RGB"), dtype=np.float32) / np.float32(255.0)
+    except OSError as failure:
+        raise ValueError(f"lighting.background: '{path}' is no readable PNG, JPEG or BMP: {failure}") from failure
 
 
 def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: float, seed: int) -> Float32:
     """(H, W, 2) slopes of the gel's texture: a random surface with standard deviation `deviation` [m], fixed by `seed`;
     0 outside the gel. Control values are independent normal numbers; the spline of such has 11/20 of their spread."""
     nodes_x, nodes_y = (int(np.ceil(size / TEXTURE_PITCH)) + 3 for size in gel_size)
-    noise = np.random.default_rng(seed).standard_normal((nodes_y, nodes_x)).astype(np.float32) * (deviation * 20.0 / 11.0)
+    noise = np.random.default_rng(seed).standard_normal((nodes_y, nodes_x), dtype=np.float32)
+    noise *= deviation * 20.0 / 11.0
     value_x, slope_x = line_matrices(grid.x / TEXTURE_PITCH + (nodes_x - 1) / 2, nodes_x)
     value_y, slope_y = line_matrices(grid.y / TEXTURE_PITCH + (nodes_y - 1) / 2, nodes_y)
     by_x = (value_y @ noise) @ slope_x.T

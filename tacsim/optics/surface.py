@@ -31,7 +31,7 @@ from tacsim.scene import GelSurface
 
 Float32 = NDArray[np.float32]
 
-TABLE_PITCH = 0.125e-3  # the table is this fine or finer [m]: height then errs by 2 um at most, 0.2 um rms
+TABLE_PITCH = 0.125e-3  # the table is this fine or finer [m]: height then errs by 0.2 um rms, 2 um on steep flanks
 FIXED_POINT_STEPS = 20
 NEWTON_STEPS = 40
 CONVERGED = 1.0 / 32.0  # largest last step [table points]; OpenCV's remap resolves no less
@@ -56,12 +56,11 @@ def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
     Raises ValueError for a surface that is no surface (shape, NaN, more sideways motion than the gel is wide),
     SurfaceFolded where it folds over.
     """
-    import cv2
-
     check_surface(surface)
     fields, lateral = _table(surface)
-    points = _material_points(surface, lateral, _table_coordinates(surface.origin, surface.spacing / _table_points(surface), grid))
-    seen = cv2.remap(fields, points, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen_at = _table_coordinates(surface.origin, surface.spacing / _table_points(surface), grid)
+    points = _material_points(surface, lateral, seen_at)
+    seen = _look_up(fields, points)
     valid = _on_gel(points, fields.shape[:2])
     if not valid.all():
         seen[~valid] = 0.0
@@ -94,12 +93,11 @@ def material_points(surface: GelSurface, points: NDArray[np.float64]) -> NDArray
         deformation = np.eye(2) + jacobian[:, :2, :]
         folded = np.linalg.det(deformation) <= 0.0
         if folded.any():
-            _raise_folded(points[folded])
+            raise _folded(found[folded])
         move = np.linalg.solve(deformation, residual[..., None])[..., 0]
         length = np.linalg.norm(move, axis=1, keepdims=True)
         found -= move * np.minimum(1.0, surface.spacing / np.maximum(length, 1e-300))  # at most one lattice cell a step
-    worst = np.abs(residual).max(axis=1)
-    _raise_folded(points[worst >= 1e-9])
+    raise _folded(found[np.abs(residual).max(axis=1) >= 1e-9])
 
 
 def check_surface(surface: GelSurface) -> None:
@@ -123,16 +121,22 @@ def check_surface(surface: GelSurface) -> None:
 
 
 def _table(surface: GelSurface) -> tuple[Float32, Float32]:
-    """(height, gradient x, gradient y) and (u_x, u_y [table points]) at material points over the whole gel, rows along y."""
+    """(height, gradient x, gradient y) and (u_x, u_y [table points]) at material points over the gel, rows along y."""
     points = _table_points(surface)
     value_x, slope_x = _table_matrices(surface.displacement.shape[0], points)
     value_y, slope_y = _table_matrices(surface.displacement.shape[1], points)
-    value = _product(value_y, surface.displacement, value_x)
-    by_x = _product(value_y, surface.displacement, slope_x) / np.float32(surface.spacing)
-    by_y = _product(slope_y, surface.displacement, value_x) / np.float32(surface.spacing)
+    control = np.asarray(surface.displacement, dtype=np.float32)
+    value = _product(value_y, control, value_x)
+    by_x = _product(value_y, control, slope_x) / np.float32(surface.spacing)
+    by_y = _product(slope_y, control, value_x) / np.float32(surface.spacing)
     a, b, c, d = 1.0 + by_x[0], by_y[0], by_x[1], 1.0 + by_y[1]  # J = [[a, b], [c, d]]
-    inverse = -1.0 / (a * d - b * c)  # the minus turns u_z into height
-    fields = np.stack([-value[2], (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse], axis=-1)
+    determinant = a * d - b * c
+    if float(determinant.min()) <= 0.0:
+        row, column = np.argwhere(determinant <= 0.0).T
+        raise _folded(np.stack([column, row], axis=1) * (surface.spacing / points) + surface.origin)
+    inverse = -1.0 / determinant  # the minus turns u_z into height
+    gradient_x, gradient_y = (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse
+    fields = np.stack([-value[2], gradient_x, gradient_y], axis=-1)
     lateral = np.stack([value[0], value[1]], axis=-1) * np.float32(points / surface.spacing)
     return fields, lateral
 
@@ -149,7 +153,8 @@ def _product(along_y: csr_array, control: Float32, along_x: csr_array) -> Float3
     rows, columns = along_y.shape[0], along_x.shape[0]
     in_x = (along_x @ control.reshape(nx, ny * 3)).reshape(columns, ny, 3)
     in_xy = along_y @ np.ascontiguousarray(in_x.transpose(1, 2, 0)).reshape(ny, 3 * columns)
-    return in_xy.reshape(rows, 3, columns).transpose(1, 0, 2)
+    product: Float32 = in_xy.reshape(rows, 3, columns).transpose(1, 0, 2)
+    return product
 
 
 def _table_points(surface: GelSurface) -> int:
@@ -167,12 +172,10 @@ def _table_coordinates(origin: tuple[float, float], pitch: float, grid: PixelGri
 
 def _material_points(surface: GelSurface, lateral: Float32, seen: Float32) -> Float32:
     """(rows, columns, 2) material points under the image points `seen` [both table points]: X <- x - u(X)."""
-    import cv2
-
     points, change = seen, seen
     for _ in range(FIXED_POINT_STEPS):
-        moved = seen - cv2.remap(lateral, points, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        change = cv2.absdiff(moved, points)
+        moved = seen - _look_up(lateral, points)
+        change = np.abs(moved - points)
         points = moved
         if float(change.max()) <= CONVERGED:
             return points
@@ -183,6 +186,16 @@ def _material_points(surface: GelSurface, lateral: Float32, seen: Float32) -> Fl
     return points
 
 
+def _look_up(field: Float32, points: Float32) -> Float32:
+    """`field` (rows, columns, n <= 4) at fractional columns and rows `points` (H, W, 2), linear between entries; beyond
+    the border as on it. OpenCV rounds `points` to 1/32."""
+    import cv2
+
+    nothing = np.empty(0, dtype=np.float32)
+    found = cv2.remap(field, points, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found, dtype=np.float32)
+
+
 def _on_gel(points: Float32, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """(rows, columns) where material points [table points] lie on a table of `shape`."""
     x, y = points[..., 0], points[..., 1]
@@ -190,9 +203,9 @@ def _on_gel(points: Float32, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return (x >= low) & (x <= high_x) & (y >= low) & (y <= high_y)
 
 
-def _raise_folded(points: NDArray[np.float64]) -> None:
+def _folded(points: NDArray[np.float64]) -> SurfaceFolded:
     x, y = points[0] * 1e3
-    raise SurfaceFolded(
-        f"the gel surface folds over at {len(points)} image points, first at x = {x:.3f} mm, y = {y:.3f} mm: it is no height "
-        "field there. Press or slide less, or use a finer preset"
+    return SurfaceFolded(
+        f"the gel surface folds over at {len(points)} points, first at x = {x:.3f} mm, y = {y:.3f} mm: "
+        "it is no height field there. Press or slide less, or use a finer preset"
     )

@@ -61,8 +61,10 @@ def attempt(
 
     Raises SimulationDiverged, with the arrays as they were, when the smallest step fails too.
     """
+    complaint = _not_finite(arrays) or ""
+    if complaint:
+        raise SimulationDiverged(complaint, f"before {where()}", "restore a snapshot, or make a new world")
     saved = {name: a.copy() for name, a in arrays.items()}
-    complaint = ""
     for retry in range(RETRIES + 1):
         health = launch(2**retry)
         complaint = health.complaint() or _not_finite(arrays) or ""

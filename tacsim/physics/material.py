@@ -132,7 +132,8 @@ def hencky_return(e, mu, bulk, limit):
     if norm > limit:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
         strain *= limit / norm
         growth = exponential_minus_identity(2.0 * strain)
-        volume = 1.0 / shrink
+        excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
+        volume = (1.0 - excess / 3.0) / shrink
         elastic = plus_identity(growth * volume, volume - 1.0)
     return elastic, plus_identity(2.0 * mu * strain, bulk * log_j)
 

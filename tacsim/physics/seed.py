@@ -103,8 +103,11 @@ class SeedWorld:
         n = len(self._x)
         self._v = np.zeros((n, 3), np.float32)
         self._c = np.zeros((n, 3, 3), np.float32)
-        self._f = np.tile(np.eye(3, dtype=np.float32), (n, 1, 1))
-        self._stress = np.zeros((n, 3, 3), np.float32)
+        self._gel_f = np.tile(np.eye(3, dtype=np.float32), (2 * self._gels, 1, 1))
+        self._gel_stress = np.zeros_like(self._gel_f)
+        self._body_f = np.tile(np.eye(3, dtype=np.float32)[:, :, None], (1, 1, len(body)))
+        self._body_stress = np.zeros_like(self._body_f)
+        self._change = np.zeros((2, 3, len(body)), np.float32)  # scratch of the return mapping
         self._aside = np.zeros(n, np.int32)  # 1 = left the grid, takes no part
         self._motion = np.array([0, 0, 0, body[:, 2].min(), body[:, 2].max()], np.float32)  # see kernels
         self._momentum, self._gain = np.zeros((2, 3), np.float32), np.zeros((2, 3), np.float32)
@@ -118,8 +121,8 @@ class SeedWorld:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {
-            "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "deformation_gradient": self._f,
-            "stress": self._stress, "aside": self._aside, "body_motion": self._motion,
+            "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "gel_deformation": self._gel_f,
+            "gel_stress": self._gel_stress, "body_deformation": self._body_f, "body_stress": self._body_stress, "aside": self._aside, "body_motion": self._motion,
             "gel_momentum": self._momentum, "gel_gain": self._gain, "backing": self._backing, "layers": self._cells,
         }  # fmt: skip
 
@@ -237,8 +240,8 @@ class SeedWorld:
             gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING,
         )  # fmt: skip
         advance(
-            self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive,
-            self._motion, self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
+            self._x, self._v, self._c, self._gel_f, self._gel_stress, self._body_f, self._body_stress,
+            self._change, self._aside, self._grid, drive, self._motion, self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
         )  # fmt: skip
 
     def _fit_grid(self, path: Path, first: int, last: int) -> tuple[float, float]:

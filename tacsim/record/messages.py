@@ -50,10 +50,15 @@ def nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
+def _stamp(seconds: float) -> int:
+    """Stamp for viewers of a time that may lie before the clock's start [ns]; /step and /{arm}/arm have it exactly."""
+    return nanoseconds(max(seconds, 0.0))
+
+
 def encode_step(step: Step, pitch: float) -> list[Encoded]:
     """All messages of a step, the one that makes it complete last. `pitch` of the surface grid is for viewers [m].
 
-    Raises ValueError for arrays of the wrong type or shape and for negative times.
+    Raises ValueError for arrays of the wrong type or shape and for a step at a negative time.
     """
     messages: list[Encoded] = []
     for name, frame in step.frames.items():
@@ -106,7 +111,7 @@ def decode_step(data: bytes, messages: Mapping[str, bytes], sensors: Container[s
 
 
 def _encode_frame(name: str, frame: TactileFrame, pitch: float) -> Iterator[Encoded]:
-    time = nanoseconds(frame.time)
+    time = _stamp(frame.time)
     stamp = _timestamp(time)
     image = CompressedImage(timestamp=stamp, frame_id=name, data=encode_png(frame.image), format="png")
     yield Encoded(f"/{name}/image", CompressedImage, time, image.SerializeToString())
@@ -180,7 +185,7 @@ def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
 
 
 def _encode_arm(name: str, arm: ArmState) -> Iterator[Encoded]:
-    time = nanoseconds(arm.time)
+    time = _stamp(arm.time)
     pose = PoseInFrame(timestamp=_timestamp(time), frame_id="world")
     place, turn = pose.pose.position, pose.pose.orientation
     place.x, place.y, place.z = arm.pose.position.tolist()

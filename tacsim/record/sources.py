@@ -1,18 +1,17 @@
-"""Recorded frames and arm states in order, frame by frame: from episodes, folders of pictures, videos and CSV files."""
+"""Recordings read frame by frame: episodes, folders of pictures, videos."""
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.interface import ArmState, EndOfEpisode, Pose, TactileFrame
+from tacsim.interface import ArmState, EndOfEpisode, TactileFrame
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 from tacsim.record.images import FORMATS, MAX_SIDE, image_size, read_image
 from tacsim.record.reader import EpisodeFile
@@ -20,7 +19,9 @@ from tacsim.record.reader import EpisodeFile
 EPISODES = (".mcap",)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 VIDEOS = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
-MAX_CSV = 64 << 20  # [bytes]
+
+if TYPE_CHECKING:
+    import cv2
 
 T = TypeVar("T")
 
@@ -44,6 +45,9 @@ class Cursor(Generic[T]):
                 self._current = next(self._items)
             except StopIteration:
                 raise EndOfEpisode(f"{self._what} has {self._next} frames") from None
+            except Exception:
+                self.close()  # a generator that has raised would next look like one that is over
+                raise
             self._next += 1
         assert self._current is not None
         return self._current
@@ -142,76 +146,7 @@ def video_images(path: Path) -> Iterator[NDArray[np.uint8]]:
         capture.release()
 
 
-def read_columns(path: Path, names: list[str]) -> list[tuple[float, ...]]:
-    """The named columns of a CSV file with a header, a tuple a row.
-
-    Raises EpisodeError: no file, too large, a column missing (with those there are), a value that is no finite number,
-    or a column `frame` that does not count the rows from 0.
-    """
-    try:
-        if path.stat().st_size > MAX_CSV:
-            raise EpisodeError(f"{path}: {path.stat().st_size} bytes; at most {MAX_CSV} are read")
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return _rows(csv.DictReader(file, skipinitialspace=True), path, names)
-    except (OSError, UnicodeDecodeError, csv.Error) as failure:
-        raise EpisodeError(f"{path}: no readable CSV file: {failure}") from failure
-
-
-def _rows(reader: csv.DictReader[str], path: Path, names: list[str]) -> list[tuple[float, ...]]:
-    header = [column.strip() for column in reader.fieldnames or []]
-    reader.fieldnames = header
-    for name in names:
-        if name not in header:
-            raise EpisodeError(f"{path}: no column '{name}'; it has: {', '.join(header) or '(nothing)'}")
-    rows = []
-    for number, row in enumerate(reader):
-        rows.append(tuple(_number(row[name], path, reader.line_num, name) for name in names))
-        if "frame" in header and _number(row["frame"], path, reader.line_num, "frame") != number:
-            raise EpisodeError(f"{path}:{reader.line_num}: frame {row['frame']} in row {number}; give each frame a row, from 0")
-    if not rows:
-        raise EpisodeError(f"{path}: a header without rows")
-    return rows
-
-
-def _number(text: str | None, path: Path, line: int, column: str) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise EpisodeError(f"{path}:{line}: column '{column}': '{text or ''}' is no finite number")
-    return value
-
-
-def finger_states(rows: list[tuple[float, ...]], period: float, lower: bool) -> list[ArmState]:
-    """Arm states of one finger of a parallel gripper from (force [N],) or (force [N], opening [m]) a row.
-
-    World is the gripper: origin midway between the fingers, z along the closing direction. The fingers close evenly, so
-    the upper one sits at z = +opening / 2 and faces down, the lower one at -opening / 2 and faces up; without an opening
-    the pose stays at the origin. A pressing force pushes the sensor back into its mount: wrench Fz = -force; the other
-    five components were not measured and are 0. Twist: difference to the row before over `period` [s].
-    """
-    side = -1.0 if lower else 1.0
-    facing = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x
-    states: list[ArmState] = []
-    before = None
-    for number, (force, *opening) in enumerate(rows):
-        z = side * opening[0] / 2.0 if opening else 0.0
-        speed = 0.0 if before is None else (z - before) / period
-        before = z
-        states.append(
-            ArmState(
-                pose=Pose(np.array([0.0, 0.0, z]), facing),
-                twist=np.array([0.0, 0.0, speed, 0.0, 0.0, 0.0]),
-                wrench=np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0]),
-                joints=None,
-                time=number * period,
-            )
-        )
-    return states
-
-
-def _open_video(path: Path):  # type: ignore[no-untyped-def]  # -> cv2.VideoCapture, which loads OpenCV
+def _open_video(path: Path) -> cv2.VideoCapture:
     import cv2
 
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # no other backend: some take a name for a device or pipeline

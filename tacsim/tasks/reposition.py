@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim import pose as se3
-from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, Truth
+from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
 from tacsim.rigfile import RepositionFacts
-from tacsim.scene import Gel, lame
 from tacsim.tasks.task import Axis
 
 REACHED = 0.02e-3  # the scripted policy holds when its estimate is this near the goal [m]
+LEAST_FORCE = 0.01  # normal force below which there is no contact to speak of [N]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,35 +39,54 @@ class Reposition:
 
 
 class ScriptedReposition:
-    """Moves the upper sensor towards the goal until the body, as felt, is there, then holds.
+    """Moves the upper sensor at half of max_step towards the goal until the body, as felt, is there, then holds.
 
-    The body lags behind the sensor by the shear of the gel, which the policy takes from the shear force it feels.
-    With `through` it goes on beyond the goal, straight and at the full rate.
+    Closed loop: it does not matter whether the body sticks to the sensor, slides under it, or tips. Where contact is
+    lost it feels nothing, and holds. With `through` it goes on beyond the goal, straight and at the full rate.
     """
 
     def __init__(self, facts: RepositionFacts, through: bool) -> None:
-        self._facts, self._through = facts, through
-        self._rate = facts.max_step / 2  # of each axis
-        self._start: Observation | None = None
+        self._goal, self._rate, self._through = np.array(facts.goal), facts.max_step / 2, through
+        self._start: FloatArray | None = None
         self._reached = False
 
     @property
     def needs(self) -> Needs:
-        return Needs(sensors=frozenset({"upper"}), arms=frozenset({"upper"}), height=True)
+        return Needs(arms=frozenset({"lower", "upper"}))
 
     def reset(self) -> None:
         self._start, self._reached = None, False
 
     def __call__(self, observation: Observation) -> Action:
+        felt = felt_position(observation)
+        if felt is None:
+            return Action({"upper": None})
         if self._start is None:
-            self._start = observation
-        goal = np.array(self._facts.goal)
-        left = goal - felt_displacement(observation, self._start, self._facts.scene.gel)
+            self._start = felt
+        left = self._goal - (felt - self._start)
         self._reached = self._reached or float(np.linalg.norm(left)) <= REACHED
         if self._reached and not self._through:
             return Action({"upper": None})
-        step = goal if self._reached else left
-        longest = float(np.abs(step).max())
-        step = step * (self._rate / longest if self._reached or longest > self._rate else 1.0)
+        way = self._goal if self._reached else left
+        longest = float(np.abs(way).max())
+        step = way * (self._rate / longest if self._reached or longest > self._rate else 1.0)
         now = observation.arms["upper"].pose
         return Action({"upper": Pose(now.position + np.append(step, 0.0), now.quaternion)})
+
+
+def felt_position(observation: Observation) -> FloatArray | None:
+    """(2,) where the body is, as the sensors feel it, world x and y [m]: midway between the centres of pressure on its
+    two faces. Friction tips the body, which moves the two centres apart but not their middle. None without contact."""
+    centres = [centre_of_pressure(observation.arms[name]) for name in ("lower", "upper")]
+    return None if centres[0] is None or centres[1] is None else 0.5 * (centres[0] + centres[1])[:2]
+
+
+def centre_of_pressure(arm: ArmState) -> FloatArray | None:
+    """(3,) the point of the gel's rest plane where the normal force acts, world [m]; None without contact.
+
+    A force at (x, y, 0) in the sensor frame has the moment (y Fz, -x Fz, ...), hence x = -My / Fz, y = Mx / Fz.
+    """
+    _, _, force, moment_x, moment_y, _ = arm.wrench
+    if -force < LEAST_FORCE:
+        return None
+    return se3.transform(arm.pose, np.array([-moment_y / force, moment_x / force, 0.0]))

@@ -65,7 +65,7 @@ class ScriptedSqueeze:
 
 
 def felt_height(observation: Observation) -> float:
-    """Height of the body as the sensors feel it [m]: the gap between the gels' rest surfaces plus how deep it is in each."""
+    """Height of the body as the sensors feel it [m]: the gap between the gels' rest surfaces, and its depth in each."""
     gap = float(observation.arms["upper"].pose.position[2] - observation.arms["lower"].pose.position[2])
     return gap + indentation(observation.tactile["lower"]) + indentation(observation.tactile["upper"])
 

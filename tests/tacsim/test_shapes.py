@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def ell_distance(points: np.ndarray) -> np.ndarray:
     x, y = points[:, 0] + 2.5, points[:, 1] + 2.0
     outline = np.array([[0, 0], [5, 0], [5, 2], [2, 2], [2, 4], [0, 4.0], [0, 0]])
     flat = np.full(len(points), np.inf)
-    for a, b in zip(outline[:-1], outline[1:], strict=True):
+    for a, b in pairwise(outline):
         s = np.clip(((x - a[0]) * (b - a)[0] + (y - a[1]) * (b - a)[1]) / ((b - a) @ (b - a)), 0, 1)
         flat = np.minimum(flat, np.hypot(x - a[0] - s * (b - a)[0], y - a[1] - s * (b - a)[1]))
     inside = (x > 0) & (y > 0) & (((x < 5) & (y < 2)) | ((x < 2) & (y < 4)))
@@ -120,10 +121,10 @@ def test_impossible_spacing_is_refused_with_advice(geometry: Shape, spacing: flo
 
 
 def test_walls_thinner_than_the_spacing_are_refused(tmp_path: Path) -> None:
-    outer, inner = trimesh.creation.box((10, 10, 10)), trimesh.creation.box((9.6, 9.6, 9.6))
+    outer, inner = trimesh.creation.box((10, 10, 10)), trimesh.creation.box((8.8, 8.8, 8.8))
     inner.invert()
     geometry = stl(tmp_path, trimesh.util.concatenate([outer, inner]))
-    with pytest.raises(ValueError, match=r"miss its volume by [-+]\d+% .* thinner than the spacing"):
+    with pytest.raises(ValueError, match=r"miss its volume by \+53% .* thinner than the spacing"):
         particles(geometry, 1 * MM)
 
 
@@ -149,21 +150,25 @@ def test_mesh_distance_is_exact(tmp_path: Path) -> None:
     assert np.abs(distance(concave, at) - ell_distance(at / MM) * MM).max() < 1e-10
 
 
-def test_points_far_from_all_and_equally_far_from_all_are_exact(tmp_path: Path) -> None:
-    mesh = trimesh.creation.icosphere(3, 4.0)
+@pytest.mark.parametrize("case", ["centre of a ball", "coarse beside fine"])
+def test_no_nearer_triangle_is_overlooked(tmp_path: Path, case: str) -> None:
+    """Hard for a search by centres of triangles: all are equally near, or small ones stand before a large one."""
+    rng = np.random.default_rng(3)
+    if case == "centre of a ball":
+        mesh, points = trimesh.creation.icosphere(3, 4.0), rng.normal(scale=0.2, size=(40, 3))
+    else:
+        crumb = trimesh.creation.icosphere(3, 0.05).apply_translation([0.0, 0.0, 1.6])
+        mesh = trimesh.util.concatenate([trimesh.creation.box((4, 6, 3)), crumb])
+        points = rng.uniform([-0.1, -0.1, 1.5], [0.1, 0.1, 1.53], (200, 3))
     geometry = stl(tmp_path, mesh)
-    nearest = np.abs(np.einsum("ij,ij->i", mesh.triangles[:, 0], mesh.face_normals)).min()
-    found = distance(geometry, [[0, 0, 0], [0.3, 0, 0], [4e-3, 4e-3, 4e-3]])
-    corner = np.array([1, 1, 1.0]) * 4
-    assert found[0] == pytest.approx(-nearest * MM, rel=1e-6)
-    brute = np.linalg.norm(
-        trimesh.triangles.closest_point(mesh.triangles, np.tile(corner, (len(mesh.faces), 1))) - corner, axis=1
-    )
-    assert found[2] == pytest.approx(brute.min() * MM, rel=1e-6)
-    assert found[1] == pytest.approx(0.3 - 4 * MM, rel=1e-4)
+    triangles = trimesh.load_mesh(geometry.path).triangles
+    found = distance(geometry, (points - mesh.bounds.mean(axis=0)) * MM)
+    for at, here in zip(points, found, strict=True):
+        brute = trimesh.triangles.closest_point(triangles, np.tile(at, (len(triangles), 1))) - at
+        assert abs(here) == pytest.approx(np.linalg.norm(brute, axis=1).min() * MM, abs=1e-10)
 
 
-def test_gradient_of_the_distance_points_away_from_the_nearest_feature(tmp_path: Path) -> None:
+def test_the_side_is_right_round_a_sharp_tip(tmp_path: Path) -> None:
     """Across an edge seen at an acute angle the nearest faces disagree about the side; the pseudonormal decides."""
     geometry = stl(tmp_path, wedge())
     tip = np.array([6, 0, 0.0]) - [3, 2, 1.5]
@@ -200,7 +205,7 @@ def test_mesh_grid_matches_the_closed_form(tmp_path: Path, make: str) -> None:
     assert np.abs(error[band]).max() < tolerance  # the sphere's is that of its facets, R (1 - cos(half an edge))
     assert (np.sign(grid.values.ravel())[~band] == np.sign(truth[~band])).all()
     assert (np.abs(grid.values.ravel()) > np.abs(truth) - tolerance)[~band].all()
-    assert np.abs(error).max() < 0.1 * spacing  # beyond the band: the whole grid in view
+    assert np.abs(error).max() < 0.5 * spacing  # beyond the band, as promised
     assert grid.values.min() < 0 < grid.values.max()
 
 
@@ -255,7 +260,7 @@ def test_bad_grids_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="positive"):
         distance_grid(Sphere(), -1.0)
     away = ((1.0, 1.0, 1.0), (1.001, 1.001, 1.001))
-    with pytest.raises(ValueError, match="comes nowhere within .* of the mesh"):
+    with pytest.raises(ValueError, match=r"comes nowhere within .* of the mesh"):
         distance_grid(stl(tmp_path, wedge()), 0.1 * MM, box=away)
 
 

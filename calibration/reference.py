@@ -1,0 +1,69 @@
+"""The reference image I0: what a sensor shows without contact. A fresh one matters more than any formula."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+SATURATED = 250.0  # a channel at or above this has lost its signal [grey levels]
+MOST_SATURATED = 0.05  # share of the gel that may be saturated; ten real sensors show 0 to 0.001
+DARKEST = 8.0  # mean grey level of each channel over the gel; below, noise and rounding are all there is
+
+
+class UnusableReference(ValueError):
+    """A reference image that nothing can be measured against."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """I0 and its mean. Make it by :func:`make_reference`."""
+
+    image: Float32  # (H, W, 3) rectified, 0..255
+    mean: Float32  # (3,) over the gel
+    valid: NDArray[np.bool_]  # (H, W)
+
+    def difference(self, image: Float32) -> Float32:
+        """(H, W, 3) relative change (I - I0) / mean(I0) of a rectified image [-]; 0 where not valid.
+
+        Raises ValueError for another shape.
+        """
+        if image.shape != self.image.shape:
+            raise ValueError(f"image is {image.shape}, the reference {self.image.shape}; take a fresh reference")
+        change = (image - self.image) / self.mean
+        change[~self.valid] = 0.0
+        return change
+
+
+def make_reference(image: Float32, valid: NDArray[np.bool_]) -> Reference:
+    """Checks a rectified contact-free image (H, W, 3), 0..255, on the gel (`valid`, (H, W)).
+
+    Raises UnusableReference when the gel is not in the image, too dark or saturated, or when shapes differ.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.shape[:2] != valid.shape:
+        raise UnusableReference(f"reference is {image.shape}, expected {(*valid.shape, 3)}")
+    gel = image[valid]
+    if len(gel) == 0:
+        raise UnusableReference("reference shows no gel: no canonical pixel lies on the gel and in the image")
+    if not np.isfinite(gel).all():
+        raise UnusableReference("reference is not finite")
+    mean = gel.mean(axis=0)
+    if (mean < DARKEST).any():
+        raise UnusableReference(
+            f"reference is dark: mean R, G, B over the gel {_levels(mean)}, at least {DARKEST:g} each; are the "
+            "sensor's lights on, and is the exposure right?"
+        )
+    saturated = float((gel >= SATURATED).any(axis=1).mean())
+    if saturated > MOST_SATURATED:
+        raise UnusableReference(
+            f"reference is saturated on {saturated:.1%} of the gel, at most {MOST_SATURATED:.0%}: shorten the exposure "
+            "or dim the lights"
+        )
+    return Reference(image.astype(np.float32), mean.astype(np.float32), valid)
+
+
+def _levels(colour: Float32) -> str:
+    return ", ".join(f"{value:.1f}" for value in colour)

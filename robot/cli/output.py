@@ -1,0 +1,98 @@
+"""Where a command writes, and how it shows that it is at work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+results = Console(highlight=False, soft_wrap=True)  # stdout: what the command found
+notes = Console(stderr=True, highlight=False, soft_wrap=True)  # stderr: what it is doing
+
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", help="New folder for the results; by default one below runs/.", show_default=False),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the configuration; may be repeated."),
+]
+
+
+def new_directory(out: Path | None, what: str) -> Path:
+    """The folder to be made for the results of `what`. Raises typer.BadParameter if there is one already."""
+    folder = Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{what}" if out is None else out
+    if folder.exists():
+        raise typer.BadParameter(
+            f"{folder} exists already; name a new folder, nothing is overwritten", param_hint="--out"
+        )
+    return folder
+
+
+def make(folder: Path) -> Path:
+    """Makes the folder. Raises FileExistsError when someone else just did, OSError."""
+    folder.mkdir(parents=True)
+    return folder
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """A progress bar on stderr; on no terminal it is silent."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar:
+        yield bar
+
+
+@contextmanager
+def busy(words: str) -> Iterator[None]:
+    """Says what takes long; on a terminal with a spinner, else as one line."""
+    if notes.is_terminal:
+        with notes.status(words):
+            yield
+    else:
+        notes.print(words)
+        yield
+
+
+def say_files(*paths: Path) -> None:
+    """Prints paths, one a line."""
+    for path in paths:
+        results.print(str(path), markup=False)
+
+
+def quantity(kind: str) -> Callable[[str], float]:
+    """Parser of an option that is a length, an angle ... with or without unit."""
+
+    def parse(text: str) -> float:
+        from tacsim.quantity import parse as parse_quantity
+
+        try:
+            return parse_quantity(text, kind)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+
+    return parse
+
+
+def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
+    """Parser of an option that is `count` lengths, angles ... with commas between."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        parts = text.split(",")
+        if len(parts) != count:
+            raise typer.BadParameter(f"'{text}' has {len(parts)} values, {count} are needed, with commas between")
+        return tuple(quantity(kind)(part.strip()) for part in parts)
+
+    return parse

@@ -1,0 +1,185 @@
+"""`tacsim run` and `tacsim replay`: an episode, and the report of one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from robot.cli.errors import FAILED, complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results
+
+if TYPE_CHECKING:
+    from robot.deploy import EpisodeFacts
+    from tacsim.config import LoadedRig
+    from tacsim.interface import Policy
+    from tacsim.record.episode import Episode, EpisodeMeta, Step
+    from tacsim.record.writer import Recorder
+    from tacsim.rig import Rig
+    from tacsim.tasks import Task
+
+STARTING = "starting (the first run compiles the kernels, up to half a minute)"
+NO_END = 1_000_000  # steps of a rig without task: its recording ends it
+
+
+def run(
+    rig: Annotated[str, typer.Argument(help="Name of a rig (sim, replay), or the path of its file.")] = "sim",
+    task: Annotated[
+        str | None, typer.Option(help="squeeze, reposition, or the path of a task file.", show_default="the rig's own")
+    ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option(help="scripted, grip, or package.module:name.", show_default="scripted; grip without a task"),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=0, help="Exactly so many control steps.", show_default="the task's")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same episode.")] = 0,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Run one episode: a policy on a rig. Records it and writes a report.
+
+    Ctrl-C or SIGTERM ends the episode after the step that is under way; what was done is saved and reported.
+
+    Example: tacsim run sim --task squeeze --steps 30 --out runs/first
+    """
+    from tacsim.config import load_rig
+
+    loaded = load_rig(rig, task=task, overrides=set_ or [])
+    own_task = loaded.facts.task
+    folder = new_directory(out, loaded.facts.name if own_task is None else own_task.kind)
+    if steps is None:
+        steps = NO_END if own_task is None else own_task.steps
+    name = policy or ("grip" if own_task is None else "scripted")
+    with Interrupt() as interrupt:
+        failed = _run(loaded, name, steps, seed, folder, interrupt)
+        if interrupt():
+            complain("stopped by a signal before the last step; what was done is saved")
+            raise typer.Exit(interrupt.exit_code)
+    if failed:
+        raise typer.Exit(FAILED)
+
+
+def _run(loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, interrupt: Interrupt) -> bool:
+    """Runs and reports the episode; True when it or its recording failed."""
+    with busy("loading"):
+        from robot.deploy import EpisodeFacts
+        from robot.open import open_rig
+        from robot.policy import load_policy
+        from tacsim.tasks import make_task
+    if not notes.is_terminal:
+        notes.print(STARTING)
+    task = None if loaded.facts.task is None else make_task(loaded.facts.task)
+    facts = EpisodeFacts(policy, seed, {"rig.yaml": loaded.text.encode()})
+    with open_rig(loaded) as rig:
+        acting = load_policy(policy, task, rig.spec)
+        with Recording(folder, loaded.facts.canonical.pitch) as recording:
+            episode, failure = _drive(rig, acting, task, steps, facts, recording, interrupt)
+    for problem in (failure, recording.problem(len(episode.steps))):
+        if problem:
+            complain(problem)
+    if not recording.opened:
+        return True
+    episode.dropped = recording.dropped
+    _report(episode, folder, [folder / "episode.mcap"])
+    return bool(failure or recording.problem(len(episode.steps)))
+
+
+def _drive(
+    rig: Rig,
+    policy: Policy,
+    task: Task | None,
+    steps: int,
+    facts: EpisodeFacts,
+    recording: Recording,
+    interrupt: Interrupt,
+) -> tuple[Episode, str]:
+    """The episode, shown by a progress bar, and what ended it too early ("" when nothing did)."""
+    from robot.deploy import EpisodeFailed, run_episode
+
+    with progress() as bar:
+        row = bar.add_task(STARTING, total=None)
+        known = None if steps == NO_END else steps
+
+        def show(step: Step) -> None:
+            bar.update(row, description=task.facts.kind if task else rig.name, total=known, completed=step.index)
+
+        try:
+            return run_episode(
+                rig, policy, task, steps, facts=facts, recorder=recording.open, on_step=show, stop=interrupt
+            ), ""
+        except EpisodeFailed as failed:
+            return failed.episode, str(failed)
+
+
+class Recording:
+    """The recorder of one run. Folder and file are made when the episode starts: a run that can't start leaves none."""
+
+    def __init__(self, folder: Path, pitch: float) -> None:
+        self._folder, self._pitch = folder, pitch
+        self._recorder: Recorder | None = None
+        self._stack = ExitStack()
+
+    def open(self, meta: EpisodeMeta) -> Recorder:
+        """Raises OSError."""
+        from tacsim.record.writer import Recorder
+
+        make(self._folder)
+        self._recorder = self._stack.enter_context(Recorder(self._folder / "episode.mcap", meta, pitch=self._pitch))
+        return self._recorder
+
+    @property
+    def opened(self) -> bool:
+        return self._recorder is not None
+
+    @property
+    def dropped(self) -> int:
+        return 0 if self._recorder is None else self._recorder.dropped
+
+    def problem(self, steps: int) -> str:
+        """What went wrong with the recording, in words; "" when nothing did."""
+        recorder = self._recorder
+        if recorder is None or not (recorder.error or recorder.dropped):
+            return ""
+        why = str(recorder.error) if recorder.error else "the disk was too slow"
+        return f"{recorder.path} holds {recorder.written} of {steps} steps: {why}"
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.close()
+
+
+def replay(
+    file: Annotated[Path, typer.Argument(help="An episode.mcap; a recording that was cut off will do.")],
+    out: Out = None,
+) -> None:
+    """Show a recorded episode again: its report, made anew. Nothing is executed.
+
+    Example: tacsim replay runs/first/episode.mcap
+    """
+    folder = new_directory(out, "replay")
+    with busy("reading"):
+        from tacsim.record.reader import read_episode
+
+        episode = read_episode(file)
+    if not episode.complete:
+        notes.print(f"The recording ended without its footer; {len(episode.steps)} steps could be read.")
+    make(folder)
+    _report(episode, folder, [])
+
+
+def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
+    """Writes the report and ends with the table."""
+    from tacsim.report import end_table, summary, write_report
+
+    with busy("writing the report"):
+        paths = write_report(episode, folder)
+    listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
+    results.print(end_table(summary(episode), listed))

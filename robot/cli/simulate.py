@@ -1,0 +1,167 @@
+"""`tacsim press` and `tacsim reproduce`: simulation without a policy's episode."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from robot.cli.output import (
+    Out,
+    Overrides,
+    busy,
+    make,
+    new_directory,
+    notes,
+    progress,
+    quantities,
+    quantity,
+    results,
+    say_files,
+)
+
+if TYPE_CHECKING:
+    from tacsim.figure4 import Trial
+    from tacsim.scene import Scene, Shape
+
+
+class Preset(StrEnum):
+    """Resolution of a simulation."""
+
+    draft = "draft"
+    standard = "standard"
+
+
+class Physics(StrEnum):
+    """Which schemes the reproduction runs."""
+
+    both = "both"
+    hybrid = "hybrid"
+    seed = "seed"
+
+
+def press(
+    indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an .stl file.")],
+    depth: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="How deep below the untouched gel.")
+    ] = "0.5 mm",
+    slide: Annotated[
+        Any, typer.Option(parser=quantities("length", 2), metavar="X,Y", help="Then slide by this much.")
+    ] = "0,0",
+    twist: Annotated[
+        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Then turn about the vertical.")
+    ] = "0",
+    radius: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Of a sphere or cylinder.")
+    ] = "4 mm",
+    height: Annotated[Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Of a cylinder.")] = "5 mm",
+    size: Annotated[
+        Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
+    ] = "5 mm, 5 mm, 5 mm",
+    scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
+    preset: Annotated[Preset, typer.Option(help="Resolution.")] = Preset.standard,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Press a rigid indenter on one gel: rgb.png, height.npy, height.png and press.json with force and contact radius.
+
+    --set changes the scene, for example --set indenter.friction=0.3 (see tacsim schema scene).
+
+    Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
+    """
+    from tacsim.config import load_scene, load_sensor
+
+    folder = new_directory(out, "press")
+    scene = load_scene("press", [f"preset={preset}", *(set_ or [])])
+    scene = _with_indenter(scene, _geometry(indenter, radius, height, size, scale))
+    sensor = load_sensor("ideal")
+    with busy("pressing (the first run compiles the kernels, up to half a minute)"):
+        from robot import press as presses
+
+        motion = presses.Press(depth, slide, twist)
+        pressed = presses.press(scene, sensor, motion)
+    facts = presses.facts_of(scene, motion, pressed, sensor)
+    presses.write(make(folder), pressed, facts)
+    results.print(f"force            {facts['force']:.4g} N")
+    results.print(f"contact radius   {facts['contact_radius'] * 1e3:.3f} mm")
+    results.print(f"deepest          {facts['deepest'] * 1e3:.3f} mm")
+    if not facts["settled"]:
+        notes.print(f"warning: not settled, relative residual {facts['residual']:.2g}; raise settling.max_substeps")
+    say_files(*sorted(folder.iterdir()))
+
+
+def _geometry(indenter: str, radius: float, height: float, size: tuple[float, ...], scale: float) -> Shape:
+    from pydantic import TypeAdapter, ValidationError
+
+    from tacsim.scene import Shape
+
+    known: dict[str, dict[str, Any]] = {
+        "sphere": {"radius": radius},
+        "cylinder": {"radius": radius, "height": height},
+        "box": {"size": size},
+    }
+    if indenter not in known and not indenter.lower().endswith(".stl"):
+        words = f"'{indenter}' is no indenter; allowed: sphere, cylinder, box, or the path of an .stl file"
+        raise typer.BadParameter(words, param_hint="INDENTER")
+    described = {"shape": indenter, **known[indenter]} if indenter in known else {"path": indenter, "scale": scale}
+    try:
+        shape: Shape = TypeAdapter(Shape).validate_python({"shape": "stl", **described})
+    except ValidationError as error:
+        problems = "; ".join(f"{part['loc'][-1]}: {part['msg']}" for part in error.errors())
+        raise typer.BadParameter(problems, param_hint="INDENTER") from None
+    return shape
+
+
+def _with_indenter(scene: Scene, geometry: Shape) -> Scene:
+    if scene.indenter is None:
+        raise typer.BadParameter("this scene has no indenter; press needs one", param_hint="--set")
+    return scene.model_copy(update={"indenter": scene.indenter.model_copy(update={"geometry": geometry})})
+
+
+def reproduce(
+    physics: Annotated[Physics, typer.Option(help="The seed's scheme, ours (hybrid), or both.")] = Physics.both,
+    out: Out = None,
+) -> None:
+    """Repeat the seed paper's experiment: fig4.png and fig4.json; exit code 1 if its result does not come out.
+
+    Squeeze and reposition are driven through their goal and beyond. The reward must rise to a peak at the goal
+    (closest distance at most 0.05 mm and 0.1 mm), then fall by more than five times that.
+
+    Example: tacsim reproduce --physics hybrid --out fig4
+    """
+    folder = new_directory(out, "reproduce")
+    schemes = ["seed", "hybrid"] if physics is Physics.both else [physics.value]
+    with busy("loading"):
+        from robot import reproduce as experiment
+        from tacsim.figure4 import figure4
+
+    trials: dict[str, dict[str, Trial]] = {task: {} for task in experiment.EXPERIMENTS}
+    with progress() as bar:
+        notes.print("The first run compiles the kernels of each physics, up to half a minute.")
+        for task, planned in experiment.EXPERIMENTS.items():
+            for scheme in schemes:
+                row = bar.add_task(f"{task}, {scheme}", total=planned.steps + 1)
+                trials[task][scheme] = experiment.run_trial(task, scheme, lambda row=row: bar.advance(row))  # type: ignore[misc]
+    make(folder)
+    picture, table = folder / "fig4.png", folder / "fig4.json"
+    table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    figure4(trials, picture)
+    say_files(picture, table)
+    if _judge(trials):
+        raise typer.Exit(1)
+
+
+def _judge(trials: dict[str, dict[str, Trial]]) -> bool:
+    """Prints a line a trial; True when any of them failed."""
+    from robot.reproduce import shortcomings
+
+    failed = False
+    for task, schemes in trials.items():
+        for scheme, trial in schemes.items():
+            problems = shortcomings(task, trial)
+            said = "; ".join(problems) or f"closest {trial.distance[trial.peak] * 1e3:.3f} mm at step {trial.peak}"
+            results.print(f"{'FAILED' if problems else 'ok':8}{task}, {scheme}: {said}")
+            failed = failed or bool(problems)
+    return failed

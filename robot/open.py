@@ -1,0 +1,240 @@
+"""Opens rigs. The only place that asks what kind of sensors and arms stand behind one."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tacsim.config import LoadedRig, load_rig
+from tacsim.interface import Arm, Normaliser, SensorSpec, TactileFrame
+from tacsim.rig import Rig
+from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts, RigFacts, SimArmFacts, SimSensorFacts
+
+if TYPE_CHECKING:
+    from tacsim.env import TacsimEnv
+    from tacsim.optics.geometry import CanonicalGrid
+    from tacsim.physics.world import World
+    from tacsim.record.replay import ReplayClock, ReplaySensor
+    from tacsim.scene import Scene
+    from tacsim.sensor import SimClock, SimSensor
+
+RIG_ATTACHMENT = "rig.yaml"  # of an episode: the resolved rig file it was recorded with
+
+
+class CannotOpen(ValueError):
+    """A rig file that is sound in itself describes no rig that can be opened."""
+
+
+def open_rig(rig: str | Path | LoadedRig | RigFacts, *, task: str | None = None, overrides: Sequence[str] = ()) -> Rig:
+    """Opens a rig by its name ("sim", "replay"), by the path of its file, or from facts already loaded.
+
+    Use it as a context manager: ``with open_rig("sim") as rig: observation = rig.reset()``. `task` and `overrides` are
+    as for tacsim.config.load_rig; facts that are loaded have theirs already. Opening moves nothing.
+
+    Raises:
+        ConfigError: the file is wrong.
+        CannotOpen: its parts don't make a rig, e.g. a recording is not named.
+        EpisodeError: a recording cannot be read.
+    """
+    if isinstance(rig, (LoadedRig, RigFacts)):
+        if task is not None or overrides:
+            raise TypeError("open_rig: task and overrides belong to load_rig; this rig is loaded already")
+        facts = rig.facts if isinstance(rig, LoadedRig) else rig
+    else:
+        facts = load_rig(rig, task=task, overrides=overrides).facts
+    _check_drivers(facts)
+    return _open_sim(facts) if facts.clock == "sim" else _open_replay(facts)
+
+
+def make_env(
+    task: str = "squeeze",
+    rig: str | Path = "sim",
+    overrides: Sequence[str] = (),
+    render_mode: str | None = None,
+) -> TacsimEnv:
+    """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters."""
+    from tacsim.env import TacsimEnv
+    from tacsim.tasks import make_task
+
+    facts = load_rig(rig, task=task, overrides=overrides).facts
+    if facts.task is None:
+        raise CannotOpen(f"rig '{facts.name}' has no task; an environment needs one")
+    opened = open_rig(facts)
+    try:
+        return TacsimEnv(opened, make_task(facts.task), render_mode)
+    except BaseException:
+        opened.close()
+        raise
+
+
+def _check_drivers(facts: RigFacts) -> None:
+    """All parts of a rig go by one clock."""
+    parts = {f"arms.{name}": arm.driver for name, arm in facts.arms.items()}
+    parts |= {f"sensors.{name}": sensor.driver for name, sensor in facts.sensors.items()}
+    for key, driver in parts.items():
+        if driver != facts.clock:
+            raise CannotOpen(
+                f"rig '{facts.name}': {key} has driver '{driver}', which cannot go by clock '{facts.clock}'; "
+                f"give it driver '{facts.clock}', or change the clock"
+            )
+
+
+def _open_sim(facts: RigFacts) -> Rig:
+    """One World seen as sensors, arms and a clock."""
+    from calibration.normaliser import for_simulated
+    from tacsim.physics.world import make_world
+    from tacsim.sensor import SimArm, SimClock, SimStart
+
+    scene = facts.scene
+    if scene is None:
+        raise CannotOpen(f"rig '{facts.name}' simulates, but has no scene; give scene, or a task (which has one)")
+    frames = _driven_frames(facts, scene)
+    models = {name: sensor for name, sensor in facts.sensors.items() if isinstance(sensor, SimSensorFacts)}
+    world = make_world(scene)
+    clock = SimClock(world, facts.period)
+    sensors = {name: _sim_sensor(world, clock, name, sensor, facts) for name, sensor in models.items()}
+    arms: dict[str, Arm] = {}
+    for name, arm in facts.arms.items():
+        assert isinstance(arm, SimArmFacts)
+        longest, widest = arm.speed * facts.period, arm.turn_rate * facts.period
+        arms[name] = SimArm(world, clock, frames[name], longest, widest)
+    task = facts.task
+    return Rig(
+        name=facts.name,
+        sensors=sensors,
+        arms=arms,
+        clock=clock,
+        normalisers={
+            name: for_simulated(sensor.model, scene.gel.size[:2], facts.canonical) for name, sensor in models.items()
+        },
+        start=SimStart(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
+        truth=None if scene.body is None else world.truth,
+        diagnostics=clock.diagnostics,
+    )
+
+
+def _driven_frames(facts: RigFacts, scene: Scene) -> dict[str, str]:
+    """Which frame of the world each arm moves: the sensor it carries, or the indenter."""
+    there = ", ".join(scene.sensors)
+    for name in facts.sensors:
+        if name not in scene.sensors:
+            raise CannotOpen(f"rig '{facts.name}': scene '{scene.name}' has no sensor '{name}'; it has {there}")
+    frames = {sensor.arm: name for name, sensor in facts.sensors.items() if sensor.arm is not None}
+    if scene.indenter is not None:
+        frames.setdefault("indenter", "indenter")
+    for name in facts.arms:
+        if name not in frames:
+            raise CannotOpen(
+                f"rig '{facts.name}': arms.{name} carries no sensor; name it in sensors.NAME.arm, or leave it out"
+            )
+    carried = [sensor.arm for sensor in facts.sensors.values()]
+    doubled = sorted({arm for arm in carried if arm is not None and carried.count(arm) > 1})
+    if doubled:
+        raise CannotOpen(f"rig '{facts.name}': arms.{doubled[0]} carries several sensors; a simulated arm carries one")
+    return frames
+
+
+def _sim_sensor(world: World, clock: SimClock, name: str, facts: SimSensorFacts, rig: RigFacts) -> SimSensor:
+    from tacsim.optics.render import Renderer
+    from tacsim.optics.surface import surface_map
+    from tacsim.sensor import SimSensor
+
+    assert rig.scene is not None
+    model = facts.model
+    spec = SensorSpec(
+        image_shape=(model.geometry.height, model.geometry.width),
+        height=True,
+        flow=model.markers is not None,
+        arm=facts.arm,
+    )
+    sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
+    return SimSensor(world, clock, name, spec, Renderer(model, rig.scene.gel.size[:2]), sample)
+
+
+class _Rewind:
+    """Start of a replayed episode: the first frame; nothing moves, nothing is touched that was not touched then."""
+
+    def __init__(self, clock: ReplayClock, sensors: Mapping[str, ReplaySensor]) -> None:
+        self._clock, self._sensors = clock, sensors
+
+    def clear(self, seed: int) -> Mapping[str, TactileFrame]:
+        self._clock.rewind()
+        return {name: sensor.reference() for name, sensor in self._sensors.items()}
+
+    def touch(self) -> None:
+        """A recording is as it is."""
+
+
+def _open_replay(facts: RigFacts) -> Rig:
+    """Recorded sensors and arms. The control period is that of the recording."""
+    from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor
+
+    recorded = {name: sensor for name, sensor in facts.sensors.items() if isinstance(sensor, ReplaySensorFacts)}
+    clock = ReplayClock(_common_period(facts.name, recorded))
+    with ExitStack() as stack:
+        sensors: dict[str, ReplaySensor] = {}
+        normalisers: dict[str, Normaliser] = {}
+        for name, sensor in recorded.items():
+            sensors[name] = ReplaySensor(sensor, name, clock)
+            stack.callback(sensors[name].close)
+            normalisers[name] = _replay_normaliser(sensor, name, sensors[name].spec.image_shape, facts.canonical)
+        arms: dict[str, Arm] = {}
+        for name, arm in facts.arms.items():
+            assert isinstance(arm, ReplayArmFacts)
+            arms[name] = ReplayArm(arm, name, clock)
+            stack.callback(arms[name].close)
+        rig = Rig(
+            name=facts.name,
+            sensors=sensors,
+            arms=arms,
+            clock=clock,
+            normalisers=normalisers,
+            start=_Rewind(clock, sensors),
+        )
+        stack.pop_all()
+        return rig
+
+
+def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
+    from tacsim.record.replay import recorded_period
+
+    periods = {name: recorded_period(sensor, name) for name, sensor in sensors.items()}
+    shortest, longest = min(periods, key=periods.__getitem__), max(periods, key=periods.__getitem__)
+    if periods[longest] > periods[shortest] * 1.01:
+        raise CannotOpen(
+            f"rig '{rig}': recordings go frame by frame, but sensors.{shortest} has one every {periods[shortest]:.4g} s "
+            f"and sensors.{longest} one every {periods[longest]:.4g} s; give recordings of one rate"
+        )
+    return periods[shortest]
+
+
+def _replay_normaliser(
+    facts: ReplaySensorFacts, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
+) -> Normaliser:
+    """By the corners of the rig file; without them by what an episode says of its own sensor."""
+    from calibration.normaliser import for_recorded, for_simulated
+
+    original = None if facts.corners is not None else _recorded_rig(Path(facts.source or ""))
+    sensor = None if original is None else original.sensors.get(name)
+    if original is not None and original.scene is not None and isinstance(sensor, SimSensorFacts):
+        return for_simulated(sensor.model, original.scene.gel.size[:2], grid)
+    return for_recorded(sensor if isinstance(sensor, ReplaySensorFacts) else facts, image_shape, grid)
+
+
+def _recorded_rig(source: Path) -> RigFacts | None:
+    """The rig that an episode was recorded with; None where it is not known."""
+    from tacsim.record.sources import EPISODES, episode_meta
+
+    if source.suffix.lower() not in EPISODES:
+        return None
+    text = episode_meta(source).attachments.get(RIG_ATTACHMENT)
+    if text is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:  # an empty folder: the text can refer to nothing beside it
+        path = Path(folder) / RIG_ATTACHMENT
+        path.write_bytes(text)
+        return load_rig(path).facts

@@ -1,0 +1,138 @@
+"""Rigid transforms: operations on tacsim.interface.Pose.
+
+``a_from_b`` maps coordinates in b to coordinates in a; it also is the pose of b in a.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import FloatArray, Pose
+
+# Pose of the upper sensor's axes as seen from the lower one's: z turned down, nothing mirrored.
+HALF_TURN_X = Pose(quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def rotation(pose: Pose) -> Rotation:
+    """The rotation of a pose."""
+    return Rotation.from_quat(np.array(pose.quaternion))  # a copy: SciPy refuses read-only arrays
+
+
+def from_rotation_vector(position: ArrayLike, vector: ArrayLike) -> Pose:
+    """The pose at `position` (3,) [m], turned by |vector| [rad] about `vector` (3,)."""
+    return Pose(
+        np.array(position, dtype=np.float64), Rotation.from_rotvec(np.array(vector, dtype=np.float64)).as_quat()
+    )
+
+
+def from_matrix(matrix: ArrayLike) -> Pose:
+    """The pose of a homogeneous matrix (4, 4) [m].
+
+    Raises ValueError when its last row is not 0 0 0 1, or its rotation is not orthonormal or mirrors (within 1e-6).
+    """
+    given = np.array(matrix, dtype=np.float64)
+    if given.shape != (4, 4) or not np.isfinite(given).all() or not np.allclose(given[3], [0, 0, 0, 1], atol=1e-9):
+        raise ValueError(f"from_matrix: need 4 x 4 finite numbers with last row 0 0 0 1, got {given.tolist()}")
+    turn = given[:3, :3]
+    skew, determinant = float(np.abs(turn @ turn.T - np.eye(3)).max()), float(np.linalg.det(turn))
+    if skew > 1e-6 or determinant < 0:
+        raise ValueError(
+            f"from_matrix: no rotation (determinant {determinant:.6g}, orthonormal within {skew:.2g}, limit 1e-06); "
+            "frames are right-handed and unscaled: look for a flipped axis or a length in the rotation"
+        )
+    return Pose(given[:3, 3], Rotation.from_matrix(turn).as_quat())
+
+
+def to_matrix(pose: Pose) -> FloatArray:
+    """Homogeneous matrix (4, 4) [m]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation(pose).as_matrix()
+    matrix[:3, 3] = pose.position
+    return matrix
+
+
+def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
+    """a_from_c."""
+    turn = rotation(a_from_b)
+    position = a_from_b.position + turn.apply(np.array(b_from_c.position))
+    return Pose(position, (turn * rotation(b_from_c)).as_quat())
+
+
+def inverse(a_from_b: Pose) -> Pose:
+    """b_from_a."""
+    back = rotation(a_from_b).inv()
+    return Pose(-back.apply(np.array(a_from_b.position)), back.as_quat())
+
+
+def relative(a: Pose, b: Pose) -> Pose:
+    """Pose of b as seen from a: ``a_from_b``, both given in one frame."""
+    return compose(inverse(a), b)
+
+
+def transform(a_from_b: Pose, points: ArrayLike) -> FloatArray:
+    """(..., 3) points in b -> the same points in a [m]."""
+    return rotate(a_from_b, points) + a_from_b.position
+
+
+def rotate(a_from_b: Pose, vectors: ArrayLike) -> FloatArray:
+    """(..., 3) directions, velocities or forces in the axes of b -> the same in the axes of a."""
+    given = np.array(vectors, dtype=np.float64)
+    turned: FloatArray = rotation(a_from_b).apply(given.reshape(-1, 3)).reshape(given.shape)
+    return turned
+
+
+def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
+    """(6,) force and torque about b's origin, in b's axes -> the same load about a's origin, in a's axes [N, N m]."""
+    load = np.array(wrench, dtype=np.float64)
+    if load.shape != (6,):
+        raise ValueError(f"transform_wrench: need 3 forces [N] and 3 torques [N m], got shape {load.shape}")
+    force, torque = rotate(a_from_b, load.reshape(2, 3))
+    return np.concatenate([force, torque + np.cross(a_from_b.position, force)])
+
+
+def difference(before: Pose, after: Pose) -> FloatArray:
+    """(6,) motion from one pose to another, in the axes of the frame both are given in: shift of the origin [m], and
+    rotation vector [rad], the shorter way round."""
+    turn = rotation(after) * rotation(before).inv()
+    return np.concatenate([after.position - before.position, turn.as_rotvec()])
+
+
+def distance(a: Pose, b: Pose) -> tuple[float, float]:
+    """How far apart two poses are: their origins [m], and their axes as one angle [rad]."""
+    motion = difference(a, b)
+    return float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
+
+
+def interpolate(a: Pose, b: Pose, s: float) -> Pose:
+    """The pose a fraction `s` of the way from a to b: straight line, rotation about one axis the shorter way (slerp).
+
+    Raises ValueError outside 0 <= s <= 1.
+    """
+    if not 0.0 <= s <= 1.0:
+        raise ValueError(f"interpolate: s must lie within 0 and 1, got {s}")
+    motion = s * difference(a, b)
+    return Pose(a.position + motion[:3], (Rotation.from_rotvec(motion[3:]) * rotation(a)).as_quat())
+
+
+def two_columns(pose: Pose) -> FloatArray:
+    """(6,) first, then second column of the rotation matrix: continuous everywhere (Zhou et al. 2019), as no rotation
+    vector and no set of angles is."""
+    return np.ascontiguousarray(rotation(pose).as_matrix()[:, :2].T).ravel()
+
+
+def from_two_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
+    """The pose whose rotation has these two columns (6,), made orthonormal by Gram-Schmidt.
+
+    Raises ValueError when they are parallel or zero.
+    """
+    first, second = np.array(columns, dtype=np.float64).reshape(2, 3)
+    area = float(np.linalg.norm(np.cross(first, second)))
+    if not area > 1e-9:
+        raise ValueError(f"from_two_columns: columns {columns!r} span no plane")
+    x = first / np.linalg.norm(first)
+    y = second - (second @ x) * x
+    y /= np.linalg.norm(y)
+    matrix = np.stack([x, y, np.cross(x, y)], axis=1)
+    return Pose(np.array(position, dtype=np.float64), Rotation.from_matrix(matrix).as_quat())

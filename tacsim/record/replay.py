@@ -1,0 +1,205 @@
+"""Recorded sensors and arms behind the contract of a rig. Frame k of all sources belongs to tick k of one clock.
+
+Times are given on the replay's clock: what was exposed 20 ms before its step then, is 20 ms old now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import ArmState, EndOfEpisode, Pose, SensorSpec, TactileFrame
+from tacsim.record.episode import EpisodeError
+from tacsim.record.gripper import finger_states, read_columns
+from tacsim.record.images import read_image, reference_image
+from tacsim.record.sources import (
+    EPISODES,
+    VIDEOS,
+    Cursor,
+    T,
+    episode_frames,
+    episode_meta,
+    episode_states,
+    folder_images,
+    list_pictures,
+    only_or_named,
+    unknown_source,
+    video_images,
+    video_rate,
+)
+from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts
+
+
+class ReplayClock:
+    """One recorded frame a tick; `period` is what a frame stands for [s]. `index` starts at 0, the first frame."""
+
+    def __init__(self, period: float) -> None:
+        if not period > 0.0:
+            raise ValueError(f"the period of a replay must be above 0 s, got {period}")
+        self._period = period
+        self.index = 0
+
+    @property
+    def period(self) -> float:
+        return self._period
+
+    def now(self) -> float:
+        return self.index * self._period
+
+    def tick(self) -> None:
+        self.index += 1
+
+    def rewind(self) -> None:
+        """Back to the first frame."""
+        self.index = 0
+
+
+class ReplaySensor:
+    """Recorded frames as a TactileSource.
+
+    The source is an episode (frames of the sensor of this name, or of its only one), a folder of pictures of one size,
+    or a video. Nothing is known of its physical calibration: `spec` promises height and flow only if the recorded
+    frames carry them.
+
+    Raises EpisodeError when the source is missing, empty, unreadable, too large, or has no such sensor.
+    """
+
+    def __init__(self, facts: ReplaySensorFacts, name: str, clock: ReplayClock) -> None:
+        self._facts, self._name, self._clock = facts, name, clock
+        self._path = _source(facts.source, f"sensors.{name}")
+        self._reference = None if facts.reference is None else read_image(Path(facts.reference))
+        self._frames = Cursor(self._open(), str(self._path))
+        self._first, _ = _first(self._frames, self._path)
+        rows, columns, _ = self._first.image.shape
+        if self._reference is not None and self._reference.shape[:2] != (rows, columns):
+            self.close()
+            raise EpisodeError(
+                f"sensors.{name}.reference: {self._reference.shape[1]} x {self._reference.shape[0]} pixels, "
+                f"but the frames of {self._path} have {columns} x {rows}"
+            )
+        surface = self._first.surface
+        flow = surface is not None and surface.flow is not None
+        self._spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=facts.arm)
+
+    @property
+    def spec(self) -> SensorSpec:
+        return self._spec
+
+    def read(self, timeout: float) -> TactileFrame:
+        """The frame of this tick, at once. Raises EndOfEpisode after the last, EpisodeError for an unreadable one."""
+        frame, age = self._frames.at(self._clock.index)
+        if frame.image.shape[:2] != self._spec.image_shape:
+            raise EpisodeError(
+                f"{self._path}: frame {self._clock.index} has {frame.image.shape[:2]} rows and columns, "
+                f"the first has {self._spec.image_shape}"
+            )
+        return replace(frame, time=self._clock.now() - age)
+
+    def reference(self) -> TactileFrame:
+        """A frame without contact: the `reference` of the rig file, else that of the episode, else the first frame."""
+        if self._reference is None:
+            return replace(self._first, time=self._clock.now())
+        return TactileFrame(image=self._reference, time=self._clock.now(), index=self._first.index)
+
+    def close(self) -> None:
+        self._frames.close()
+
+    def _open(self) -> Callable[[], Iterator[tuple[TactileFrame, float]]]:
+        """What starts the frames, each with its age at its step [s]. Pictures and videos know none: 0."""
+        path = self._path
+        if path.is_dir():
+            pictures = list_pictures(path)
+            return lambda: _number(folder_images(pictures))
+        if path.suffix.lower() in VIDEOS and path.is_file():
+            return lambda: _number(video_images(path))
+        if path.suffix.lower() not in EPISODES or not path.is_file():
+            raise unknown_source(path)
+        meta = episode_meta(path)
+        sensor = only_or_named(list(meta.spec.sensors), self._name, path, "sensor")
+        if self._reference is None:
+            self._reference = reference_image(meta.attachments, sensor)
+        return lambda: ((frame, time - frame.time) for frame, time in episode_frames(path, sensor))
+
+
+class ReplayArm:
+    """Recorded states as an Arm that executes nothing.
+
+    The source is an episode (states of the arm of this name, or of its only one), or a CSV file of a parallel gripper
+    with a row a frame: see :func:`tacsim.record.gripper.finger_states` for the frames and signs. The arm called "lower"
+    is the lower finger, any other the upper one.
+
+    Raises EpisodeError when the source is missing, empty, unreadable, or has no such arm or column.
+    """
+
+    def __init__(self, facts: ReplayArmFacts, name: str, clock: ReplayClock) -> None:
+        self._facts, self._name, self._clock = facts, name, clock
+        self._path = _source(facts.source, f"arms.{name}")
+        self._states = Cursor(self._open(), str(self._path))
+        _first(self._states, self._path)
+
+    def state(self) -> ArmState:
+        """The state of this tick. Raises EndOfEpisode after the last."""
+        state, age = self._states.at(self._clock.index)
+        return replace(state, time=self._clock.now() - age)
+
+    def command(self, target: Pose | None) -> Pose | None:
+        """Executes nothing, and says so: None."""
+        return None
+
+    def stop(self) -> None:
+        """Nothing moves."""
+
+    def recover(self) -> None:
+        """Nothing to recover from."""
+
+    def close(self) -> None:
+        self._states.close()
+
+    def _open(self) -> Callable[[], Iterator[tuple[ArmState, float]]]:
+        """What starts the states, each with its age at its step [s]."""
+        path = self._path
+        if path.suffix.lower() in EPISODES and path.is_file():
+            arm = only_or_named(list(episode_meta(path).spec.arms), self._name, path, "arm")
+            return lambda: ((state, time - state.time) for state, time in episode_states(path, arm))
+        if not path.is_file():
+            raise EpisodeError(f"{path}: no such file")
+        if path.suffix.lower() != ".csv":
+            raise EpisodeError(f"{path}: no record of an arm; give an episode ({', '.join(EPISODES)}) or a .csv file")
+        columns = [self._facts.force_column]
+        columns += [] if self._facts.width_column is None else [self._facts.width_column]
+        states = finger_states(read_columns(path, columns), self._clock.period, lower=self._name == "lower")
+        return lambda: ((state, 0.0) for state in states)
+
+
+def recorded_period(facts: ReplaySensorFacts, name: str) -> float:
+    """Time between two frames of a recording [s]: what the rig's period should be. Raises EpisodeError.
+
+    An episode knows it, most videos do; for the others `fps` of the rig file counts.
+    """
+    path = _source(facts.source, f"sensors.{name}")
+    if path.suffix.lower() in EPISODES:
+        return episode_meta(path).spec.period
+    rate = video_rate(path) if path.suffix.lower() in VIDEOS and path.is_file() else None
+    return 1.0 / (facts.fps if rate is None else rate)
+
+
+def _first(cursor: Cursor[T], path: Path) -> T:
+    try:
+        return cursor.at(0)
+    except EndOfEpisode:
+        raise EpisodeError(f"{path}: a recording without frames") from None
+
+
+def _number(images: Iterator[NDArray[np.uint8]]) -> Iterator[tuple[TactileFrame, float]]:
+    for index, image in enumerate(images):
+        yield TactileFrame(image=image, time=0.0, index=index), 0.0
+
+
+def _source(source: str | None, key: str) -> Path:
+    if source is None:
+        raise EpisodeError(f"{key}.source: no recording given; name one with --set {key}.source=PATH")
+    return Path(source)

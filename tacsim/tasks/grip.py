@@ -1,0 +1,54 @@
+"""Grip: close the sensors until they feel a firm contact, then hold. Needs images only, and so runs on any rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from tacsim import pose as se3
+from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
+from tacsim.touch import contact_signal
+
+TARGET = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
+CLOSE = 0.1e-3  # how far each sensor closes in a control period [m]
+
+
+class Grip:
+    """Moves every sensor along its own z until the mean contact signal reaches the target, then holds for good.
+
+    The same code closes simulated sensors and says what it would do on recorded frames. A sensor that no arm carries is
+    addressed by its own name, with a target relative to where it is.
+
+    Args:
+        spec: of the rig; says which arm carries which sensor.
+        target: contact signal (tacsim.touch) that ends the closing [-].
+        step: how far each sensor closes in a control period [m].
+    """
+
+    def __init__(self, spec: RigSpec, target: float = TARGET, step: float = CLOSE) -> None:
+        if not target > 0 or not step > 0:
+            raise ValueError(f"grip: target and step must be positive, got target {target}, step {step} m")
+        self._carriers: Mapping[str, str | None] = {name: sensor.arm for name, sensor in spec.sensors.items()}
+        self._target, self._step = target, step
+        self._holding = False
+
+    @property
+    def needs(self) -> Needs:
+        return Needs()
+
+    def reset(self) -> None:
+        self._holding = False
+
+    def __call__(self, observation: Observation) -> Action:
+        signals = [contact_signal(touch) for touch in observation.tactile.values()]
+        self._holding = self._holding or float(np.mean(signals)) >= self._target
+        if self._holding:
+            return Action({arm or sensor: None for sensor, arm in self._carriers.items()})
+        forward = Pose(np.array([0.0, 0.0, self._step]))
+        return Action(
+            {
+                arm or sensor: se3.compose(Pose() if arm is None else observation.arms[arm].pose, forward)
+                for sensor, arm in self._carriers.items()
+            }
+        )

@@ -1,0 +1,41 @@
+"""Ramped paths."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import Pose
+from tacsim.physics.controller import PEAK, plan, ramp
+
+
+def test_ramp_starts_and_ends_at_rest() -> None:
+    t = np.linspace(0, 1, 2001)
+    s = ramp(t)
+    speed = np.gradient(s, t)
+    assert (s[0], s[-1]) == (0, 1)
+    assert speed[0] == pytest.approx(0, abs=1e-5) and speed[-1] == pytest.approx(0, abs=1e-5)
+    assert speed.max() == pytest.approx(PEAK, rel=1e-4)
+    assert (np.diff(s) >= 0).all()
+
+
+def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
+    start = Pose()
+    end = Pose(np.array([0.3e-3, -0.2e-3, 1e-3]), Rotation.from_rotvec([0, 0, 0.2]).as_quat())
+    path = plan([start], [end], mach=0.05, dt=0.4, lever=10.0)
+    drive = path.drive(0, path.substeps).astype(float)
+    rim = np.linalg.norm(drive[:, 0, 4], axis=1) + 10.0 * np.linalg.norm(drive[:, 0, 5], axis=1)
+    assert rim.max() <= 0.05 * 1.001
+    assert drive[-1, 0, 3] == pytest.approx(end.position * 1e3, abs=1e-6)
+    assert drive[-1, 0, :3] == pytest.approx(Rotation.from_quat(end.quaternion).as_matrix(), abs=1e-6)
+    assert drive[:, 0, 4].sum(axis=0) * 0.4 == pytest.approx(end.position * 1e3, abs=1e-5)
+
+
+def test_refining_cuts_the_same_path_finer() -> None:
+    path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0)
+    coarse, fine = path.drive(5, 9), path.drive(5, 9, refine=4)
+    assert len(fine) == 16
+    assert fine[3::4, 0, 3] == pytest.approx(coarse[:, 0, 3], abs=1e-6)
+
+
+def test_no_motion_needs_no_substeps() -> None:
+    assert plan([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0).substeps == 0

@@ -1,0 +1,117 @@
+"""Material laws of the kernels against the float64 reference."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tacsim.physics import material, reference
+from tacsim.runtime import start, ti
+from tacsim.scene import BodyMaterial, lame
+
+MU, BULK = 0.172, 1.67
+Strains = ti.types.ndarray(dtype=material.vec6, ndim=1)
+Matrices = ti.types.ndarray(dtype=material.mat3, ndim=1)
+
+
+@ti.kernel
+def return_all(e: Strains, tau: Strains, mu: ti.f32, bulk: ti.f32, limit: ti.f32):
+    for p in range(e.shape[0]):
+        elastic, stress = material.hencky_return(e[p], mu, bulk, limit)
+        e[p] = elastic
+        tau[p] = stress
+
+
+@ti.kernel
+def convect_all(e: Strains, d: Matrices):
+    for p in range(e.shape[0]):
+        e[p] = material.convect(e[p], d[p])
+
+
+def six(m: np.ndarray) -> np.ndarray:
+    return np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], m[..., 0, 1], m[..., 0, 2], m[..., 1, 2]], -1)
+
+
+def full(s: np.ndarray) -> np.ndarray:
+    return np.stack([s[..., 0], s[..., 3], s[..., 4], s[..., 3], s[..., 1], s[..., 5], s[..., 4], s[..., 5], s[..., 2]], -1).reshape(
+        *s.shape[:-1], 3, 3
+    )
+
+
+def random_b(count: int, size: float, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    strain = rng.uniform(-size, size, (count, 3))
+    axes = Rotation.random(count, rng=seed).as_matrix()
+    return np.einsum("nik,nk,njk->nij", axes, np.exp(2 * strain), axes)
+
+
+def run(b: np.ndarray, limit: float, mu: float = MU, bulk: float = BULK) -> tuple[np.ndarray, np.ndarray]:
+    start()
+    e = np.ascontiguousarray(six(b - np.eye(3)), np.float32)
+    tau = np.zeros_like(e)
+    return_all(e, tau, mu, bulk, limit)
+    return full(e.astype(float)) + np.eye(3), full(tau.astype(float))
+
+
+@pytest.mark.parametrize(("size", "tolerance"), [(1e-3, 2e-6), (0.05, 2e-6), (0.2, 5e-6), (0.6, 2e-4)])
+def test_elastic_stress_matches_the_reference(size: float, tolerance: float) -> None:
+    b = random_b(500, size)
+    _, tau = run(b, 1e9)
+    _, truth = reference.hencky_return(b, MU, BULK, math.inf)
+    assert np.abs(tau - truth).max() < tolerance * np.abs(truth).max()
+
+
+@pytest.mark.parametrize("limit", [1e-3, 0.02, 0.07, 0.2])
+def test_return_lands_on_the_yield_surface_and_keeps_volume(limit: float) -> None:
+    b = random_b(500, 0.4)
+    b_new, tau = run(b, limit)
+    b_truth, tau_truth = reference.hencky_return(b, MU, BULK, limit)
+    deviator = tau - np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    assert np.linalg.norm(deviator, axis=(1, 2)).max() <= 2 * MU * limit * (1 + 1e-4) + 1e-6
+    assert np.abs(np.linalg.det(b_new) / np.linalg.det(b) - 1).max() < 3e-5
+    assert np.abs(tau - tau_truth).max() < 3e-4 * np.abs(tau_truth).max()
+    assert np.abs(b_new - b_truth).max() < 3e-4
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.floats(1e-3, 0.3))
+def test_the_law_is_objective(seed: int, size: float) -> None:
+    b = random_b(1, size, seed)
+    turn = Rotation.random(rng=seed + 1).as_matrix()
+    _, tau = run(b, 0.05)
+    _, tau_turned = run(turn @ b @ turn.T, 0.05)
+    assert np.abs(turn @ tau @ turn.T - tau_turned).max() < 1e-5 * max(np.abs(tau).max(), 0.01)
+
+
+def test_convection_is_f_b_f_transposed() -> None:
+    start()
+    rng = np.random.default_rng(3)
+    d = rng.uniform(-0.05, 0.05, (200, 3, 3))
+    b = random_b(200, 0.1)
+    e = np.ascontiguousarray(six(b - np.eye(3)), np.float32)
+    convect_all(e, np.ascontiguousarray(d, np.float32))
+    f = np.eye(3) + d
+    assert np.abs(full(e.astype(float)) + np.eye(3) - f @ b @ np.swapaxes(f, 1, 2)).max() < 1e-6
+
+
+def test_tiny_strains_keep_their_digits() -> None:
+    """Storing e = b - I: a strain of 1e-6 is still right to 1e-4, where b in float32 would have lost it all."""
+    b = random_b(200, 1e-6)
+    _, tau = run(b, 1e9)
+    e = b - np.eye(3)
+    small = MU * (e - np.trace(e, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3))
+    small += BULK / 2 * np.trace(e, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    assert np.abs(tau - small).max() < 1e-4 * np.abs(small).max()
+
+
+def test_yield_norms() -> None:
+    """A uniaxial yield stress reaches that plateau; the seed's Frobenius norm gives sqrt(3/2) of it."""
+    uniaxial = BodyMaterial(yield_stress=30e3)
+    frobenius = BodyMaterial(yield_stress=30e3, yield_norm="frobenius")
+    assert frobenius.elastic_limit / uniaxial.elastic_limit == pytest.approx(math.sqrt(1.5))
+    mu, _ = lame(uniaxial)
+    deviator = 2 * mu * uniaxial.elastic_limit  # |dev tau|_F at yield = sqrt(2/3) sigma
+    assert deviator * math.sqrt(1.5) == pytest.approx(30e3)

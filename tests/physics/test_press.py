@@ -1,0 +1,132 @@
+"""A rigid indenter on one gel: force, friction, frames."""
+
+import numpy as np
+import pytest
+
+from tacsim.interface import Pose
+from tacsim.physics.layer import layer_contact
+from tacsim.physics.press import PressWorld
+from tacsim.scene import Box, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
+
+
+def world(geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, **scene: object) -> PressWorld:
+    return PressWorld(
+        Scene.model_validate(
+            {
+                "body": None,
+                "indenter": Indenter(geometry=geometry, friction=friction),
+                "gel": Gel(material=GelMaterial(poisson_ratio=0.45)),
+                "settling": {"tolerance": tolerance},
+                **scene,
+            }
+        )
+    )
+
+
+def move(w: PressWorld, by: tuple[float, float, float], turn: float = 0.0) -> None:
+    pose = w.pose("indenter")
+    quaternion = np.array([0, 0, np.sin(turn / 2), np.cos(turn / 2)])
+    stats = w.move({"indenter": Pose(pose.position + by, quaternion)})
+    assert stats.settled, stats
+
+
+def layer_force(radius: float, depth: float) -> float:
+    n, side = 192, 30e-3
+    x = (np.arange(n) - n / 2) * side / n
+    r2 = x[:, None] ** 2 + x**2
+    gap = np.where(r2 < radius**2, radius - np.sqrt(np.maximum(radius**2 - r2, 0)), 1.0)
+    return layer_contact(gap, depth, side / n, 4e-3, 0.145e6, 0.45).force
+
+
+def test_sphere_force_against_the_elastic_layer() -> None:
+    """Frictionless, 0.5 mm elements: within 6 % of an independent solver, and closer than 1 mm elements."""
+    truth = layer_force(4e-3, 0.4e-3)
+    errors = []
+    for preset in ("draft", "standard"):
+        w = world(Sphere(radius=4e-3), friction=0.0, preset=preset)
+        move(w, (0, 0, -0.4e-3 - 0.1e-3))
+        errors.append(abs(-w.wrench("lower")[2] / truth - 1))
+    assert errors[1] < 0.06
+    assert errors[1] < errors[0]
+
+
+def test_nothing_overlaps_at_rest_and_backing_balances_contact() -> None:
+    w = world(Sphere(radius=4e-3))
+    pose = w.pose("indenter")
+    stats = w.move({"indenter": Pose(pose.position + [0, 0, -1.1e-3], pose.quaternion)})
+    assert stats.settled and stats.residual <= 1e-3
+    assert stats.substeps > stats.hold > 0
+    assert w.move({}).overlap < 3e-6  # the multiplier goes on taking over from the penalty
+
+
+def test_an_off_centre_press_shows_where_it_is() -> None:
+    """x right, y down, z out: pressing at (+3, -2) mm dents the nodes there, nowhere else, and turns the moment's signs."""
+    w = world(Sphere(radius=3e-3), tolerance=1e-2)
+    move(w, (3e-3, -2e-3, 0))
+    move(w, (0, 0, -0.6e-3))
+    surface = w.surface("lower")
+    i, j = np.unravel_index(np.argmin(surface.displacement[..., 2]), surface.displacement.shape[:2])
+    assert surface.origin[0] + i * surface.spacing == pytest.approx(3e-3, abs=0.6e-3)
+    assert surface.origin[1] + j * surface.spacing == pytest.approx(-2e-3, abs=0.6e-3)
+    force, moment = w.wrench("lower")[:3], w.wrench("lower")[3:]
+    assert force[2] < 0
+    assert moment == pytest.approx(np.cross([3e-3, -2e-3, -0.5e-3], force), abs=0.1 * np.abs(moment).max())
+
+
+def test_moving_the_sensor_is_moving_the_indenter() -> None:
+    a, b = world(Sphere(radius=4e-3)), world(Sphere(radius=4e-3))
+    a.move({"indenter": Pose(a.pose("indenter").position + [0.2e-3, 0, -0.6e-3])})
+    b.move({"lower": Pose(np.array([-0.2e-3, 0, 0.6e-3]))})
+    assert a.wrench("lower") == pytest.approx(b.wrench("lower"), abs=1e-5)
+
+
+def test_a_slid_plate_reaches_coulomb_friction_and_stuck_contact_keeps_its_shear() -> None:
+    """A plate wider than the gel: no edge ploughs, so the ratio of forces is the coefficient."""
+    w = world(Box(size=(30e-3, 30e-3, 4e-3)), friction=0.3)
+    move(w, (0, 0, -0.3e-3))
+    move(w, (0.05e-3, 0, 0))
+    stuck = w.wrench("lower")
+    assert 0.02 < stuck[0] / -stuck[2] < 0.29
+    move(w, (0, 0, 0))  # a further hold: friction with memory does not creep
+    assert w.wrench("lower")[0] == pytest.approx(stuck[0], rel=5e-3)
+    for _ in range(6):
+        move(w, (0.4e-3, 0, 0))
+    slid = w.wrench("lower")
+    assert slid[0] / -slid[2] == pytest.approx(0.3, rel=0.03)
+
+
+def test_a_twist_gives_a_moment_about_z_of_the_same_sense() -> None:
+    w = world(Box(size=(6e-3, 4e-3, 4e-3)))
+    move(w, (0, 0, -0.4e-3))
+    move(w, (0, 0, 0), turn=0.05)
+    assert w.wrench("lower")[5] > 1e-4
+
+
+def test_lift_off_leaves_nothing_behind() -> None:
+    w = world(Sphere(radius=4e-3))
+    move(w, (0.3e-3, 0, -0.8e-3))
+    move(w, (0, 0, 2e-3))
+    assert np.abs(w.wrench("lower")).max() == 0
+    assert np.abs(w.surface("lower").displacement).max() < 2e-6
+
+
+def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
+    import trimesh
+
+    path = f"{tmp_path}/ball.stl"
+    trimesh.creation.icosphere(4, radius=4.0).export(path)
+    from tacsim.scene import Mesh
+
+    a, b = world(Sphere(radius=4e-3)), world(Mesh(path=path))
+    for w in (a, b):
+        move(w, (0, 0, -0.6e-3))
+    assert b.wrench("lower")[2] == pytest.approx(a.wrench("lower")[2], rel=0.03)
+    assert np.abs(a.surface("lower").displacement - b.surface("lower").displacement).max() < 10e-6
+
+
+def test_a_press_allocates_no_particles_or_grid() -> None:
+    w = world(Sphere(radius=4e-3))
+    assert w.truth() is None
+    assert set(w.snapshot()) == {
+        "gel_displacement", "gel_velocity", "gel_force", "slip", "pressure", "wrench", "backing", "poses",
+    }  # fmt: skip

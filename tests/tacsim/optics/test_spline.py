@@ -1,0 +1,53 @@
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from tacsim.optics.spline import displacement_and_jacobian, line_matrices, spline_weights
+from tacsim.scene import GelSurface
+
+
+def _random_surface() -> GelSurface:
+    control = np.random.default_rng(1).normal(0.0, 1e-4, (9, 7, 3)).astype(np.float32)
+    return GelSurface(control, spacing=1e-3, origin=(-4e-3, -3e-3))
+
+
+def _random_points(count: int) -> np.ndarray:
+    return np.random.default_rng(2).uniform((-4e-3, -3e-3), (4e-3, 3e-3), (count, 2))
+
+
+def test_spline_is_scipys_quadratic_without_prefilter_up_to_the_rim() -> None:
+    surface, points = _random_surface(), _random_points(500)
+    found, _ = displacement_and_jacobian(surface, points)
+    position = (points - surface.origin) / surface.spacing
+    for component in range(3):
+        control = surface.displacement[..., component].astype(np.float64)
+        expected = map_coordinates(control, position.T, order=2, prefilter=False, mode="nearest")
+        np.testing.assert_allclose(found[:, component], expected, atol=1e-15)
+
+
+def test_jacobian_is_the_finite_difference() -> None:
+    surface, points = _random_surface(), _random_points(200)
+    _, jacobian = displacement_and_jacobian(surface, points)
+    step = 1e-8
+    for axis in range(2):
+        shift = step * np.eye(2)[axis]
+        after, _ = displacement_and_jacobian(surface, points + shift)
+        before, _ = displacement_and_jacobian(surface, points - shift)
+        np.testing.assert_allclose(jacobian[..., axis], (after - before) / (2 * step), atol=2e-6)
+
+
+def test_beyond_the_rim_the_surface_goes_on_unchanged() -> None:
+    surface = _random_surface()
+    rim, slope = displacement_and_jacobian(surface, np.array([(4e-3, 1e-3), (9e-3, 1e-3)]))
+    np.testing.assert_array_equal(rim[0], rim[1])
+    assert np.abs(slope[1, :, 0]).max() == 0.0
+    assert np.abs(slope[1, :, 1]).max() > 0.0
+
+
+def test_line_matrices_agree_with_the_weights() -> None:
+    position = np.linspace(-1.0, 6.5, 40)
+    control = np.random.default_rng(3).normal(size=6)
+    value, derivative = line_matrices(position, nodes=6)
+    index, weight, slope = spline_weights(position, nodes=6)
+    np.testing.assert_allclose(value @ control, (control[index] * weight).sum(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(derivative @ control, (control[index] * slope).sum(axis=1), atol=1e-6)
+    np.testing.assert_allclose(value @ np.ones(6), 1.0, rtol=1e-6)

@@ -1,0 +1,76 @@
+"""Steps and facts of a small made-up episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tacsim.interface import Action, ArmState, Pose, RigSpec, SensorSpec, SurfaceMap, TactileFrame
+from tacsim.record.episode import EpisodeMeta, Step
+
+
+def random_pose(rng: np.random.Generator) -> Pose:
+    quaternion = rng.normal(size=4)
+    return Pose(rng.normal(size=3), quaternion / np.linalg.norm(quaternion))
+
+
+def random_surface(rng: np.random.Generator, size: tuple[int, int], flow: bool) -> SurfaceMap:
+    return SurfaceMap(
+        height=rng.normal(size=size).astype(np.float32),
+        gradient=rng.normal(size=(*size, 2)).astype(np.float32),
+        flow=rng.normal(size=(3, 4, 2)).astype(np.float32) if flow else None,
+    )
+
+
+def random_step(index: int, image: tuple[int, int] = (24, 32), grid: tuple[int, int] = (6, 5)) -> Step:
+    """Sensor "lower" with everything, "upper" without flow, "side" without a surface; arms with and without joints."""
+    rng = np.random.default_rng(index)
+    time = 0.1 * index + 1 / 3
+
+    def frame(surface: SurfaceMap | None) -> TactileFrame:
+        pixels = rng.integers(0, 256, (*image, 3), dtype=np.uint8)
+        return TactileFrame(image=pixels, time=time - 0.0123456789, index=3 * index, surface=surface)
+
+    def arm(joints: bool) -> ArmState:
+        angles = rng.normal(size=6) if joints else None
+        return ArmState(random_pose(rng), rng.normal(size=6), rng.normal(size=6), angles, time - 1e-3)
+
+    surfaces = {"lower": random_surface(rng, grid, True), "upper": random_surface(rng, grid, False), "side": None}
+    return Step(
+        index=index,
+        time=time,
+        frames={name: frame(surface) for name, surface in surfaces.items()},
+        arms={"lower": arm(joints=False), "upper": arm(joints=True)},
+        action=None if index == 0 else Action({"upper": random_pose(rng), "lower": None}),
+        sent={"upper": None if index == 0 else random_pose(rng), "lower": None},
+        reward=None if index == 0 else float(rng.normal()),
+        distance=None if index == 0 else float(rng.normal()),
+        info={"residual": float(rng.normal()), "worst": float("nan"), "most": float("inf"), "hits": 1.0},
+        seconds=float(rng.uniform()),
+    )
+
+
+@pytest.fixture
+def make_step() -> Callable[..., Step]:
+    return random_step
+
+
+@pytest.fixture
+def meta() -> EpisodeMeta:
+    sensors = {
+        "lower": SensorSpec((24, 32), height=True, flow=True, arm="lower"),
+        "upper": SensorSpec((24, 32), height=True, flow=False, arm="upper"),
+        "side": SensorSpec((24, 32), height=False, flow=False, arm=None),
+    }
+    return EpisodeMeta(
+        rig="sim",
+        task="squeeze",
+        policy="scripted",
+        seed=7,
+        spec=RigSpec(sensors=sensors, arms=("lower", "upper"), truth=True, period=0.1),
+        versions={"tacsim": "0.1.0", "numpy": "2.4"},
+        attachments={"rig.yaml": b"name: sim\n", "calibration/lower.npz": bytes(range(256)), "empty": b""},
+        goal=(2e-3, 1 / 3),
+    )

@@ -1,0 +1,158 @@
+"""What is read equals what was written, bit for bit; and readers of others can read it too."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from tacsim.interface import Pose, TactileFrame
+from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
+from tacsim.record.images import decode_image, encode_png, reference_attachments, reference_image
+from tacsim.record.reader import EpisodeFile, iter_steps, read_episode
+from tacsim.record.writer import Recorder
+
+
+def same(a: object, b: object) -> bool:
+    """Equal bit for bit, arrays with type and shape, through mappings, sequences and the contract's dataclasses."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, float) and isinstance(b, float):
+        return a.hex() == b.hex()
+    if isinstance(a, dict) and isinstance(b, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__)
+    return type(a) is type(b) and a == b
+
+
+def record(path: Path, meta: EpisodeMeta, steps: list[Step]) -> None:
+    with Recorder(path, meta) as recorder:
+        for step in steps:
+            assert recorder.write(step)
+    assert recorder.error is None
+    assert (recorder.written, recorder.dropped) == (len(steps), 0)
+
+
+def test_episode_comes_back_bit_for_bit(tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]) -> None:
+    steps = [make_step(k) for k in range(4)]
+    record(tmp_path / "e.mcap", meta, steps)
+    episode = read_episode(tmp_path / "e.mcap")
+    assert same(episode.meta, meta)
+    assert episode.complete
+    assert episode.dropped == 0
+    assert [step.index for step in episode.steps] == [0, 1, 2, 3]
+    for written, read in zip(steps, episode.steps, strict=True):
+        assert same(read, written)
+    assert episode.steps[0].frames["upper"].surface is not None
+    assert episode.steps[0].frames["upper"].surface.flow is None
+    assert episode.steps[0].frames["side"].surface is None
+    assert episode.steps[0].action is None
+    assert all(same(a, b) for a, b in zip(iter_steps(tmp_path / "e.mcap"), steps, strict=True))
+
+
+@pytest.mark.parametrize("goal", [None, 7e-3, (0.1, 0.2, 0.3)])
+def test_facts_that_may_be_missing(tmp_path: Path, meta: EpisodeMeta, goal: float | tuple[float, ...] | None) -> None:
+    facts = replace(meta, goal=goal, task=None, attachments={}, versions={})
+    record(tmp_path / "e.mcap", facts, [])
+    episode = read_episode(tmp_path / "e.mcap")
+    assert same(episode.meta, facts)
+    assert episode.complete
+    assert episode.steps == []
+
+
+def test_a_unit_quaternion_keeps_its_bits() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(1000):
+        quaternion = rng.normal(size=4)
+        pose = Pose(np.zeros(3), quaternion / np.linalg.norm(quaternion))
+        assert same(Pose(pose.position, pose.quaternion), pose)
+
+
+def test_stock_reader_finds_order_types_and_content(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
+) -> None:
+    steps = [make_step(k) for k in range(3)]
+    record(tmp_path / "e.mcap", meta, steps)
+    with (tmp_path / "e.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.chunk_count == 3  # one a step
+        names = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
+        assert names["/lower/image"] == "foxglove.CompressedImage"
+        assert names["/lower/surface"] == names["/lower/flow"] == "foxglove.Grid"
+        assert names["/upper/pose"] == "foxglove.PoseInFrame"
+        assert names["/step"] == "tacsim.Step"
+        topics = [channel.topic for _, channel, _ in reader.iter_messages()]
+        assert len(topics) == 3 * 11
+        assert topics[10::11] == ["/step"] * 3
+        decoded = list(reader.iter_decoded_messages(topics=["/lower/image", "/lower/surface", "/upper/pose"]))
+        image, surface, pose = (entry.decoded_message for entry in decoded[-3:])
+        assert image.format == "png"
+        assert image.frame_id == "lower"
+        assert image.timestamp.seconds * 10**9 + image.timestamp.nanos == round(steps[2].frames["lower"].time * 1e9)
+        assert decoded[-1].message.log_time == round(steps[2].time * 1e9)
+        assert [field.name for field in surface.fields] == ["height", "gradient_x", "gradient_y"]
+        assert surface.cell_size.x == pytest.approx(0.25e-3)
+        assert pose.frame_id == "world"
+        assert pose.pose.position.z == steps[2].arms["upper"].pose.position[2]
+        assert [a.name for a in reader.iter_attachments()] == list(meta.attachments)
+
+
+def test_json_messages_carry_their_schema(tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]) -> None:
+    record(tmp_path / "e.mcap", meta, [make_step(1)])
+    with (tmp_path / "e.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(topics=["/step", "/lower/arm"]):
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            properties = json.loads(schema.data)["properties"]
+            content = json.loads(message.data, parse_constant=lambda text: pytest.fail(f"no JSON: {text}"))
+            assert set(content) == set(properties)
+
+
+def test_png_holds_rgb_not_bgr() -> None:
+    red = np.zeros((4, 5, 3), np.uint8)
+    red[..., 0] = 255
+    data = encode_png(red)
+    assert np.array_equal(decode_image(data, "red"), red)
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[0, 0].tolist() == [0, 0, 255]  # BGR: red
+
+
+def test_references_travel_as_attachments(tmp_path: Path, meta: EpisodeMeta) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    attachments = reference_attachments({"lower": TactileFrame(image, 0.0, 0)})
+    record(tmp_path / "e.mcap", replace(meta, attachments=attachments), [])
+    read = read_episode(tmp_path / "e.mcap").meta.attachments
+    assert same(reference_image(read, "lower"), image)
+    assert reference_image(read, "upper") is None
+
+
+def test_only_the_asked_sensor_is_decoded(tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]) -> None:
+    record(tmp_path / "e.mcap", meta, [make_step(0)])
+    with EpisodeFile(tmp_path / "e.mcap", sensors=("upper",)) as file:
+        assert [list(step.frames) for step in file.steps()] == [["upper"]]
+
+
+def test_memory_of_a_whole_episode_is_limited(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
+) -> None:
+    record(tmp_path / "e.mcap", meta, [make_step(k) for k in range(3)])
+    with pytest.raises(EpisodeError, match="10000 bytes decoded at step 1; use iter_steps"):
+        read_episode(tmp_path / "e.mcap", max_memory=10000)
+
+
+def test_import_is_light() -> None:
+    code = "import tacsim.record.replay, sys; print([m for m in ('cv2', 'taichi', 'PIL') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

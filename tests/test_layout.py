@@ -1,0 +1,175 @@
+"""The house rules that a machine can check: who imports what, what a light import loads, what the wheel carries."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("tacsim", "calibration", "robot")  # each imports only itself and those before it
+HEAVY = {"taichi", "cv2", "rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
+LIGHT_IMPORTS = (*PACKAGES, "tacsim.interface", "tacsim.config", "robot.open", "robot.cli")
+MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in MODULES}
+
+TEXT = {".py", ".md", ".toml", ".yaml", ".yml", ".txt", ".json", ".jinja", ".html", ".css", ".cfg", ".ini", ""}
+SHIPPED = (*PACKAGES, "configs", "constraints", "docs", "examples", "benchmarks", "tests", ".ci")
+# Spelled in pieces, so that this file does not find itself.
+MACHINE_PATHS = re.compile(
+    "|".join((r"\.\./" + "shared", r"(?<![\w.])/" + "work/", r"(?<![\w.])/" + "root/", "file:" + "//"))
+)
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    """Full names of the modules that `tree` imports, wherever in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield node.module
+
+
+def loaded_on_import(tree: ast.Module) -> Iterator[str]:
+    """Full names of the modules imported when the file itself is: outside functions and `if TYPE_CHECKING`."""
+    waiting: list[ast.AST] = list(tree.body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            waiting += node.orelse
+            continue
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield from imports(node)
+        waiting += ast.iter_child_nodes(node)
+
+
+def top(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def has_kernels(tree: ast.Module) -> bool:
+    """True if a function is decorated with something of `ti` (@ti.kernel, @ti.func, ...)."""
+    return any(
+        re.match(r"ti\.", ast.unparse(decorator))
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        for decorator in node.decorator_list
+    )
+
+
+def shipped_texts() -> Iterator[Path]:
+    """Text files of the project: those of the known folders and of its root, without caches."""
+    for path in (*ROOT.iterdir(), *(path for folder in SHIPPED for path in (ROOT / folder).rglob("*"))):
+        if path.is_file() and path.suffix in TEXT and "__pycache__" not in path.parts and path.name != ".git":
+            yield path
+
+
+@pytest.mark.parametrize("module", LIGHT_IMPORTS)
+def test_importing_is_light(module: str) -> None:
+    code = f"import sys, {module}; print(*sorted({{name.partition('.')[0] for name in sys.modules}} & {HEAVY!r}))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [], f"`import {module}` loads {done.stdout.strip()}: import it inside the function"
+
+
+def test_only_runtime_imports_taichi() -> None:
+    found = {name(path) for path, tree in TREES.items() if "taichi" in map(top, imports(tree))}
+    assert found == {"tacsim/runtime.py"}
+
+
+def test_opencv_and_ur_rtde_are_imported_inside_functions() -> None:
+    found = {
+        name(path): sorted(heavy)
+        for path, tree in TREES.items()
+        if (heavy := (HEAVY - {"taichi"}) & set(map(top, loaded_on_import(tree))))
+    }
+    assert found == {}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_file_imports_upward(package: str) -> None:
+    above = set(PACKAGES[PACKAGES.index(package) + 1 :])
+    found = {
+        name(path): sorted(wrong)
+        for path, tree in TREES.items()
+        if path.is_relative_to(ROOT / package) and (wrong := above & set(map(top, imports(tree))))
+    }
+    assert found == {}
+
+
+def test_kernel_files_keep_their_annotations() -> None:
+    """Taichi reads annotations of kernels as objects; `from __future__ import annotations` makes them strings."""
+    assert [name(path) for path, tree in TREES.items() if has_kernels(tree) and "__future__" in imports(tree)] == []
+
+
+def test_mypy_spares_kernel_files_and_no_other() -> None:
+    overrides = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]["overrides"]
+    (spared,) = (item["module"] for item in overrides if item.get("check_untyped_defs") is False)
+    kernels = {name(path).removesuffix(".py").replace("/", ".") for path, tree in TREES.items() if has_kernels(tree)}
+    assert set(spared) == kernels
+
+
+def test_every_folder_of_modules_is_a_package() -> None:
+    folders = {path.parent for path in MODULES}
+    assert [name(folder) for folder in sorted(folders) if not (folder / "__init__.py").is_file()] == []
+    assert [package for package in PACKAGES if not (ROOT / package / "py.typed").is_file()] == []
+
+
+def test_tests_mirror_the_packages() -> None:
+    """A folder below tests/<package> is named after the one it tests."""
+    folders = {path.parent for package in PACKAGES for path in (ROOT / "tests" / package).rglob("test_*.py")}
+    assert [
+        name(folder) for folder in sorted(folders) if not (ROOT / folder.relative_to(ROOT / "tests")).is_dir()
+    ] == []
+
+
+def test_no_text_names_a_place_on_somebodys_machine() -> None:
+    found = [
+        f"{name(path)}:{number}"
+        for path in shipped_texts()
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if MACHINE_PATHS.search(line)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("version", ["311", "312", "313"])
+def test_constraints_are_pins_and_nothing_else(version: str) -> None:
+    lines = (ROOT / f"constraints/py{version}.txt").read_text(encoding="utf-8").splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
+    assert [line for line in pins if not re.fullmatch(r"[a-z0-9-]+==[\w.+!]+", line)] == []
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = {
+        re.split(r"[^\w-]", requirement)[0].lower()
+        for requirement in (*required["dependencies"], *required["optional-dependencies"]["dev"])
+    }
+    if version == "313":
+        wanted.remove("ur-rtde")  # has no wheel there
+    assert wanted <= {line.partition("==")[0] for line in pins}, "pyproject.toml changed: run `make lock`"
+
+
+def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    carried = set(zipfile.ZipFile(wheel).namelist())
+    configs = {path.relative_to(ROOT / "configs").as_posix() for path in (ROOT / "configs").rglob("*.yaml")}
+    assert configs, "configs/ holds no YAML file"
+    assert {f"tacsim/_configs/{config}" for config in configs} <= carried
+    assert {name(path) for path in MODULES} <= carried
+    assert {f"{package}/py.typed" for package in PACKAGES} <= carried
+    assert {top(entry.partition("/")[0]) for entry in carried} == {*PACKAGES, "tacsim-0"}  # and tacsim-0.1.0.dist-info

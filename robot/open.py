@@ -206,8 +206,8 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
     shortest, longest = min(periods, key=periods.__getitem__), max(periods, key=periods.__getitem__)
     if periods[longest] > periods[shortest] * 1.01:
         raise CannotOpen(
-            f"rig '{rig}': recordings go frame by frame, but sensors.{shortest} has one every {periods[shortest]:.4g} s "
-            f"and sensors.{longest} one every {periods[longest]:.4g} s; give recordings of one rate"
+            f"rig '{rig}': recordings go frame by frame, but sensors.{shortest} has one every "
+            f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give recordings of one rate"
         )
     return periods[shortest]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -229,38 +230,44 @@ def approach(world: World, touch_force: float) -> MoveStats | None:
     the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
     """
     stats = _close_gaps(world)
-    force = _least_force(world)
-    beyond: tuple[float, float] | None = None  # how much farther was too far [m], and the force there [N]
-    step = FIRST_STEP
+    way, too_far = 0.0, math.inf  # how far the sensors have come, and what would be too far [m]
+    felt = [(way, _least_force(world))]  # (way, force) of every state tried
+    step = 0.0
     for _ in range(MOST_MOVES):
-        if force >= touch_force:
+        if felt[-1][0] == way and felt[-1][1] >= touch_force:
             return stats
-        step = FIRST_STEP if beyond is None else _next_step(force, beyond, touch_force * (1 + TOUCH_TOLERANCE / 2))
+        step = _aim(felt, way, too_far, touch_force * (1 + TOUCH_TOLERANCE / 2)) - way
         if step < SMALLEST_STEP:
             break
         before = world.snapshot()
         stats = _advance(world, dict.fromkeys(world.sensors, step))
-        reached = _least_force(world)
-        if reached > touch_force * (1 + TOUCH_TOLERANCE):
+        felt.append((way + step, _least_force(world)))
+        if felt[-1][1] > touch_force * (1 + TOUCH_TOLERANCE):
             world.restore(before)
-            beyond = (step, reached)
+            too_far = way + step
         else:
-            force = reached
-            beyond = None if beyond is None else (beyond[0] - step, beyond[1])
+            way += step
     raise NoTouch(
-        f"approach found no gentle contact: normal force {force:.4g} N of {touch_force:.4g} N wanted, after at most "
-        f"{MOST_MOVES} moves, the last by {step:.3g} m. Is there a body between the gels, and is touch_force within "
+        f"approach found no gentle contact: normal force {felt[-1][1]:.4g} N, {touch_force:.4g} N wanted, after "
+        f"{len(felt) - 1} moves, the last by {step:.3g} m. Is there a body between the gels, and is touch_force within "
         "what the scene's settling tolerance resolves?"
     )
 
 
-def _next_step(force: float, beyond: tuple[float, float], wanted: float) -> float:
-    """The step [m] that should give the force `wanted` [N]: force is taken as linear from here to `beyond`; without
-    contact here, from half-way on."""
-    length, force_there = beyond
-    share = (wanted - force) / (force_there - force)
-    share = share if force > 0 else 0.5 + 0.5 * share
-    return length * min(max(share, 0.05), 0.95)
+def _aim(felt: list[tuple[float, float]], way: float, too_far: float, wanted: float) -> float:
+    """How far [m] the force `wanted` [N] is to be expected: on the line through the last two states in contact; with
+    one such state, contact is taken to begin half-way to it. Kept between `way` and `too_far`."""
+    farthest = min(too_far, way + FIRST_STEP)
+    touching = [(x, force) for x, force in felt if force > 0][-2:]
+    if not touching:
+        return farthest
+    x, force = touching[-1]
+    if len(touching) == 2 and (force - touching[0][1]) * (x - touching[0][0]) > 0:
+        aim = x + (wanted - force) * (x - touching[0][0]) / (force - touching[0][1])
+    else:
+        aim = way + (x - way) * (0.5 + 0.5 * wanted / force) if force > wanted else farthest
+    margin = 0.05 * (farthest - way)
+    return min(max(aim, way + margin), farthest if too_far > farthest else farthest - margin)
 
 
 def _close_gaps(world: World) -> MoveStats | None:

@@ -62,10 +62,8 @@ def marker_coverage(positions: NDArray[np.float64], radius: float, shape: tuple[
     return coverage
 
 
-def draw_markers(
-    image: NDArray[np.float32], surface: GelSurface, markers: Markers, geometry: SensorGeometry
-) -> NDArray[np.float32]:
-    """`image` (rows, columns, 3) with the dots of the deformed surface drawn on it."""
+def marker_transmission(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> NDArray[np.float32]:
+    """(H, W) share of its light that each pixel keeps under the dots of the deformed surface."""
     positions = marker_positions(surface, markers, geometry)
-    coverage = marker_coverage(positions, markers.radius / geometry.pixel_pitch, image.shape[:2])
-    return image * (1.0 - (1.0 - INK) * coverage[..., None])
+    coverage = marker_coverage(positions, markers.radius / geometry.pixel_pitch, (geometry.height, geometry.width))
+    return np.float32(1.0) - np.float32(1.0 - INK) * coverage

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.optics.geometry import Light, Lighting, SensorModel
-from tacsim.optics.grid import PixelGrid, image_grid
-from tacsim.optics.markers import check_fits, draw_markers
+from tacsim.optics.grid import PixelGrid, image_grid, strips
+from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import sample_surface
 from tacsim.scene import GelSurface
@@ -52,13 +52,17 @@ class Renderer:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
         import cv2
 
-        gradient = sample_surface(surface, self._grid).gradient + self._texture
-        image = shade(gradient, self.model.lighting)
-        image += self._unlit
-        if self._markers is not None:
-            image = draw_markers(image, surface, self._markers, self.model.geometry)
-        np.maximum(image, 0.0, out=image)
-        return np.asarray(cv2.convertScaleAbs(image, alpha=255.0), dtype=np.uint8)  # rounds, and saturates at white
+        gradient = sample_surface(surface, self._grid).gradient
+        dots = None if self._markers is None else marker_transmission(surface, self._markers, self.model.geometry)
+        image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
+        for strip in strips(self._grid.rows):
+            light = shade(gradient[strip] + self._texture[strip], self.model.lighting)
+            light += self._unlit[strip]
+            if dots is not None:
+                light *= dots[strip, :, None]
+            np.maximum(light, 0.0, out=light)
+            image[strip] = cv2.convertScaleAbs(light, alpha=255.0)  # rounds, and saturates at white
+        return image
 
 
 def shade(gradient: Float32, lighting: Lighting) -> Float32:

@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 
 from tacsim.interface import SurfaceMap
 from tacsim.optics.geometry import CanonicalGrid, Markers
-from tacsim.optics.grid import PixelGrid, canonical_cells
+from tacsim.optics.grid import PixelGrid, canonical_cells, strips
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.spline import displacement_and_jacobian, line_matrices
 from tacsim.scene import GelSurface
@@ -59,11 +59,13 @@ def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
     check_surface(surface)
     fields, lateral = _table(surface)
     seen_at = _table_coordinates(surface.origin, surface.spacing / _table_points(surface), grid)
-    points = _material_points(surface, lateral, seen_at)
-    seen = _look_up(fields, points)
-    valid = _on_gel(points, fields.shape[:2])
-    if not valid.all():
-        seen[~valid] = 0.0
+    seen = np.empty((*grid.shape, 3), dtype=np.float32)
+    valid = np.empty(grid.shape, dtype=np.bool_)
+    for strip in strips(grid.rows):
+        points = _material_points(surface, lateral, seen_at[strip])
+        seen[strip] = _look_up(fields, points)
+        valid[strip] = _on_gel(points, fields.shape[:2])
+    seen[~valid] = 0.0
     return SurfaceSample(seen[..., 0], seen[..., 1:], valid)
 
 
@@ -133,7 +135,8 @@ def _table(surface: GelSurface) -> tuple[Float32, Float32]:
     determinant = a * d - b * c
     if float(determinant.min()) <= 0.0:
         row, column = np.argwhere(determinant <= 0.0).T
-        raise _folded(np.stack([column, row], axis=1) * (surface.spacing / points) + surface.origin)
+        corner = np.array(surface.origin, dtype=np.float64)
+        raise _folded(corner + np.stack([column, row], axis=1) * (surface.spacing / points))
     inverse = -1.0 / determinant  # the minus turns u_z into height
     gradient_x, gradient_y = (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse
     fields = np.stack([-value[2], gradient_x, gradient_y], axis=-1)

@@ -61,9 +61,7 @@ def attempt(
 
     Raises SimulationDiverged, with the arrays as they were, when the smallest step fails too.
     """
-    complaint = _not_finite(arrays) or ""
-    if complaint:
-        raise SimulationDiverged(complaint, f"before {where()}", "restore a snapshot, or make a new world")
+    complaint = ""
     saved = {name: a.copy() for name, a in arrays.items()}
     for retry in range(RETRIES + 1):
         health = launch(2**retry)
@@ -75,6 +73,13 @@ def attempt(
     raise SimulationDiverged(
         complaint, where(), f"even with 1/{2**RETRIES} of the time step; move less far or slower, or use a finer preset"
     )
+
+
+def require_finite(arrays: Mapping[str, NDArray[np.float32]]) -> None:
+    """Raises SimulationDiverged when a state was already broken before a motion begins."""
+    complaint = _not_finite(arrays)
+    if complaint:
+        raise SimulationDiverged(complaint, "before the motion began", "restore a snapshot, or make a new world")
 
 
 def _not_finite(arrays: Mapping[str, NDArray[np.float32]]) -> str | None:

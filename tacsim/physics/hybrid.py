@@ -6,7 +6,7 @@ from tacsim.interface import Pose, Truth
 from tacsim.physics.contact import particle_contact
 from tacsim.physics.controller import Path, Reading, merged, move_and_settle, plan
 from tacsim.physics.gel import MM, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
-from tacsim.physics.health import Health, as_float32, attempt
+from tacsim.physics.health import Health, as_float32, attempt, require_finite
 from tacsim.physics.material import vec3, vec4
 from tacsim.physics.plasticine import (
     Grid,
@@ -221,6 +221,7 @@ class HybridWorld:
     # ----------------------------------------------------------------- motion
 
     def move(self, targets: dict[str, Pose]) -> MoveStats:
+        require_finite(self._arrays())
         end = merged(self._poses, targets)
         lever = max(self._gel.half)
         path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)

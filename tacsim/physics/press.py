@@ -5,7 +5,7 @@ import numpy as np
 from tacsim.interface import Pose
 from tacsim.physics.controller import Path, Reading, merged, move_and_settle, plan
 from tacsim.physics.gel import MM, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
-from tacsim.physics.health import Health, as_float32, attempt
+from tacsim.physics.health import Health, as_float32, attempt, require_finite
 from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
 from tacsim.physics.material import mat3, vec3
@@ -117,6 +117,7 @@ class PressWorld:
         return None
 
     def move(self, targets: dict[str, Pose]) -> MoveStats:
+        require_finite(self._arrays())
         end = merged(self._poses, targets)
         path = plan(
             list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, max(self._gel.half)

@@ -99,7 +99,7 @@ class SeedWorld:
         rest = self._lattice.points
         gels = [_rotation(p).apply(rest) + p.position * MM for p in self._poses.values()]
         self._gels = len(rest)
-        self._x = np.concatenate([*gels, body]).astype(np.float32)
+        self._x = np.concatenate([*gels, body])  # float64, see kernels
         n = len(self._x)
         self._v = np.zeros((n, 3), np.float32)
         self._c = np.zeros((n, 3, 3), np.float32)
@@ -115,7 +115,7 @@ class SeedWorld:
         room = self._poses["upper"].position[2] + 2 * self.scene.gel.size[2]
         self._cells = np.array([round(room * MM / self._dx)], np.int32)  # layers of the grid between the backings
         self._grid = np.zeros((1, 1, 1, 4), np.float32)
-        as_float32([a for a in self._arrays().values() if a.dtype != np.int32])
+        as_float32([a for a in self._arrays().values() if a.dtype != np.int32 and a is not self._x])
 
     # ------------------------------------------------------------------ state
 
@@ -161,16 +161,16 @@ class SeedWorld:
     def _in_sensor(self, name: str) -> NDArray[np.float64]:
         """Particles of a gel in its sensor's frame [mm]."""
         first, pose = self.sensors.index(name) * self._gels, self._poses[name]
-        x = self._x[first : first + self._gels].astype(np.float64)
-        return np.asarray(_rotation(pose).inv().apply(x - pose.position * MM))
+        x = self._x[first : first + self._gels] - pose.position * MM
+        return np.asarray(_rotation(pose).inv().apply(x))
 
     def truth(self) -> Truth:
         """Of the body's particles in play; those set aside are left out."""
         x = self._body_points()
         height = (float(np.ptp(x[:, 2])) + self._lattice.spacing) / MM
-        return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, x / np.float32(MM), dict(self._poses))
+        return Truth(height, x.mean(axis=0) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
-    def _body_points(self) -> Float32:
+    def _body_points(self) -> NDArray[np.float64]:
         body = slice(2 * self._gels, None)
         return self._x[body][self._aside[body] == 0]
 

@@ -15,6 +15,7 @@ Vec4 = ti.types.vector(4, f32)
 Mat3 = ti.types.matrix(3, 3, f32)
 
 Flags = ti.types.ndarray(dtype=ti.i32, ndim=1)
+Positions = ti.types.ndarray(dtype=ti.types.vector(3, ti.f64), ndim=1)  # a settling gel moves by less than f32 resolves
 Scalars = ti.types.ndarray(dtype=f32, ndim=1)
 Vectors = ti.types.ndarray(dtype=Vec3, ndim=1)
 Matrices = ti.types.ndarray(dtype=Mat3, ndim=1)
@@ -197,7 +198,7 @@ def particle_to_grid(
 ):  # fmt: skip
     """Scatters momentum, mass and the impulse of stress; sets aside (and so counts) particles outside the grid."""
     for p in range(x.shape[0]):
-        X = (x[p] - origin) / spacing
+        X = ti.cast((x[p] - origin) / spacing, f32)
         if aside[p] == 0 and not inside(X, grid):
             aside[p] = 1
             if p < 2 * step.gels:
@@ -260,7 +261,7 @@ def grid_to_particle(
     """Gathers velocity and its gradient, updates F <- (I + dt C) F (of the body: the trial), takes the gels' stress."""
     for p in range(x.shape[0]):
         if aside[p] == 0:
-            X = (x[p] - origin) / spacing
+            X = ti.cast((x[p] - origin) / spacing, f32)
             base = ti.floor(X - 0.5, ti.i32)
             fx = X - base
             w = weights(fx)
@@ -333,8 +334,8 @@ def advection(
         before, after = Vec3(0.0), Vec3(0.0)
         for p in range(s * step.gels, (s + 1) * step.gels):
             if aside[p] == 0:
-                at = x[p] + step.dt * v[p]
-                x[p] = at
+                x[p] = x[p] + step.dt * ti.cast(v[p], ti.f64)
+                at = ti.cast(x[p], f32)
                 before += v[p]
                 driven = driven_velocity(drive, n, s, at, step.dt)
                 v[p] = v[p] - step.gel_damping * step.dt * (v[p] - driven)
@@ -344,8 +345,8 @@ def advection(
             momentum[s, a] = after[a]
     for p in range(2 * step.gels, x.shape[0]):
         if aside[p] == 0:
-            at = x[p] + step.dt * v[p]
-            x[p] = at
+            x[p] = x[p] + step.dt * ti.cast(v[p], ti.f64)
+            at = ti.cast(x[p], f32)
             mean += v[p]
             count += 1
             lowest, highest = ti.min(lowest, at[2]), ti.max(highest, at[2])
@@ -358,7 +359,7 @@ def advection(
 
 @ti.kernel
 def advance(
-    x: Vectors, v: Vectors, C: Matrices, gel_f: Matrices, gel_stress: Matrices, body_f: Planes, body_stress: Planes,
+    x: Positions, v: Vectors, C: Matrices, gel_f: Matrices, gel_stress: Matrices, body_f: Planes, body_stress: Planes,
     change: Planes, aside: Flags, grid: Grid, drive: Drive, motion: Scalars, momentum: Table, gain: Table,
     backing: Table, health: Scalars, gel: Solid, body: Solid, step: Step,
 ):  # fmt: skip

@@ -29,7 +29,13 @@ def test_wrong_python_fails_with_advice(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_packages_are_held_against_their_pins(monkeypatch: pytest.MonkeyPatch) -> None:
-    pins = ["numpy>=2.0", "scipy<0.1", "no-such-package-here>=1", "rich; python_version < '3'", "pytest; extra == 'dev'"]
+    pins = [
+        "numpy>=2.0",
+        "scipy<0.1",
+        "no-such-package-here>=1",
+        "rich; python_version < '3'",
+        "pytest; extra == 'dev'",
+    ]
     monkeypatch.setattr(metadata, "requires", lambda name: pins)
     found = {check.name: check for check in doctor.packages()}
     assert set(found) == {"package numpy", "package scipy", "package no-such-package-here"}  # markers are obeyed

@@ -218,7 +218,7 @@ def _pixels(picture: NDArray[np.float32], colour: NDArray[np.float32]) -> int:
 def figure4_picture(folder: Path, shift: float) -> NDArray[np.float32]:
     """Figure 4 of one made-up trial whose body stands `shift` beside the gels."""
     axis = np.arange(-4.5e-3, 5e-3, 1e-3)
-    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) + [shift, 0.0, 5e-3]
+    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) + np.array([shift, 0.0, 5e-3])
     height = np.zeros((80, 80), np.float32)
     magenta = np.broadcast_to(np.array([255, 0, 255], np.uint8), (48, 64, 3))
     poses = {"lower": Pose(), "upper": Pose(np.array([0, 0, 10e-3]), np.array([1.0, 0, 0, 0]))}

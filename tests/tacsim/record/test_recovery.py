@@ -15,8 +15,9 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
+from tacsim.record import writer
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
-from tacsim.record.messages import decode_step, encode_step
+from tacsim.record.messages import Encoded, decode_step, encode_step
 from tacsim.record.reader import read_episode
 from tacsim.record.schemas import META, encode_meta, sealed
 from tacsim.record.writer import Recorder
@@ -125,6 +126,30 @@ def test_a_step_lost_in_the_middle_ends_the_episode(small: Path, tmp_path: Path)
     assert episode is not None
     assert [step.index for step in episode.steps] == [0]
     assert not episode.complete
+
+
+def test_a_changed_digit_of_a_message_is_seen(small: Path, tmp_path: Path) -> None:
+    """It would still be a valid message: only the checksum of its chunk tells."""
+    data = bytearray(small.read_bytes())
+    first = data.index(b'"index":1,') + len(b'"index":')
+    data[first] = ord("7")
+    episode = read_or_refuse(tmp_path / "digit.mcap", bytes(data))
+    assert episode is not None
+    assert [step.index for step in episode.steps] == [0]
+
+
+def test_a_step_is_not_completed_with_messages_of_another(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forgetful(step: Step, pitch: float) -> list[Encoded]:
+        return [m for m in encode_step(step, pitch) if step.index == 0 or m.topic != "/lower/image"]
+
+    monkeypatch.setattr(writer, "encode_step", forgetful)
+    with Recorder(tmp_path / "e.mcap", meta) as recorder:
+        recorder.write(make_step(0))
+        recorder.write(make_step(1))
+    with pytest.raises(EpisodeError, match=r"step number 1: a step names the message '/lower/image'"):
+        read_episode(tmp_path / "e.mcap")
 
 
 @pytest.mark.parametrize("opcode", range(1, 16))

@@ -207,7 +207,7 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
     if periods[longest] > periods[shortest] * 1.01:
         raise CannotOpen(
             f"rig '{rig}': recordings go frame by frame, but sensors.{shortest} has one every "
-            f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give recordings of one rate"
+            f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give two of one rate"
         )
     return periods[shortest]
 

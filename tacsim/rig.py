@@ -21,7 +21,7 @@ from tacsim.interface import (
     TactileSource,
     Truth,
 )
-from tacsim.limits import ActionError
+from tacsim.limits import check_action
 
 
 class Start(Protocol):
@@ -115,18 +115,10 @@ class Rig:
         Returns the observation and what each arm was really sent (None: nothing was executed).
         Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged.
         """
-        self._check(action.tool)
+        check_action(action, self._addressable, self.name)
         sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self._arms.items()}
         self._clock.tick()
         return self.observe(), sent
-
-    def _check(self, tool: Mapping[str, object]) -> None:
-        for name, target in tool.items():
-            if name not in self._addressable:
-                names = ", ".join(sorted(self._addressable)) or "(none)"
-                raise ActionError(f"action for '{name}', but rig '{self.name}' moves only: {names}")
-            if target is not None and not isinstance(target, Pose):
-                raise ActionError(f"action for '{name}' must be a tacsim.interface.Pose or None, got {target!r}")
 
     def truth(self) -> Truth | None:
         """The body as only a simulation knows it; for tasks, never for policies."""

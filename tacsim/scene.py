@@ -28,7 +28,10 @@ class GelMaterial(Facts):
 
 
 class BodyMaterial(Facts):
-    """Elastoplastic body: Hencky elasticity, von Mises yield. Give the yield as a stress or as the seed's strain k; neither = elastic."""
+    """Elastoplastic body: Hencky elasticity, von Mises yield.
+
+    Give the yield as a stress or as the seed's strain k; with neither the body is elastic.
+    """
 
     youngs_modulus: Annotated[Pressure, Field(gt=0)] = 0.5e6
     poisson_ratio: PoissonRatio = 0.45
@@ -65,7 +68,7 @@ def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
 
 
 class Gel(Facts):
-    """One elastic gel pad, bonded to its backing; the housing is a rigid plane round it, `housing` below its surface."""
+    """One elastic gel pad, bonded to its backing; a rigid housing surrounds it, `housing` below its surface."""
 
     size: Size3 = (20e-3, 20e-3, 4e-3)  # x, y, thickness [m]
     material: GelMaterial = GelMaterial()
@@ -168,7 +171,7 @@ class Scene(Facts):
 class GelSurface:
     """Displacement of a gel's top surface at the nodes of its own lattice, in the sensor frame.
 
-    Between nodes the surface is the C1 quadratic B-spline with these control values (contact and renderer use the same).
+    Between nodes the surface is the C1 quadratic B-spline with these control values; contact and renderer use the same.
     """
 
     displacement: NDArray[np.float32]  # (nx, ny, 3) [m]; x grows with the first index, y with the second

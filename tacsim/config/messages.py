@@ -33,12 +33,12 @@ def report_errors(error: ValidationError, root: Node, annotation: Any, reading: 
     for detail in error.errors(include_url=False):
         context = detail.get("ctx", {})
         spot = find(root, annotation, (*detail["loc"], *context.get("at", ())))
-        if spot is not None:
+        if not spot.node.broken:
             reading.report(spot.node.place, _key(spot), _text(detail, spot))
 
 
-def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Spot | None:
-    """Follows pydantic's location through the tree; None where it meets a node that is already reported.
+def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Spot:
+    """Follows pydantic's location through the tree.
 
     At a union pydantic's location names the variant ("box"), which is no key of the file.
     """
@@ -46,8 +46,6 @@ def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Spot | None
     steps = list(loc)
     while steps:
         node = spot.node
-        if node.broken:
-            return None
         step = steps.pop(0)
         if step == "[key]":
             return replace(spot, of_key=True)
@@ -62,7 +60,7 @@ def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Spot | None
         if entry is None:
             return Spot(node, spot.annotation, spot.key, absent=step)
         spot = Spot(entry, inner, join(spot.key, step), parent=spot.annotation, holder=node)
-    return None if spot.node.broken else spot
+    return spot
 
 
 def _entry(node: Node, step: str | int) -> Node | None:

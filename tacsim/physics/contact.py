@@ -28,9 +28,7 @@ def spline(a):
 @ti.func
 def top_node(u: ti.template(), g, i, j):
     """Index of the surface node (i, j), repeated beyond the rim."""
-    return ti.Vector(
-        [g, ti.max(0, ti.min(i, u.shape[1] - 1)), ti.max(0, ti.min(j, u.shape[2] - 1)), u.shape[3] - 1]
-    )
+    return ti.Vector([g, ti.max(0, ti.min(i, u.shape[1] - 1)), ti.max(0, ti.min(j, u.shape[2] - 1)), u.shape[3] - 1])
 
 
 @ti.func
@@ -45,7 +43,7 @@ def displacement_at(u: ti.template(), g, a):
 
 @ti.func
 def material_point(u: ti.template(), g, x, h):
-    """Lattice coordinates a of the surface point that now lies under (x, y): three fixed-point steps of a h + u(a) = x."""
+    """Lattice coordinates a of the surface point now under (x, y): three fixed-point steps of a h + u(a) = x."""
     nx, ny = float(u.shape[1] - 1), float(u.shape[2] - 1)
     start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)
     a = start
@@ -72,6 +70,12 @@ def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
 
 
 @ti.func
+def contact_ceiling(u: ti.template(), h, radius):
+    """A particle higher than this above the rest surface cannot touch: a gel bulges by far less than its thickness."""
+    return 0.2 * h * (u.shape[3] - 1) + radius
+
+
+@ti.func
 def particle_contact(
     g, x, v, slip, u: ti.template(), gv: ti.template(), gf: ti.template(), h, radius, k_n, mu, housing, dt,
     health: ti.template(),
@@ -87,8 +91,7 @@ def particle_contact(
     reach = 2.2 * 0.5 * h
     thickness = h * (u.shape[3] - 1)
     c_n = CONTACT_DAMPING * k_n * dt
-    near = x[2] < 0.2 * thickness + radius and x[2] > -1.2 * thickness
-    if near and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
+    if x[2] > -1.2 * thickness and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
         a, us = material_point(u, g, x, h)
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:

@@ -39,7 +39,10 @@ class Path:
     dt: float
 
     def drive(self, first: int, last: int, refine: int = 1) -> NDArray[np.float32]:
-        """(n, frames, 6, 3) f32 for substeps first..last, each cut in `refine`: rows of R, position [mm], velocity, angular velocity."""
+        """(n, frames, 6, 3) f32 for substeps first..last, each cut in `refine`.
+
+        Rows: the rotation matrix, position [mm], velocity, angular velocity; all in world.
+        """
         knots = np.arange(first * refine, last * refine + 1) / (max(self.substeps, 1) * refine)
         s = ramp(np.clip(knots, 0.0, 1.0))
         out = np.empty((len(s) - 1, len(self.start), 6, 3))
@@ -59,7 +62,7 @@ def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lev
     """A path whose fastest point moves at peak Mach `mach`; `lever` [mm] turns rotation into speed at the gel's rim."""
     length = 0.0
     for a, b in zip(start, end, strict=True):
-        turn = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).magnitude()
+        turn = float((Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).magnitude())
         length = max(length, float(np.linalg.norm(b.position - a.position)) * MM + turn * lever)
     substeps = math.ceil(PEAK * length / (mach * dt)) if length > 0 else 0
     return Path(start, end, substeps, dt)

@@ -1,9 +1,11 @@
 """Two gels (FEM in their sensor frames) round a plasticine body (MLS-MPM), coupled by contact with friction memory."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.contact import particle_contact
+from tacsim.physics.contact import contact_ceiling, particle_contact
 from tacsim.physics.controller import Path, Reading, merged, move_and_settle, plan
 from tacsim.physics.gel import MM, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
 from tacsim.physics.health import Health, as_float32, attempt, require_finite
@@ -21,6 +23,7 @@ from tacsim.physics.plasticine import (
     particles_to_grid,
 )
 from tacsim.physics.world import MoveStats
+from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
 from tacsim.scene import GelSurface, Scene
 from tacsim.shapes import extent, particles
@@ -81,25 +84,31 @@ def grid_update(grid: ti.template(), origin, cell, drive: ti.template(), it, dam
 @ti.func
 def touch(
     g, rotate, it, drive: ti.template(), x: ti.template(), v: ti.template(), slip: ti.template(),
-    u: ti.template(), gv: ti.template(), gf: ti.template(), h, mass, radius, k_n, mu, housing, dt, health: ti.template(),
+    u: ti.template(), gv: ti.template(), gf: ti.template(), h, mass, radius, k_n, mu, housing, dt,
+    health: ti.template(),
 ):  # fmt: skip
     """Contact of every particle with gel g. Returns force and moment of the body on the sensor, sensor axes."""
     origin, velocity, spin = row(drive, it, g, 3), row(drive, it, g, 4), row(drive, it, g, 5)
     back = rotate.transpose()
+    outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
+    highest = contact_ceiling(u, h, radius)
     total, moment = vec3(0.0), vec3(0.0)
     for p in range(x.shape[0]):
         arm = x[p] - origin
-        local = back @ arm
-        relative = back @ (v[p] - velocity - spin.cross(arm))
-        force, memory, overlap = particle_contact(
-            g, local, relative, slip[g, p], u, gv, gf, h, radius, k_n, mu, housing, dt, health
-        )
+        memory = vec3(0.0)
+        if outward.dot(arm) < highest:  # most of the body is far away: one dot product decides
+            local = back @ arm
+            relative = back @ (v[p] - velocity - spin.cross(arm))
+            force, kept, overlap = particle_contact(
+                g, local, relative, slip[g, p], u, gv, gf, h, radius, k_n, mu, housing, dt, health
+            )
+            memory = kept
+            if overlap > 0.0:
+                v[p] = v[p] + (dt / mass) * (rotate @ force)
+                total -= force
+                moment -= local.cross(force)
+                health[5] = ti.max(health[5], overlap)
         slip[g, p] = memory
-        if overlap > 0.0:
-            v[p] = v[p] + (dt / mass) * (rotate @ force)
-            total -= force
-            moment -= local.cross(force)
-            health[5] = ti.max(health[5], overlap)
     return total, moment
 
 
@@ -164,7 +173,7 @@ class HybridWorld:
         self._backing = np.zeros((2, 3), np.float32)
         self._poses = {
             "lower": Pose(),
-            "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), np.array([1.0, 0.0, 0.0, 0.0])),
+            "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
         }
         self._dt = COURANT * min(self._body.cell, self._gel.spacing)
         # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
@@ -194,7 +203,7 @@ class HybridWorld:
         state["speed"] = np.array(self._speed)
         return state
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         for name, a in self._arrays().items():
             if state[name].shape != a.shape:
                 raise ValueError(f"snapshot: {name} has shape {state[name].shape}, this world needs {a.shape}")
@@ -216,11 +225,11 @@ class HybridWorld:
         x = self._particles.x
         z = x[:, 2]
         height = (float(z.max()) - float(z.min()) + self._body.spacing) / MM
-        return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, x / np.float32(MM), dict(self._poses))
+        return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
     # ----------------------------------------------------------------- motion
 
-    def move(self, targets: dict[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         require_finite(self._arrays())
         end = merged(self._poses, targets)
         lever = max(self._gel.half)
@@ -255,7 +264,8 @@ class HybridWorld:
             len(drive), dt, drive,
             g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
             b.x, b.v, b.c, b.e, self._slip, self._mean,
-            self._grid, *(float(o) for o in origin), body.spacing, body.mu, body.bulk, body.limit, BODY_DAMPING, self._lightness,
+            self._grid, *(float(o) for o in origin), body.spacing, body.mu, body.bulk, body.limit,
+            BODY_DAMPING, self._lightness,
             self._stiffness, self.scene.friction["lower"], self.scene.friction["upper"],
             -1.0 if housing is None else housing * MM,
             self._wrench, self._backing, health,

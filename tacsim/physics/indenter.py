@@ -6,7 +6,7 @@ Everything is in the sensor frame [mm, MPa].
 """
 
 from tacsim.physics.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, spline, top_node
-from tacsim.physics.material import mat3, vec3
+from tacsim.physics.material import vec3
 from tacsim.runtime import ti
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
@@ -60,9 +60,7 @@ def signed_distance(kind, size, y, values: ti.template(), origin, spacing):
     elif kind == CYLINDER:
         r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
         phi, radial = corner_distance(vec3(r - size[0], -FAR, ti.abs(y[2]) - size[2]), vec3(1.0))
-        n = vec3(
-            radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2]
-        )
+        n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])
     else:
         at = (y - origin) / spacing
         known = True

@@ -36,7 +36,9 @@ def compliance(k: FloatArray, thickness: float, youngs_modulus: float, poisson_r
     """
     nu = poisson_ratio
     q = np.minimum(np.maximum(k * thickness, 1e-6), 300.0)  # beyond 300 the layer is a half-space to machine precision
-    ratio = ((3 - 4 * nu) * np.sinh(2 * q) - 2 * q) / ((3 - 4 * nu) * np.cosh(2 * q) + 2 * q * q + 5 - 12 * nu + 8 * nu * nu)
+    ratio = ((3 - 4 * nu) * np.sinh(2 * q) - 2 * q) / (
+        (3 - 4 * nu) * np.cosh(2 * q) + 2 * q * q + 5 - 12 * nu + 8 * nu * nu
+    )
     wave = 2 * (1 - nu * nu) / (youngs_modulus * np.maximum(k, 1e-6 / thickness)) * ratio
     uniform = thickness * (1 + nu) * (1 - 2 * nu) / ((1 - nu) * youngs_modulus)
     return np.where(k == 0, uniform, wave)
@@ -78,4 +80,6 @@ def layer_contact(
         norm_before = norm
         if np.abs(pressure - before).sum() < tolerance * pressure.sum():
             return LayerContact(pressure, displacement(pressure), pixel)
-    raise RuntimeError(f"layer contact did not converge in {max_iterations} iterations; use a coarser grid or a looser tolerance")
+    raise RuntimeError(
+        f"layer contact did not converge in {max_iterations} iterations; use a coarser grid or a looser tolerance"
+    )

@@ -45,9 +45,7 @@ def minors(s):
 
 @ti.func
 def determinant(s):
-    return (
-        s[0] * (s[1] * s[2] - s[5] * s[5]) - s[3] * (s[3] * s[2] - s[5] * s[4]) + s[4] * (s[3] * s[5] - s[1] * s[4])
-    )
+    return s[0] * (s[1] * s[2] - s[5] * s[5]) - s[3] * (s[3] * s[2] - s[5] * s[4]) + s[4] * (s[3] * s[5] - s[1] * s[4])
 
 
 @ti.func
@@ -82,9 +80,7 @@ def log_pade(a):
     """log(I + a) by the [3/3] Padé approximant; relative error below 1.4e-5 for |a| up to 0.5."""
     a2 = product(a, a)
     a3 = product(a2, a)
-    return product(
-        60.0 * a + 60.0 * a2 + 11.0 * a3, inverse(plus_identity(90.0 * a + 36.0 * a2 + 3.0 * a3, 60.0))
-    )
+    return product(60.0 * a + 60.0 * a2 + 11.0 * a3, inverse(plus_identity(90.0 * a + 36.0 * a2 + 3.0 * a3, 60.0)))
 
 
 @ti.func

@@ -47,9 +47,7 @@ class BodyFacts:
 def body_facts(material: BodyMaterial, spacing: float) -> BodyFacts:
     mu, lam = lame(material)
     limit = material.elastic_limit
-    return BodyFacts(
-        spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC
-    )
+    return BodyFacts(spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC)
 
 
 @dataclass
@@ -81,7 +79,7 @@ def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tup
 
 @ti.func
 def stencil(x, origin, cell, shape):
-    """First node of the 3x3x3 stencil, its weights by axis, the offset from it; `inside` is False off the grid (or NaN)."""
+    """First node of the 3x3x3 stencil, offset from it, weights by axis; `inside` is False off the grid (or NaN)."""
     s = (x - origin) / cell
     inside = True
     for d in ti.static(range(3)):

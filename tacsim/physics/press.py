@@ -1,5 +1,7 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from tacsim.interface import Pose
@@ -8,7 +10,7 @@ from tacsim.physics.gel import MM, Nodes, gel_advance, gel_facts, gel_forces, ge
 from tacsim.physics.health import Health, as_float32, attempt, require_finite
 from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
-from tacsim.physics.material import mat3, vec3
+from tacsim.physics.material import vec3
 from tacsim.physics.world import MoveStats
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
@@ -96,7 +98,7 @@ class PressWorld:
         state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
         return state
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         for name, a in self._arrays().items():
             if state[name].shape != a.shape:
                 raise ValueError(f"snapshot: {name} has shape {state[name].shape}, this world needs {a.shape}")
@@ -116,7 +118,7 @@ class PressWorld:
     def truth(self) -> None:
         return None
 
-    def move(self, targets: dict[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         require_finite(self._arrays())
         end = merged(self._poses, targets)
         path = plan(

@@ -7,7 +7,7 @@ to the scheme itself: bodies stick to each other (no friction coefficient), begi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -254,7 +254,12 @@ class SeedWorld:
 
         faces = path.drive(first, last)[:, :, 3, 2]
         room = faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM
-        if not STRETCH[0] * self._dx < room.min() / self._cells[0] <= room.max() / self._cells[0] < STRETCH[1] * self._dx:
+        if (
+            not STRETCH[0] * self._dx
+            < room.min() / self._cells[0]
+            <= room.max() / self._cells[0]
+            < STRETCH[1] * self._dx
+        ):
             self._cells[0] = max(round(float(room.mean()) / self._dx), 1)
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
         low, high = gels.min(axis=0), gels.max(axis=0)

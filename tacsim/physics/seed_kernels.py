@@ -125,22 +125,29 @@ def principal(U, values):
 
 
 @ti.func
+def jacobi(B, i: ti.template(), j: ti.template()):
+    """Rotates columns i and j of B until they are orthogonal."""
+    bi, bj = Vec3(B[0, i], B[1, i], B[2, i]), Vec3(B[0, j], B[1, j], B[2, j])
+    gap, dot = bj.dot(bj) - bi.dot(bi), 2.0 * bi.dot(bj)
+    t = dot / (ti.abs(gap) + ti.sqrt(gap * gap + dot * dot) + 1e-30)
+    t = ti.select(gap < 0.0, -t, t)
+    c = 1.0 / ti.sqrt(1.0 + t * t)
+    s = c * t
+    for a in ti.static(range(3)):
+        B[a, i], B[a, j] = c * bi[a] - s * bj[a], s * bi[a] + c * bj[a]
+    return B
+
+
+@ti.func
 def svd(F: ti.template(), US: ti.template()):
-    """U S of F = U S V^T: one-sided Jacobi rotates the columns of F until they are orthogonal (Hestenes 1958)."""
+    """U S of F = U S V^T by one-sided Jacobi rotations (Hestenes 1958)."""
     for p in range(F.shape[2]):
         B = Mat3(0.0)
-        for a, b in ti.static(ti.ndrange(3, 3)):  # load() and store() would keep the loop from being vectorised (6x)
+        for a, b in ti.static(ti.ndrange(3, 3)):  # load() and store() would keep the loop from being vectorised (5x)
             B[a, b] = F[a, b, p]
         for _ in ti.static(range(SWEEPS)):
             for i, j in ti.static(((0, 1), (0, 2), (1, 2))):
-                bi, bj = Vec3(B[0, i], B[1, i], B[2, i]), Vec3(B[0, j], B[1, j], B[2, j])
-                gap, dot = bj.dot(bj) - bi.dot(bi), 2.0 * bi.dot(bj)
-                t = dot / (ti.abs(gap) + ti.sqrt(gap * gap + dot * dot) + 1e-30)
-                t = ti.select(gap < 0.0, -t, t)
-                c = 1.0 / ti.sqrt(1.0 + t * t)
-                s = c * t
-                for a in ti.static(range(3)):
-                    B[a, i], B[a, j] = c * bi[a] - s * bj[a], s * bi[a] + c * bj[a]
+                B = jacobi(B, i, j)
         for a, b in ti.static(ti.ndrange(3, 3)):
             US[a, b, p] = B[a, b]
 

@@ -51,7 +51,7 @@ class Outcome:
 
 def judge(task: Task, truth: Truth, start: Truth) -> Outcome:
     """Distance, reward, success and score of `truth`, in an episode that began at `start`."""
-    facts, distance = task.facts, task.distance(truth, start)
+    facts, distance = task.facts, float(task.distance(truth, start))
     return Outcome(
         distance=distance,
         reward=-distance / facts.reward_scale,

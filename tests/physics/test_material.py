@@ -36,9 +36,9 @@ def six(m: np.ndarray) -> np.ndarray:
 
 
 def full(s: np.ndarray) -> np.ndarray:
-    return np.stack([s[..., 0], s[..., 3], s[..., 4], s[..., 3], s[..., 1], s[..., 5], s[..., 4], s[..., 5], s[..., 2]], -1).reshape(
-        *s.shape[:-1], 3, 3
-    )
+    return np.stack(
+        [s[..., 0], s[..., 3], s[..., 4], s[..., 3], s[..., 1], s[..., 5], s[..., 4], s[..., 5], s[..., 2]], -1
+    ).reshape(*s.shape[:-1], 3, 3)
 
 
 def random_b(count: int, size: float, seed: int = 0) -> np.ndarray:

@@ -62,7 +62,7 @@ def test_nothing_overlaps_at_rest_and_backing_balances_contact() -> None:
 
 
 def test_an_off_centre_press_shows_where_it_is() -> None:
-    """x right, y down, z out: pressing at (+3, -2) mm dents the nodes there, nowhere else, and turns the moment's signs."""
+    """x right, y down, z out: a press at (+3, -2) mm dents the nodes there, and gives the moment its signs."""
     w = world(Sphere(radius=3e-3), tolerance=1e-2)
     move(w, (3e-3, -2e-3, 0))
     move(w, (0, 0, -0.6e-3))

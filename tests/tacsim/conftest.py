@@ -16,7 +16,7 @@ from tacsim.rig import Rig
 from tacsim.scene import GelSurface, Scene
 
 HEIGHT, RADIUS, GAP = 10e-3, 0.25e-3, 0.5e-3  # of the body; of a particle; between gel and body at first [m]
-GEL, BODY = 5e3, 50e3  # stiffness of one gel and of the body [N/m]
+GEL, BODY = 5e3, 5e3  # stiffness of one gel and of the body [N/m]
 LAG = 0.4  # the body follows the upper sensor but for this part of the first millimetre
 SMALL = (
     "sensors.lower.model.geometry.width=40",

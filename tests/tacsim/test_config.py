@@ -132,6 +132,13 @@ def test_extends_merges_mappings_and_replaces_everything_else(folder: Path) -> N
     )  # a reference replaces, clay's numbers do not shine through
 
 
+def test_extends_inside_a_merged_mapping_starts_from_its_own_base(folder: Path) -> None:
+    write("a.yaml", "extends: squeeze\nbody: {material: {extends: dough, poisson_ratio: 0.4}}")
+    body = load_scene("a.yaml").body
+    assert body is not None
+    assert (body.material.yield_stress, body.material.poisson_ratio) == (5e3, 0.4)
+
+
 def test_a_file_may_be_just_another_name(folder: Path) -> None:
     assert load_scene(write("mine.yaml", "press")) == load_scene("press")
 

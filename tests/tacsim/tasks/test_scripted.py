@@ -1,0 +1,121 @@
+"""Scripted policies reach the goal by touch alone, on a world known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.deploy import run_episode
+from tacsim.interface import Action, Observation
+from tacsim.rigfile import RepositionFacts, SqueezeFacts
+from tacsim.tasks import make_task
+from tacsim.tasks.grip import Grip
+from tacsim.tasks.reposition import centre_of_pressure, felt_position
+from tacsim.tasks.squeeze import felt_height
+
+SQUEEZE = SqueezeFacts(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
+REPOSITION = RepositionFacts(kind="reposition", goal=(2e-3, -1e-3), max_step=0.2e-3)
+
+
+def test_squeeze_reaches_the_goal_then_holds(open_springs: Any) -> None:
+    rig, task = open_springs(), make_task(SQUEEZE)
+    episode = run_episode(rig, task.scripted(), task, 40)
+    distances = [step.distance for step in episode.steps]
+    assert len(distances) == 41
+    assert min(distances) <= 0.02e-3
+    assert distances[-1] == min(distances)
+    last = episode.steps[-1].action
+    assert last is not None
+    assert set(last.tool.values()) == {None}
+
+
+def test_squeeze_closes_alike_and_no_faster_than_half_of_max_step(open_springs: Any) -> None:
+    task = make_task(SQUEEZE)
+    episode = run_episode(open_springs(), task.scripted(through=True), task, 15)
+    for before, after in zip(episode.steps, episode.steps[1:], strict=False):
+        up = after.arms["lower"].pose.position - before.arms["lower"].pose.position
+        down = after.arms["upper"].pose.position - before.arms["upper"].pose.position
+        assert up == pytest.approx(-down, abs=1e-12)
+        assert 0 < up[2] <= 0.1e-3 + 1e-12
+
+
+def test_through_passes_the_goal_at_the_goal(open_springs: Any) -> None:
+    """The reward rises to a peak at the goal, then falls for good, at the full rate."""
+    facts = SqueezeFacts(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
+    rig, task = open_springs(), make_task(facts)
+    episode = run_episode(rig, task.scripted(through=True), task, 25)
+    rewards = [step.reward for step in episode.steps]
+    peak = int(np.argmax(rewards))
+    assert 0 < peak < 15
+    assert episode.steps[peak].distance <= 0.02e-3
+    assert np.all(np.diff(rewards[peak:]) < 0)
+    lower = [step.arms["lower"].pose.position[2] for step in episode.steps[peak:]]
+    assert np.diff(lower) == pytest.approx(0.1e-3)
+
+
+def test_felt_height_is_the_true_height(open_springs: Any) -> None:
+    rig = open_springs()
+    observation = rig.reset()
+    for _ in range(3):
+        down = observation.arms["upper"].pose
+        target = type(down)(down.position - [0, 0, 1e-4], down.quaternion)
+        observation, _ = rig.step(Action({"upper": target}))
+        assert felt_height(observation) == pytest.approx(rig.truth().height, abs=2e-6)
+
+
+def test_reposition_reaches_the_goal_although_the_body_lags(open_springs: Any) -> None:
+    rig, task = open_springs("reposition"), make_task(REPOSITION)
+    episode = run_episode(rig, task.scripted(), task, 40)
+    distances = [step.distance for step in episode.steps]
+    assert distances[0] == pytest.approx(np.hypot(2e-3, 1e-3), rel=0.01)
+    assert min(distances) <= 0.03e-3
+    assert distances[-1] == min(distances)
+    sensor = episode.steps[-1].arms["upper"].pose.position[:2]
+    assert np.hypot(*(sensor - REPOSITION.goal)) > 0.2e-3  # the sensor itself is beyond: the lag was felt
+
+
+def test_reposition_through_goes_on_straight(open_springs: Any) -> None:
+    rig, task = open_springs("reposition"), make_task(REPOSITION)
+    episode = run_episode(rig, task.scripted(through=True), task, 40)
+    rewards = [step.reward for step in episode.steps]
+    peak = int(np.argmax(rewards))
+    assert episode.steps[peak].distance <= 0.05e-3
+    assert np.all(np.diff(rewards[peak:]) < 0)
+    way = np.diff([step.arms["upper"].pose.position[:2] for step in episode.steps[peak:]], axis=0)
+    assert way == pytest.approx(np.tile([0.1e-3, -0.05e-3], (len(way), 1)))
+
+
+def test_reposition_feels_the_body_and_nothing_without_contact(open_springs: Any) -> None:
+    rig = open_springs("reposition")
+    observation = rig.reset()
+    up = observation.arms["upper"].pose
+    observation, _ = rig.step(Action({"upper": type(up)(up.position + [1e-3, -0.5e-3, 0], up.quaternion)}))
+    assert felt_position(observation) == pytest.approx(rig.truth().position[:2], abs=1e-9)
+    free = replace(observation.arms["upper"], wrench=np.array([0.1, 0.0, -0.005, 1.0, 1.0, 1.0]))
+    assert centre_of_pressure(free) is None
+    task = make_task(REPOSITION)
+    blind = Observation(observation.tactile, {**observation.arms, "upper": free}, 0.0)
+    assert task.scripted()(blind).tool == {"upper": None}
+
+
+def test_grip_closes_until_the_contact_is_firm_then_holds(open_springs: Any) -> None:
+    rig = open_springs()
+    policy = Grip(rig.spec, target=0.05)
+    episode = run_episode(rig, policy, None, 30)
+    signals = [np.mean([step.info[f"contact_signal_{name}"] for name in ("lower", "upper")]) for step in episode.steps]
+    firm = int(np.argmax(np.array(signals) >= 0.05))
+    assert 0 < firm < 30
+    assert np.all(np.array(signals[:firm]) < 0.05)
+    for step in episode.steps[1 : firm + 1]:
+        assert step.action is not None
+        assert all(pose is not None for pose in step.action.tool.values())
+    first = episode.steps[1]
+    assert first.sent["upper"] is not None
+    down = first.sent["upper"].position - episode.steps[0].arms["upper"].pose.position
+    assert down == pytest.approx([0, 0, -0.1e-3], abs=1e-12)  # along the sensor's own z: out of the gel
+    for step in episode.steps[firm + 1 :]:
+        assert step.action is not None
+        assert set(step.action.tool.values()) == {None}

@@ -16,6 +16,7 @@ from tacsim.rigfile import RigFacts
 from tacsim.tasks import judge, make_task
 
 FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
+SEEN = 1.0  # mean difference from the image without contact that contact must make [grey levels]
 WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
 
 
@@ -153,6 +154,6 @@ def shortcomings(task: str, trial: Trial) -> list[str]:
                 f"at the {name} the distance is {end * 1e3:.3f} mm, not more than {FALL:g} x {allowed * 1e3:.2f} mm "
                 "worse than at the peak"
             )
-    if not trial.image_difference[-1] > trial.image_difference[0]:
-        found.append("the images do not change with contact")
+    if not max(trial.image_difference) > SEEN:
+        found.append(f"contact changes the images by at most {max(trial.image_difference):.2f} grey levels")
     return found

@@ -107,10 +107,22 @@ class SimArm:
         return ArmState(
             pose=self._world.pose(self._frame),
             twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
-            wrench=np.array(self._world.wrench(self._frame), dtype=np.float64),
+            wrench=self._wrench(),
             joints=None,
             time=self._clock.now(),
         )
+
+    def _wrench(self) -> FloatArray:
+        """On the sensor; on a tool without one (the indenter) the reaction of all sensors."""
+        world = self._world
+        if self._frame in world.sensors:
+            return np.array(world.wrench(self._frame), dtype=np.float64)
+        here = world.pose(self._frame)
+        parts = [
+            se3.transform_wrench(se3.relative(here, world.pose(name)), world.wrench(name)) for name in world.sensors
+        ]
+        reaction: FloatArray = -np.sum(parts, axis=0)
+        return reaction
 
     def command(self, target: Pose | None) -> Pose | None:
         """Takes effect at the next tick; None holds. Returns the pose after the limits."""

@@ -21,7 +21,7 @@ from tacsim.scene import Settling
 MM = 1e3
 PEAK = 1.875  # peak slope of the quintic ramp over its mean
 CHECK = 20  # substeps between two looks at the residual
-FORCE_FLOOR = 2e-3  # [N] residuals are relative to the contact force, but never to less than this
+FORCE_FLOOR = 2e-3  # [N] residuals are relative to the contact force, but to no less than this by default
 
 
 def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -76,6 +76,7 @@ class Reading:
     backing: NDArray[np.float64]  # (gels, 3)
     overlap: float  # [mm]
     guard_hits: int
+    floor: float = FORCE_FLOOR  # [N] residuals are relative to at least this
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
@@ -83,7 +84,7 @@ def residual(now: Reading, before: Reading, balanced: bool) -> float:
 
     `balanced`: the contact forces of all gels must add up to zero (a free body between them).
     """
-    scale = max(float(np.abs(now.contact).max()), FORCE_FLOOR)
+    scale = max(float(np.abs(now.contact).max()), now.floor)
     parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
     if balanced:
         parts.append(np.abs(now.contact.sum(axis=0)).max())

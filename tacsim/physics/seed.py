@@ -86,6 +86,8 @@ class SeedWorld:
         self._lattice = gel_lattice(scene.gel, scene.spacing)
         self._gel = solid(scene.gel.material, h * h * self._lattice.layer)
         self._body = solid(scene.body.material, h**3)
+        # force that rounding in F can pretend: one particle's area at the gel's modulus
+        self._floor = scene.gel.material.youngs_modulus * MPA * h * h
         self._initialise(particles(scene.body.geometry, scene.spacing) * MM)
 
     def _initialise(self, body: NDArray[np.float64]) -> None:
@@ -103,17 +105,14 @@ class SeedWorld:
         n = len(self._x)
         self._v = np.zeros((n, 3), np.float32)
         self._c = np.zeros((n, 3, 3), np.float32)
-        self._gel_f = np.tile(np.eye(3, dtype=np.float32), (2 * self._gels, 1, 1))
-        self._gel_stress = np.zeros_like(self._gel_f)
-        self._body_f = np.tile(np.eye(3, dtype=np.float32)[:, :, None], (1, 1, len(body)))
-        self._body_stress = np.zeros_like(self._body_f)
-        self._change = np.zeros((2, 3, len(body)), np.float32)  # scratch of the return mapping
+        self._f = np.tile(np.eye(3, dtype=np.float32), (n, 1, 1))
+        self._stress = np.zeros((n, 3, 3), np.float32)
         self._aside = np.zeros(n, np.int32)  # 1 = left the grid, takes no part
         self._motion = np.array([0, 0, 0, body[:, 2].min(), body[:, 2].max()], np.float32)  # see kernels
         self._momentum, self._gain = np.zeros((2, 3), np.float32), np.zeros((2, 3), np.float32)
         self._backing = np.zeros((2, 6), np.float32)
         room = self._poses["upper"].position[2] + 2 * self.scene.gel.size[2]
-        self._cells = np.array([round(room * MM / self._dx)], np.int32)  # layers of the grid between the backings
+        self._layers = np.array([round(room * MM / self._dx)], np.int32)  # layers of the grid between the backings
         self._grid = np.zeros((1, 1, 1, 4), np.float32)
         as_float32([a for a in self._arrays().values() if a.dtype != np.int32 and a is not self._x])
 
@@ -121,9 +120,9 @@ class SeedWorld:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {
-            "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "gel_deformation": self._gel_f,
-            "gel_stress": self._gel_stress, "body_deformation": self._body_f, "body_stress": self._body_stress, "aside": self._aside, "body_motion": self._motion,
-            "gel_momentum": self._momentum, "gel_gain": self._gain, "backing": self._backing, "layers": self._cells,
+            "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "deformation_gradient": self._f,
+            "stress": self._stress, "aside": self._aside, "body_motion": self._motion,
+            "gel_momentum": self._momentum, "gel_gain": self._gain, "backing": self._backing, "layers": self._layers,
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
@@ -178,6 +177,7 @@ class SeedWorld:
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         """See World. Raises ValueError for a tilted target, or one that leaves the gels less than half their thickness."""
+        self._check_finite()
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
         self._check_room(end)
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
@@ -206,6 +206,14 @@ class SeedWorld:
         yaw = Rotation.from_euler("z", np.arctan2(turn[1, 0], turn[0, 0]))
         return Pose(pose.position, (yaw * flip).as_quat())
 
+    def _check_finite(self) -> None:
+        for name, a in self._arrays().items():
+            if not np.isfinite(a).all():
+                index = tuple(int(i) for i in np.argwhere(~np.isfinite(a))[0])
+                raise SimulationDiverged(
+                    f"{name}{list(index)} is {a[index]}", "before the motion", "restore a snapshot, or make a new world"
+                )
+
     def _check_room(self, poses: Mapping[str, Pose]) -> None:
         thickness = self.scene.gel.size[2]
         room = float(poses["upper"].position[2] - poses["lower"].position[2])
@@ -229,19 +237,19 @@ class SeedWorld:
         attempt(self._arrays(), launch, lambda: where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
-        return Reading(backing + self._gain, backing, self._overlap(path, last), left)
+        return Reading(backing + self._gain, backing, self._overlap(path, last), left, self._floor)
 
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance
 
         thickness = self.scene.gel.size[2] * MM
         step = Step(
-            dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._cells[0]), gels=self._gels,
-            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING,
+            dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
+            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING, gels=self._gels,
         )  # fmt: skip
         advance(
-            self._x, self._v, self._c, self._gel_f, self._gel_stress, self._body_f, self._body_stress,
-            self._change, self._aside, self._grid, drive, self._motion, self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
+            self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive, self._motion,
+            self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
         )  # fmt: skip
 
     def _fit_grid(self, path: Path, first: int, last: int) -> tuple[float, float]:
@@ -253,14 +261,10 @@ class SeedWorld:
         from tacsim.physics.seed_kernels import PAD
 
         faces = path.drive(first, last)[:, :, 3, 2]
-        room = faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM
-        if (
-            not STRETCH[0] * self._dx
-            < room.min() / self._cells[0]
-            <= room.max() / self._cells[0]
-            < STRETCH[1] * self._dx
-        ):
-            self._cells[0] = max(round(float(room.mean()) / self._dx), 1)
+        room = (faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM) / self._dx
+        layers = int(self._layers[0])
+        if room.min() < STRETCH[0] * layers or room.max() > STRETCH[1] * layers:
+            self._layers[0] = layers = max(round(float(room.mean())), 1)
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
         low, high = gels.min(axis=0), gels.max(axis=0)
         side = SIDE * float((high - low).max())
@@ -270,14 +274,26 @@ class SeedWorld:
         margin = MARGIN * self._dx + 2 * self.scene.settling.mach * (last - first) * self._dt
         corner = np.floor((low - margin) / self._dx)
         nodes = np.ceil((high + margin) / self._dx) - corner + 1
-        shape = (int(nodes[0]), int(nodes[1]), int(self._cells[0]) + 2 * PAD + 1)
+        shape = (int(nodes[0]), int(nodes[1]), layers + 2 * PAD + 1)
         if self._grid.shape[:3] != shape:
             self._grid = np.zeros((*shape, 4), np.float32)
         return float(corner[0] * self._dx), float(corner[1] * self._dx)
 
     def _overlap(self, path: Path, last: int) -> float:
-        """Deepest body particle below the gels' top layer of particles, surfaces half a spacing out of each [mm]."""
-        return 0.0
+        """Deepest body particle below the nearest column of a gel, surfaces half a spacing outside the particles [mm]."""
+        nx, ny, nz = self._lattice.count
+        frames = path.drive(last - 1, last)[0].astype(np.float64)
+        body = self._body_points()
+        deepest = 0.0
+        for index, (rotation, origin) in enumerate((f[:3], f[3]) for f in frames):
+            x = (body - origin) @ rotation
+            gel = (self._x[index * self._gels : (index + 1) * self._gels : nz] - origin) @ rotation
+            column = np.rint(x[:, :2] / self._lattice.spacing + (np.array([nx, ny]) - 1) / 2).astype(int)
+            over = ((column >= 0) & (column < [nx, ny])).all(axis=1)
+            top = gel[column[over, 0] * ny + column[over, 1], 2] + self._lattice.layer / 2
+            gap = x[over, 2] - self._lattice.spacing / 2 - top
+            deepest = max(deepest, -float(gap.min(initial=0.0)))
+        return deepest
 
 
 def _rotation(pose: Pose) -> Rotation:

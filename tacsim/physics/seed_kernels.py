@@ -19,7 +19,6 @@ Positions = ti.types.ndarray(dtype=ti.types.vector(3, ti.f64), ndim=1)  # a sett
 Scalars = ti.types.ndarray(dtype=f32, ndim=1)
 Vectors = ti.types.ndarray(dtype=Vec3, ndim=1)
 Matrices = ti.types.ndarray(dtype=Mat3, ndim=1)
-Planes = ti.types.ndarray(dtype=f32, ndim=3)  # [row, column, particle]: lets the compiler vectorise the SVD (4x faster)
 Grid = ti.types.ndarray(dtype=Vec4, ndim=3)  # momentum, then velocity; mass
 Drive = ti.types.ndarray(dtype=f32, ndim=4)  # [substep, sensor, row, xyz] of tacsim.physics.controller.Path
 Table = ti.types.ndarray(dtype=f32, ndim=2)
@@ -102,17 +101,28 @@ def inside(X, grid: ti.template()):
 
 
 @ti.func
-def load(planes: ti.template(), p):
-    m = Mat3(0.0)
-    for a, b in ti.static(ti.ndrange(3, 3)):
-        m[a, b] = planes[a, b, p]
-    return m
+def turn(a, b):
+    """Cosine and sine of the Jacobi rotation that makes two columns orthogonal."""
+    gap, dot = b.dot(b) - a.dot(a), 2.0 * a.dot(b)
+    t = dot / (ti.abs(gap) + ti.sqrt(gap * gap + dot * dot) + 1e-30)
+    t = ti.select(gap < 0.0, -t, t)
+    c = 1.0 / ti.sqrt(1.0 + t * t)
+    return c, c * t
 
 
 @ti.func
-def store(planes: ti.template(), p, m):
-    for a, b in ti.static(ti.ndrange(3, 3)):
-        planes[a, b, p] = m[a, b]
+def left_singular(F):
+    """U and S of F = U S V^T by one-sided Jacobi rotations of the columns (Hestenes 1958); S positive, unsorted."""
+    b0, b1, b2 = Vec3(F[0, 0], F[1, 0], F[2, 0]), Vec3(F[0, 1], F[1, 1], F[2, 1]), Vec3(F[0, 2], F[1, 2], F[2, 2])
+    for _ in ti.static(range(SWEEPS)):
+        c, s = turn(b0, b1)
+        b0, b1 = c * b0 - s * b1, s * b0 + c * b1
+        c, s = turn(b0, b2)
+        b0, b2 = c * b0 - s * b2, s * b0 + c * b2
+        c, s = turn(b1, b2)
+        b1, b2 = c * b1 - s * b2, s * b1 + c * b2
+    S = Vec3(b0.norm(), b1.norm(), b2.norm())
+    return ti.Matrix.cols([b0 / S[0], b1 / S[1], b2 / S[2]]), S
 
 
 @ti.func
@@ -125,67 +135,23 @@ def principal(U, values):
 
 
 @ti.func
-def jacobi(B, i: ti.template(), j: ti.template()):
-    """Rotates columns i and j of B until they are orthogonal."""
-    bi, bj = Vec3(B[0, i], B[1, i], B[2, i]), Vec3(B[0, j], B[1, j], B[2, j])
-    gap, dot = bj.dot(bj) - bi.dot(bi), 2.0 * bi.dot(bj)
-    t = dot / (ti.abs(gap) + ti.sqrt(gap * gap + dot * dot) + 1e-30)
-    t = ti.select(gap < 0.0, -t, t)
-    c = 1.0 / ti.sqrt(1.0 + t * t)
-    s = c * t
-    for a in ti.static(range(3)):
-        B[a, i], B[a, j] = c * bi[a] - s * bj[a], s * bi[a] + c * bj[a]
-    return B
-
-
-@ti.func
-def svd(F: ti.template(), US: ti.template()):
-    """U S of F = U S V^T by one-sided Jacobi rotations (Hestenes 1958)."""
-    for p in range(F.shape[2]):
-        B = Mat3(0.0)
-        for a, b in ti.static(ti.ndrange(3, 3)):  # load() and store() would keep the loop from being vectorised (5x)
-            B[a, b] = F[a, b, p]
-        for _ in ti.static(range(SWEEPS)):
-            for i, j in ti.static(((0, 1), (0, 2), (1, 2))):
-                B = jacobi(B, i, j)
-        for a, b in ti.static(ti.ndrange(3, 3)):
-            US[a, b, p] = B[a, b]
-
-
-@ti.func
-def yield_rule(US: ti.template(), change: ti.template(), solid):
+def return_mapping(F, solid):
     """Seed paper, eq. (1)-(2): Hencky strain e = log S; beyond yield dev e shrinks by dg = |dev e| - sigma_y / (2 mu).
 
-    `change` = per principal axis exp(-dg dev e/|dev e|) / S^2 and the Kirchhoff stress (2 mu e + lambda tr e) / S^2.
+    Returns the elastic F = U exp(e - dg dev e/|dev e|) V^T, and the Kirchhoff stress U (2 mu e + lambda tr e) U^T.
     """
-    for p in range(US.shape[2]):
-        S2 = Vec3(0.0)
-        for i in ti.static(range(3)):
-            S2[i] = US[0, i, p] ** 2 + US[1, i, p] ** 2 + US[2, i, p] ** 2
-        e = 0.5 * ti.log(S2)
-        mean = e.sum() / 3.0
-        dev = e - mean
-        norm = dev.norm()
-        dg = norm - solid.limit
-        shrink = Vec3(1.0)
-        if dg > 0.0:
-            flow = (dg / norm) * dev
-            shrink = ti.exp(-flow)
-            e -= flow
-        for i in ti.static(range(3)):
-            change[0, i, p] = shrink[i] / S2[i]
-            change[1, i, p] = (2.0 * solid.mu * e[i] + 3.0 * solid.lam * mean) / S2[i]
-
-
-@ti.func
-def rebuild(F: ti.template(), stress: ti.template(), change: ti.template()):
-    """F <- U exp(e) V^T and the stress U tau U^T; `stress` holds U S. V^T = S^-1 U^T F, so V itself is not needed."""
-    for p in range(F.shape[2]):
-        US = load(stress, p)
-        shrink = Vec3(change[0, 0, p], change[0, 1, p], change[0, 2, p])
-        tau = Vec3(change[1, 0, p], change[1, 1, p], change[1, 2, p])
-        store(F, p, principal(US, shrink) @ load(F, p))
-        store(stress, p, principal(US, tau))
+    U, S = left_singular(F)
+    e = ti.log(S)
+    mean = e.sum() / 3.0
+    dev = e - mean
+    norm = dev.norm()
+    dg = norm - solid.limit
+    elastic = F
+    if dg > 0.0:
+        flow = (dg / norm) * dev
+        elastic = principal(U, ti.exp(-flow)) @ F  # V^T = S^-1 U^T F, so V itself is not needed
+        e -= flow
+    return elastic, principal(U, 2.0 * solid.mu * e + 3.0 * solid.lam * mean)
 
 
 @ti.func
@@ -200,8 +166,8 @@ def neo_hookean(F, solid):
 
 @ti.func
 def particle_to_grid(
-    x: ti.template(), v: ti.template(), C: ti.template(), gel_stress: ti.template(), body_stress: ti.template(),
-    aside: ti.template(), grid: ti.template(), origin, spacing, step, gel, body, health: ti.template(),
+    x: ti.template(), v: ti.template(), C: ti.template(), stress: ti.template(), aside: ti.template(),
+    grid: ti.template(), origin, spacing, step, gel, body, health: ti.template(),
 ):  # fmt: skip
     """Scatters momentum, mass and the impulse of stress; sets aside (and so counts) particles outside the grid."""
     for p in range(x.shape[0]):
@@ -214,12 +180,10 @@ def particle_to_grid(
             base = ti.floor(X - 0.5, ti.i32)
             fx = X - base
             w = weights(fx)
-            mass, volume, stress = gel.mass, gel.volume, Mat3(0.0)
-            if p < 2 * step.gels:
-                stress = gel_stress[p]
-            else:
-                mass, volume, stress = body.mass, body.volume, load(body_stress, p - 2 * step.gels)
-            affine, push = mass * C[p], -4.0 * step.dt * volume * stress
+            mass, volume = gel.mass, gel.volume
+            if p >= 2 * step.gels:
+                mass, volume = body.mass, body.volume
+            affine, push = mass * C[p], -4.0 * step.dt * volume * stress[p]
             for a, b in ti.static(ti.ndrange(3, 3)):
                 affine[a, b] = affine[a, b] * spacing[b] + push[a, b] / spacing[b]
             start = mass * v[p] - affine @ fx
@@ -262,10 +226,10 @@ def update_grid(grid: ti.template(), drive: ti.template(), n, origin, spacing, s
 
 @ti.func
 def grid_to_particle(
-    x: ti.template(), v: ti.template(), C: ti.template(), gel_f: ti.template(), gel_stress: ti.template(),
-    body_f: ti.template(), aside: ti.template(), grid: ti.template(), origin, spacing, step, gel, health: ti.template(),
+    x: ti.template(), v: ti.template(), C: ti.template(), F: ti.template(), stress: ti.template(),
+    aside: ti.template(), grid: ti.template(), origin, spacing, step, gel, body, health: ti.template(),
 ):  # fmt: skip
-    """Gathers velocity and its gradient, updates F <- (I + dt C) F (of the body: the trial), takes the gels' stress."""
+    """Gathers velocity and its gradient, updates F <- (I + dt C) F, maps it back to the yield surface, takes the stress."""
     for p in range(x.shape[0]):
         if aside[p] == 0:
             X = ti.cast((x[p] - origin) / spacing, f32)
@@ -293,13 +257,15 @@ def grid_to_particle(
             update = step.dt * gradient
             for a in ti.static(range(3)):
                 update[a, a] += 1.0
+            trial = update @ F[p]
             if p < 2 * step.gels:
-                F = update @ gel_f[p]
-                gel_f[p] = F
-                gel_stress[p] = neo_hookean(F, gel)
-                health[0] = ti.min(health[0], F.determinant())
+                F[p] = trial
+                stress[p] = neo_hookean(trial, gel)
+                health[0] = ti.min(health[0], trial.determinant())
             else:
-                store(body_f, p - 2 * step.gels, update @ load(body_f, p - 2 * step.gels))
+                elastic, tau = return_mapping(trial, body)
+                F[p] = elastic
+                stress[p] = tau
             health[2] = ti.min(health[2], update.determinant())
             health[3] = ti.max(health[3], velocity.norm())
 
@@ -366,33 +332,27 @@ def advection(
 
 @ti.kernel
 def advance(
-    x: Positions, v: Vectors, C: Matrices, gel_f: Matrices, gel_stress: Matrices, body_f: Planes, body_stress: Planes,
-    change: Planes, aside: Flags, grid: Grid, drive: Drive, motion: Scalars, momentum: Table, gain: Table,
-    backing: Table, health: Scalars, gel: Solid, body: Solid, step: Step,
+    x: Positions, v: Vectors, C: Matrices, F: Matrices, stress: Matrices, aside: Flags, grid: Grid, drive: Drive,
+    motion: Scalars, momentum: Table, gain: Table, backing: Table, health: Scalars, gel: Solid, body: Solid, step: Step,
 ):  # fmt: skip
     """Many substeps of the whole scene in one launch, one a row of `drive`."""
     ti.loop_config(serialize=True)
     for n in range(drive.shape[0]):
         z0, dz = vertical(drive, n, step)
         origin, spacing = Vec3(step.x0, step.y0, z0), Vec3(step.dx, step.dx, dz)
-        for i in range(grid.shape[0]):
-            for j in range(grid.shape[1]):
-                for k in range(grid.shape[2]):
-                    grid[i, j, k] = Vec4(0.0)
-        particle_to_grid(x, v, C, gel_stress, body_stress, aside, grid, origin, spacing, step, gel, body, health)
+        for i, j, k in ti.ndrange(grid.shape[0], grid.shape[1], grid.shape[2]):
+            grid[i, j, k] = Vec4(0.0)
+        particle_to_grid(x, v, C, stress, aside, grid, origin, spacing, step, gel, body, health)
         update_grid(grid, drive, n, origin, spacing, step, backing)
-        grid_to_particle(x, v, C, gel_f, gel_stress, body_f, aside, grid, origin, spacing, step, gel, health)
-        svd(body_f, body_stress)
-        yield_rule(body_stress, change, body)
-        rebuild(body_f, body_stress, change)
+        grid_to_particle(x, v, C, F, stress, aside, grid, origin, spacing, step, gel, body, health)
         advection(x, v, aside, drive, n, step, gel, motion, momentum, gain)
 
 
 @ti.kernel
-def return_mapping(F: Planes, stress: Planes, change: Planes, body: Solid):
-    """The return mapping alone: trial F -> elastic F and Kirchhoff stress; `change` is scratch, (2, 3, n)."""
+def map_back(F: Matrices, stress: Matrices, body: Solid):
+    """The return mapping alone: trial F -> elastic F and Kirchhoff stress."""
     ti.loop_config(serialize=True)
-    for _ in range(1):
-        svd(F, stress)
-        yield_rule(stress, change, body)
-        rebuild(F, stress, change)
+    for p in range(F.shape[0]):
+        elastic, tau = return_mapping(F[p], body)
+        F[p] = elastic
+        stress[p] = tau

@@ -234,7 +234,7 @@ def _wait_for_steps(path: Path, process: subprocess.Popen[str]) -> None:
 def made_up(distance: list[float]) -> Trial:
     """A trial with these distances [mm] from the goal."""
     metres = [value * 1e-3 for value in distance]
-    seen = [0.1 * k for k in range(len(distance))]
+    seen = [0.5 * k for k in range(len(distance))]
     return Trial(
         list(range(len(distance))), [-d for d in distance], metres, seen, 7e-3, [], 1e-4, (0.02, 0.02, 0.004), 1e-3
     )

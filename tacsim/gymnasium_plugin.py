@@ -1,0 +1,51 @@
+"""Makes ``gymnasium.make("tacsim/Squeeze-v0")`` work without an import of tacsim.
+
+Gymnasium 1.0 dropped the entry points by which installed packages offered environments. In their place the distribution
+carries ``tacsim_gymnasium.pth``: Python runs its one line at start, which waits for the first ``import gymnasium`` and
+registers our environments then. Nothing heavy is loaded before. See docs/decisions/0006.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
+from typing import Any
+
+
+def install() -> None:
+    """Registers when Gymnasium is imported; at once, if it already is."""
+    if "gymnasium" in sys.modules:
+        _register()
+    else:
+        sys.meta_path.insert(0, _AfterGymnasium())
+
+
+def _register() -> None:
+    try:
+        from tacsim.env import register_envs
+
+        register_envs()
+    except Exception as error:  # a broken tacsim must not take Gymnasium down with it
+        warnings.warn(f"tacsim: environments are not registered: {error!r}", stacklevel=2)
+
+
+class _AfterGymnasium:
+    """A finder that steps aside once it has seen Gymnasium, and lets the module run our registration after its own body."""
+
+    def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name != "gymnasium":
+            return None
+        sys.meta_path.remove(self)
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is None or spec.loader is None:
+            return spec
+        run = spec.loader.exec_module
+
+        def run_and_register(module: ModuleType) -> None:
+            run(module)
+            _register()
+
+        spec.loader.exec_module = run_and_register  # type: ignore[method-assign]
+        return spec

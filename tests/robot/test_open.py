@@ -1,0 +1,154 @@
+"""Rigs from files: what is opened, what is refused, and that Gymnasium finds the environments."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.open import CannotOpen, open_rig
+from tacsim.config import ConfigError, load_rig
+from tacsim.interface import Action, Needs
+from tacsim.record.episode import EpisodeError
+
+SMALL = ("scene.body.geometry.size=[4 mm, 4 mm, 4 mm]", "scene.gel.size=[8 mm, 8 mm, 2 mm]")
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "rig.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_sim_ends_its_reset_in_gentle_contact() -> None:
+    with open_rig("sim", overrides=SMALL) as rig:
+        observation = rig.reset()
+        forces = [-arm.wrench[2] for arm in observation.arms.values()]
+        assert all(0.05 <= force <= 0.06 * 1.01 for force in forces)
+        rig.require(
+            Needs(frozenset({"lower", "upper"}), frozenset({"lower", "upper"}), height=True, truth=True), "test"
+        )
+        assert rig.references["upper"].surface is not None
+        assert float(np.abs(rig.references["upper"].surface.height).max()) < 1e-6  # taken clear of the body
+
+
+def test_a_real_world_resets_to_the_same_bits() -> None:
+    with open_rig("sim", overrides=SMALL) as rig:
+        runs = []
+        for _ in range(2):
+            observation = rig.reset()
+            up = observation.arms["upper"].pose
+            target = type(up)(up.position - [0, 0, 1e-4], up.quaternion)
+            observation, _ = rig.step(Action({"upper": target}))
+            runs.append(observation)
+        for name in ("lower", "upper"):
+            assert np.array_equal(runs[0].tactile[name].image, runs[1].tactile[name].image)
+            assert np.array_equal(runs[0].arms[name].wrench, runs[1].arms[name].wrench)
+
+
+def test_a_rigid_press_is_a_rig_too(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        "name: bench\nclock: sim\nscene: {extends: press, gel: {size: [8 mm, 8 mm, 2 mm], material: silicone}}\n"
+        "arms: {plate: {driver: sim}, indenter: {driver: sim}}\nsensors: {lower: {driver: sim, arm: plate}}\n",
+    )
+    with open_rig(path) as rig:
+        observation = rig.reset()
+        assert rig.truth() is None
+        assert not rig.spec.truth
+        ball = observation.arms["indenter"].pose
+        down = type(ball)([0.0, 0.0, 4e-3 - 0.3e-3], ball.quaternion)  # ball of 4 mm, 0.3 mm deep
+        for _ in range(3):
+            observation, _ = rig.step(Action({"indenter": down}))
+        assert observation.tactile["lower"].height is not None
+        assert float(observation.tactile["lower"].height.max()) == pytest.approx(0.3e-3, rel=0.15)
+        plate, ball_wrench = observation.arms["plate"].wrench, observation.arms["indenter"].wrench
+        assert plate[2] < -0.01
+        assert ball_wrench[:3] == pytest.approx(-plate[:3], abs=1e-9)  # both frames are upright
+
+
+def test_replay_says_how_to_name_a_recording() -> None:
+    with pytest.raises(EpisodeError, match=r"sensors\.finger\.source: no recording given; name one with --set"):
+        open_rig("replay")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "name: r\nclock: replay\nscene: squeeze\narms: {lower: {driver: sim}}\n"
+            "sensors: {lower: {driver: sim, arm: lower}}\n",
+            "arms.lower has driver 'sim', which cannot go by clock 'replay'",
+        ),
+        (
+            "name: r\nclock: sim\nscene: squeeze\narms: {left: {driver: sim}}\n"
+            "sensors: {left: {driver: sim, arm: left}}\n",
+            "scene 'squeeze' has no sensor 'left'; it has lower, upper",
+        ),
+        (
+            "name: r\nclock: sim\nscene: squeeze\narms: {lower: {driver: sim}, spare: {driver: sim}}\n"
+            "sensors: {lower: {driver: sim, arm: lower}}\n",
+            "arms.spare carries no sensor",
+        ),
+        (
+            "name: r\nclock: sim\nscene: squeeze\narms: {one: {driver: sim}}\n"
+            "sensors: {lower: {driver: sim, arm: one}, upper: {driver: sim, arm: one}}\n",
+            "arms.one carries several sensors",
+        ),
+    ],
+)
+def test_parts_that_make_no_rig_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(CannotOpen, match=message):
+        open_rig(write(tmp_path, text))
+
+
+def test_recordings_of_two_rates_are_refused(tmp_path: Path) -> None:
+    import cv2
+
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), np.full((20, 20, 3), 100, np.uint8))
+    text = "name: r\nclock: replay\nsensors:\n"
+    text += "".join(
+        f"  {n}: {{driver: replay, source: '{tmp_path / n}', fps: {f}}}\n" for n, f in (("a", 30), ("b", 60))
+    )
+    with pytest.raises(CannotOpen, match=r"sensors\.b has one every 0\.01667 s and sensors\.a every 0\.03333 s"):
+        open_rig(write(tmp_path, text))
+
+
+def test_a_wrong_file_is_a_config_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        open_rig(write(tmp_path, "name: r\nclock: sun\nsensors: {}\n"))
+
+
+def test_facts_that_are_loaded_take_no_more_overrides() -> None:
+    with pytest.raises(TypeError, match="loaded already"):
+        open_rig(load_rig("sim"), overrides=["period=1 s"])
+
+
+def test_gymnasium_finds_the_environments_without_an_import() -> None:
+    """In a fresh process, with a small scene; the module in the id registers it, as Gymnasium 1 has it."""
+    program = (
+        "import gymnasium, sys\n"
+        f"env = gymnasium.make('tacsim.env:tacsim/Squeeze-v0', overrides={SMALL!r})\n"
+        "flat, info = env.reset(seed=1)\n"
+        "flat, reward, *_ = env.step(env.action_space.sample())\n"
+        "assert flat in env.observation_space and reward < 0 and 'tactile_upper' in flat\n"
+        "env.close()\n"
+        "assert 'tacsim/Reposition-v0' in gymnasium.registry\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stderr
+
+
+def test_importing_the_top_floor_loads_nothing_heavy() -> None:
+    heavy = ("taichi", "cv2", "rtde_control")
+    program = (
+        "import sys, robot.open, robot.deploy, robot.policy, tacsim.env, tacsim.sensor\n"
+        f"print([name for name in {heavy!r} if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr

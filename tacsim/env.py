@@ -1,8 +1,7 @@
 """Gymnasium environments: Env = Rig + Task.
 
-Gymnasium 1 has no plug-ins any more; an id names the module that registers it. So
-``gymnasium.make("tacsim.env:tacsim/Squeeze-v0")`` needs no import of tacsim, and after ``import tacsim.env`` plain
-``gymnasium.make("tacsim/Squeeze-v0")`` does.
+Where tacsim is installed, ``gymnasium.make("tacsim/Squeeze-v0")`` finds them without an import (see
+tacsim.gymnasium_plugin); from sources, ``gymnasium.make("tacsim.env:tacsim/Squeeze-v0")`` does.
 """
 
 from __future__ import annotations
@@ -15,20 +14,11 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from tacsim import encode
+from tacsim.gymnasium_plugin import register_envs
 from tacsim.interface import Needs, Observation, Pose, Truth
 from tacsim.physics.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.tasks.task import Task, judge
-
-ENTRY_POINT = "robot.open:make_env"  # named, not imported: tacsim stays below robot
-ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposition"}
-
-
-def register_envs() -> None:
-    """Registers the environments with Gymnasium, once a process."""
-    for name, task in ENVIRONMENTS.items():
-        if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=ENTRY_POINT, kwargs={"task": task})
 
 
 class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):

@@ -9,13 +9,30 @@ from __future__ import annotations
 
 import sys
 import warnings
-from importlib.machinery import ModuleSpec, PathFinder
-from types import ModuleType
-from typing import Any
+from importlib.machinery import PathFinder
+
+TYPE_CHECKING = False  # typing itself would cost milliseconds at every start of Python
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+
+
+ENTRY_POINT = "robot.open:make_env"  # named, not imported: tacsim stays below robot
+ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposition"}
+
+
+def register_envs() -> None:
+    """Registers the environments with Gymnasium, once a process."""
+    import gymnasium
+
+    for name, task in ENVIRONMENTS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(name, entry_point=ENTRY_POINT, kwargs={"task": task})
 
 
 def install() -> None:
-    """Registers when Gymnasium is imported; at once, if it already is."""
+    """Registers our environments when Gymnasium is imported; at once, if it already is."""
     if "gymnasium" in sys.modules:
         _register()
     else:
@@ -24,17 +41,17 @@ def install() -> None:
 
 def _register() -> None:
     try:
-        from tacsim.env import register_envs
-
         register_envs()
     except Exception as error:  # a broken tacsim must not take Gymnasium down with it
         warnings.warn(f"tacsim: environments are not registered: {error!r}", stacklevel=2)
 
 
 class _AfterGymnasium:
-    """A finder that steps aside once it has seen Gymnasium, and lets the module run our registration after its own body."""
+    """A finder that steps aside once it has seen Gymnasium, and runs our registration after the module's own body."""
 
-    def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         if name != "gymnasium":
             return None
         sys.meta_path.remove(self)

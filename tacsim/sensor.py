@@ -237,11 +237,12 @@ class SimStart:
 def approach(world: World, touch_force: float) -> MoveStats | None:
     """Moves all sensors along their own z towards the body until the least normal force reaches `touch_force` [N].
 
-    A fast part closes the gaps that are known; then come small steps. A step that presses harder than
+    A fast part closes the gaps that are known; then come small steps. A motion that presses harder than
     touch_force * (1 + TOUCH_TOLERANCE) is taken back, state and all, so that the body keeps no trace of it, and bounds
     the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
     """
-    stats = _close_gaps(world)
+    most = touch_force * (1 + TOUCH_TOLERANCE)
+    stats = _close_gaps(world, most)
     way, too_far = 0.0, math.inf  # how far the sensors have come, and what would be too far [m]
     felt = [(way, _least_force(world))]  # (way, force) of every state tried
     step = 0.0
@@ -254,7 +255,7 @@ def approach(world: World, touch_force: float) -> MoveStats | None:
         before = world.snapshot()
         stats = _advance(world, dict.fromkeys(world.sensors, step))
         felt.append((way + step, _least_force(world)))
-        if felt[-1][1] > touch_force * (1 + TOUCH_TOLERANCE):
+        if felt[-1][1] > most:
             world.restore(before)
             too_far = way + step
         else:
@@ -282,14 +283,24 @@ def _aim(felt: list[tuple[float, float]], way: float, too_far: float, wanted: fl
     return min(max(aim, way + margin), farthest if too_far > farthest else farthest - margin)
 
 
-def _close_gaps(world: World) -> MoveStats | None:
-    """Drives each sensor to CLEARANCE before the body's nearest particle, where a body is known and there is a gap."""
+def _close_gaps(world: World, most: float) -> MoveStats | None:
+    """Drives each sensor to CLEARANCE before the body's nearest particle, where a body is known and there is a gap.
+
+    Taken back if it presses harder than `most` [N]: on a shared grid, contact begins at a distance.
+    """
     truth = world.truth()
     if truth is None:
         return None
     gaps = {name: _gap(truth, world.pose(name)) - CLEARANCE for name in world.sensors}
     wanted = {name: gap for name, gap in gaps.items() if gap > 0}
-    return _advance(world, wanted) if wanted else None
+    if not wanted:
+        return None
+    before = world.snapshot()
+    stats = _advance(world, wanted)
+    if _least_force(world) > most:
+        world.restore(before)
+        return None
+    return stats
 
 
 def _gap(truth: Truth, sensor: Pose) -> float:

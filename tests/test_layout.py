@@ -172,4 +172,8 @@ def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
     assert {f"tacsim/_configs/{config}" for config in configs} <= carried
     assert {name(path) for path in MODULES} <= carried
     assert {f"{package}/py.typed" for package in PACKAGES} <= carried
-    assert {top(entry.partition("/")[0]) for entry in carried} == {*PACKAGES, "tacsim-0"}  # and tacsim-0.1.0.dist-info
+    assert {top(entry.partition("/")[0]) for entry in carried} == {
+        *PACKAGES,
+        "tacsim-0",  # tacsim-0.1.0.dist-info
+        "tacsim_gymnasium",  # the .pth of tacsim/gymnasium_plugin.py
+    }

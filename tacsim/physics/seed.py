@@ -31,7 +31,7 @@ REACH = 1.5  # [cells] gap at which contact through the grid begins
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
 BODY_DAMPING = 0.2  # rate against the driven motion [c / mm]
 SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
-STRETCH = (0.72, 1.2)  # vertical spacing of the grid / dx that is kept before the number of layers changes
+FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
 MARGIN = 3  # [cells] of grid round the particles
 TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
 ELASTIC = 1e30  # elastic limit of a body that does not yield
@@ -68,7 +68,8 @@ def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
 
     mu, lam = (modulus * MPA for modulus in lame(material))
     limit = min(material.elastic_limit, ELASTIC) if isinstance(material, BodyMaterial) else ELASTIC
-    return Solid(mass=(lam + 2 * mu) * volume, volume=volume, mu=mu, lam=lam, limit=limit)
+    mass = (lam + 2 * mu) * volume
+    return Solid(mass=mass, volume=volume, mu=mu, lam=lam, limit=limit)  # type: ignore[call-arg]  # a Taichi dataclass
 
 
 class SeedWorld:
@@ -111,8 +112,9 @@ class SeedWorld:
         self._motion = np.array([0, 0, 0, body[:, 2].min(), body[:, 2].max()], np.float32)  # see kernels
         self._momentum, self._gain = np.zeros((2, 3), np.float32), np.zeros((2, 3), np.float32)
         self._backing = np.zeros((2, 6), np.float32)
-        room = self._poses["upper"].position[2] + 2 * self.scene.gel.size[2]
-        self._layers = np.array([round(room * MM / self._dx)], np.int32)  # layers of the grid between the backings
+        room = (self._poses["upper"].position[2] + 2 * self.scene.gel.size[2]) * MM / self._dx
+        # cells of the grid between the backings; and their height / dx, the least since they last were renewed
+        self._layers = np.array([round(room), room / round(room)], np.float32)
         self._grid = np.zeros((1, 1, 1, 4), np.float32)
         as_float32([a for a in self._arrays().values() if a.dtype != np.int32 and a is not self._x])
 
@@ -160,8 +162,8 @@ class SeedWorld:
     def _in_sensor(self, name: str) -> NDArray[np.float64]:
         """Particles of a gel in its sensor's frame [mm]."""
         first, pose = self.sensors.index(name) * self._gels, self._poses[name]
-        x = self._x[first : first + self._gels] - pose.position * MM
-        return np.asarray(_rotation(pose).inv().apply(x))
+        x: NDArray[np.float64] = self._x[first : first + self._gels] - pose.position * MM
+        return x @ _rotation(pose).as_matrix()
 
     def truth(self) -> Truth:
         """Of the body's particles in play; those set aside are left out."""
@@ -171,12 +173,13 @@ class SeedWorld:
 
     def _body_points(self) -> NDArray[np.float64]:
         body = slice(2 * self._gels, None)
-        return self._x[body][self._aside[body] == 0]
+        points: NDArray[np.float64] = self._x[body][self._aside[body] == 0]
+        return points
 
     # ----------------------------------------------------------------- motion
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
-        """See World. Raises ValueError for a tilted target, or one that leaves the gels less than half their thickness."""
+        """See World. Raises ValueError for a tilted target, or one that would crush the gels."""
         self._check_finite()
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
         self._check_room(end)
@@ -219,8 +222,8 @@ class SeedWorld:
         room = float(poses["upper"].position[2] - poses["lower"].position[2])
         if room < -thickness:
             raise ValueError(
-                f"the gels' rest surfaces would overlap by {-room * MM:.3g} mm, which leaves each gel less than half of "
-                f"its {thickness * MM:.3g} mm; keep the upper sensor at least {-thickness * MM:.3g} mm above the lower"
+                f"the gels' rest surfaces would overlap by {-room * MM:.3g} mm, which leaves each gel less than half "
+                f"of its {thickness * MM:.3g} mm; keep the upper at least {-thickness * MM:.3g} mm above the lower"
             )
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
@@ -237,13 +240,15 @@ class SeedWorld:
         attempt(self._arrays(), launch, lambda: where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
+        if not len(self._body_points()):
+            raise SimulationDiverged("every particle of the body left the grid", where, "move slower, or less far")
         return Reading(backing + self._gain, backing, self._overlap(path, last), left, self._floor)
 
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance
 
         thickness = self.scene.gel.size[2] * MM
-        step = Step(
+        step = Step(  # type: ignore[call-arg]  # a Taichi dataclass
             dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
             gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING, gels=self._gels,
         )  # fmt: skip
@@ -253,18 +258,10 @@ class SeedWorld:
         )  # fmt: skip
 
     def _fit_grid(self, path: Path, first: int, last: int) -> tuple[float, float]:
-        """Makes the grid cover the particles and what they can reach; returns x, y of node (0, 0), multiples of the cell.
-
-        Between the backings the number of layers is kept as long as their spacing stays within STRETCH: a change of it
-        shifts nodes against the contact surfaces, which shows as a small jump of force.
-        """
+        """Makes the grid cover what the particles can reach; returns x, y of node (0, 0), whole multiples of dx."""
         from tacsim.physics.seed_kernels import PAD
 
-        faces = path.drive(first, last)[:, :, 3, 2]
-        room = (faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM) / self._dx
-        layers = int(self._layers[0])
-        if room.min() < STRETCH[0] * layers or room.max() > STRETCH[1] * layers:
-            self._layers[0] = layers = max(round(float(room.mean())), 1)
+        layers = self._fit_layers(path.drive(first, last)[:, :, 3, 2])
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
         low, high = gels.min(axis=0), gels.max(axis=0)
         side = SIDE * float((high - low).max())
@@ -279,8 +276,24 @@ class SeedWorld:
             self._grid = np.zeros((*shape, 4), np.float32)
         return float(corner[0] * self._dx), float(corner[1] * self._dx)
 
+    def _fit_layers(self, faces: Float32) -> int:
+        """Cells of the grid between the backings, for a launch with sensor origins at heights `faces` (n, 2) [mm].
+
+        While the sensors close in, the layers are kept and shrink (a change of number shifts nodes against the contact
+        surfaces: a small jump of force). While they part, layers are added: in a grid that stretches with the motion
+        the body would stick to the gels, with nearly the force of the squeeze.
+        """
+        room = (faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM) / self._dx
+        if room[-1] > room[0]:
+            self._layers[0] = max(self._layers[0], round(float(room[-1] / self._layers[1])))
+        elif room[-1] < room[0]:
+            if room[-1] < FINEST * self._layers[0]:
+                self._layers[:] = max(round(float(room[-1])), 1), 1.0
+            self._layers[1] = min(self._layers[1], room[-1] / self._layers[0])
+        return int(self._layers[0])
+
     def _overlap(self, path: Path, last: int) -> float:
-        """Deepest body particle below the nearest column of a gel, surfaces half a spacing outside the particles [mm]."""
+        """Deepest body particle below the nearest column of a gel; half a spacing lies outside the particles [mm]."""
         nx, ny, nz = self._lattice.count
         frames = path.drive(last - 1, last)[0].astype(np.float64)
         body = self._body_points()

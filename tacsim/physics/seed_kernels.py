@@ -229,7 +229,7 @@ def grid_to_particle(
     x: ti.template(), v: ti.template(), C: ti.template(), F: ti.template(), stress: ti.template(),
     aside: ti.template(), grid: ti.template(), origin, spacing, step, gel, body, health: ti.template(),
 ):  # fmt: skip
-    """Gathers velocity and its gradient, updates F <- (I + dt C) F, maps it back to the yield surface, takes the stress."""
+    """Gathers velocity and its gradient C, updates F <- (I + dt C) F, maps it back to the yield surface."""
     for p in range(x.shape[0]):
         if aside[p] == 0:
             X = ti.cast((x[p] - origin) / spacing, f32)
@@ -272,7 +272,7 @@ def grid_to_particle(
 
 @ti.func
 def body_reference(drive: ti.template(), n, z, motion: ti.template(), step):
-    """Velocity that the body would have at height z if it followed the sensors without inertia; damping acts against it.
+    """Velocity that the body would have at height z if it followed the sensors without inertia; damping pulls to it.
 
     `motion` = mean velocity (3), lowest and highest z of the body one substep ago. Between two touching gels: along z
     linear from one sensor to the other, laterally its own mean; on one gel: with that sensor; on none: at rest.

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.open import CannotOpen, open_rig
+from robot.open import RIG_ATTACHMENT, CannotOpen, open_rig
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Action, Needs
-from tacsim.record.episode import EpisodeError
+from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
+from tacsim.record.images import reference_attachments
+from tacsim.record.writer import Recorder
 
 SMALL = ("scene.body.geometry.size=[4 mm, 4 mm, 4 mm]", "scene.gel.size=[8 mm, 8 mm, 2 mm]")
 
@@ -68,6 +70,29 @@ def test_a_rigid_press_is_a_rig_too(tmp_path: Path) -> None:
         plate, ball_wrench = observation.arms["plate"].wrench, observation.arms["indenter"].wrench
         assert plate[2] < -0.01
         assert ball_wrench[:3] == pytest.approx(-plate[:3], abs=1e-9)  # both frames are upright
+
+
+def test_a_replayed_episode_is_observed_as_it_was_then(tmp_path: Path) -> None:
+    """The rig file inside the episode tells the replay how to normalise; nothing of it is said again."""
+    loaded, path = load_rig("sim", overrides=SMALL), tmp_path / "episode.mcap"
+    with open_rig(loaded) as rig:
+        first = rig.reset()
+        frames, references = rig.frames, reference_attachments(rig.references)
+        attachments = {RIG_ATTACHMENT: loaded.text.encode(), **references}
+        meta = EpisodeMeta("sim", None, "none", 0, rig.spec, {}, attachments)
+    with Recorder(path, meta) as recorder:
+        recorder.write(Step(0, first.time, frames, first.arms))
+    rig_file = write(
+        tmp_path,
+        f"name: r\nclock: replay\narms: {{upper: {{driver: replay, source: '{path}'}}}}\n"
+        f"sensors: {{upper: {{driver: replay, source: '{path}', arm: upper}}}}\n",
+    )
+    with open_rig(rig_file) as rig:
+        again = rig.reset()
+    then, now = first.tactile["upper"], again.tactile["upper"]
+    for name in ("image", "height", "gradient", "contact", "valid"):
+        assert np.array_equal(getattr(then, name), getattr(now, name)), name
+    assert np.array_equal(first.arms["upper"].wrench, again.arms["upper"].wrench)
 
 
 def test_replay_says_how_to_name_a_recording() -> None:
@@ -129,11 +154,13 @@ def test_facts_that_are_loaded_take_no_more_overrides() -> None:
         open_rig(load_rig("sim"), overrides=["period=1 s"])
 
 
-def test_gymnasium_finds_the_environments_without_an_import() -> None:
-    """In a fresh process, with a small scene; the module in the id registers it, as Gymnasium 1 has it."""
+@pytest.mark.parametrize("first", ["", "import tacsim.gymnasium_plugin as p; p.install()\n"])
+def test_gymnasium_finds_the_environments_without_an_import(first: str) -> None:
+    """In a fresh process, with a small scene: by the module in the id, and by what the installed .pth runs at start."""
+    module = "" if first else "tacsim.env:"
     program = (
-        "import gymnasium, sys\n"
-        f"env = gymnasium.make('tacsim.env:tacsim/Squeeze-v0', overrides={SMALL!r})\n"
+        f"{first}import gymnasium, sys\n"
+        f"env = gymnasium.make('{module}tacsim/Squeeze-v0', overrides={SMALL!r})\n"
         "flat, info = env.reset(seed=1)\n"
         "flat, reward, *_ = env.step(env.action_space.sample())\n"
         "assert flat in env.observation_space and reward < 0 and 'tactile_upper' in flat\n"
@@ -141,6 +168,15 @@ def test_gymnasium_finds_the_environments_without_an_import() -> None:
         "assert 'tacsim/Reposition-v0' in gymnasium.registry\n"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("module", ["tacsim.encode", "tacsim.env", "gymnasium"])
+def test_any_of_ours_may_import_gymnasium_first(module: str) -> None:
+    """Registration runs inside `import gymnasium`: it must not need a module of ours that is half imported."""
+    program = f"import tacsim.gymnasium_plugin as p; p.install()\nimport {module}, gymnasium\n"
+    program += "assert 'tacsim/Squeeze-v0' in gymnasium.registry\n"
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
 
 

@@ -11,7 +11,8 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from tacsim.env import ENVIRONMENTS, TacsimEnv, register_envs
+from tacsim.env import TacsimEnv
+from tacsim.gymnasium_plugin import ENVIRONMENTS, register_envs
 from tacsim.interface import IncompatibleRig
 from tacsim.limits import ActionError
 from tacsim.physics.health import SimulationDiverged
@@ -52,6 +53,10 @@ def test_actions_move_the_free_axes_by_max_step(open_springs: Any, task: str, mo
         expected = {"lower": [0, 0, 0], "upper": [0.2e-3, -0.1e-3, 0]}
     for name, want in expected.items():
         assert change[name] == pytest.approx(want, abs=1e-12)
+    env.step(np.array([1.0, -0.5], np.float32))  # goes on from where the arms were sent
+    twice = {name: env.rig.observe().arms[name].pose.position - before[name] for name in before}
+    for name, want in expected.items():
+        assert twice[name] == pytest.approx(2 * np.array(want), abs=1e-12)
     # the pose in the observation is relative to reset, in the sensor's own axes: the upper one is half-turned about x
     sign = np.array([1, -1, -1])
     assert flat["pose_upper"][:3] == pytest.approx(sign * expected["upper"], abs=1e-9)

@@ -6,6 +6,8 @@ import math
 from typing import Annotated
 
 import pytest
+
+# Subnormal numbers are left out: once Taichi runs in a process it flushes them to zero.
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, TypeAdapter, ValidationError
@@ -71,7 +73,10 @@ def test_an_ambiguous_unit_gets_no_suggestion() -> None:
     assert "did you mean" not in str(caught.value)
 
 
-@given(st.floats(allow_nan=False, allow_infinity=False), st.sampled_from([(k, u) for k in UNITS for u in UNITS[k]]))
+@given(
+    st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
+    st.sampled_from([(k, u) for k in UNITS for u in UNITS[k]]),
+)
 def test_every_number_with_every_unit(number: float, kind_and_unit: tuple[str, str]) -> None:
     kind, unit = kind_and_unit
     if math.isfinite(number * UNITS[kind][unit]):

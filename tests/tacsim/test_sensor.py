@@ -27,6 +27,19 @@ def test_approach_ends_in_gentle_contact_on_both_gels(spring_world: Any, touch_f
     assert len(spring_world.moves) < 60
 
 
+def test_contact_that_begins_at_a_distance_is_gentle_too(spring_world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a grid shared by gels and body: the fast part of the approach already presses, and is taken back."""
+
+    def reach(self: Any) -> float:
+        gap = self.poses["upper"].position[2] - self.poses["lower"].position[2]
+        return float(max(0.0, (10.6e-3 - gap) * 2e3))
+
+    monkeypatch.setattr(type(spring_world), "force", property(reach))
+    approach(spring_world, 0.05)
+    assert 0.05 <= spring_world.force <= 0.06
+    assert spring_world.worst <= 0.06
+
+
 def test_approach_moves_both_sensors_alike(spring_world: Any) -> None:
     before = {name: spring_world.pose(name).position[2] for name in spring_world.sensors}
     approach(spring_world, 0.05)

@@ -42,6 +42,16 @@ def test_squeeze_closes_alike_and_no_faster_than_half_of_max_step(open_springs: 
         assert 0 < up[2] <= 0.1e-3 + 1e-12
 
 
+def test_squeeze_shares_the_last_step_between_both_sensors(open_springs: Any) -> None:
+    observation = open_springs().reset()
+    facts = SqueezeFacts(kind="squeeze", goal=felt_height(observation) - 0.06e-3, max_step=0.2e-3)
+    action = make_task(facts).scripted()(observation)
+    for name, way in (("lower", 0.03e-3), ("upper", -0.03e-3)):
+        target = action.tool[name]
+        assert target is not None
+        assert target.position - observation.arms[name].pose.position == pytest.approx([0, 0, way], abs=1e-9)
+
+
 def test_through_passes_the_goal_at_the_goal(open_springs: Any) -> None:
     """The reward rises to a peak at the goal, then falls for good, at the full rate."""
     facts = SqueezeFacts(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
@@ -119,3 +129,26 @@ def test_grip_closes_until_the_contact_is_firm_then_holds(open_springs: Any) -> 
     for step in episode.steps[firm + 1 :]:
         assert step.action is not None
         assert set(step.action.tool.values()) == {None}
+
+
+def test_grip_holds_for_good_even_when_the_contact_fades(open_springs: Any) -> None:
+    rig = open_springs()
+    faint = rig.reset()
+    firm = replace(faint.tactile["lower"], image=np.full_like(faint.tactile["lower"].image, 200))
+    policy = Grip(rig.spec)
+    policy.reset()
+    assert policy(faint).tool["lower"] is not None
+    assert policy(Observation({"lower": firm, "upper": firm}, faint.arms, 0.1)).tool == {"lower": None, "upper": None}
+    assert policy(faint).tool == {"lower": None, "upper": None}
+    policy.reset()
+    assert policy(faint).tool["lower"] is not None
+
+
+def test_grip_addresses_a_sensor_without_arm_by_its_name(open_springs: Any) -> None:
+    rig = open_springs()
+    spec = replace(rig.spec, arms=(), sensors={"finger": replace(rig.spec.sensors["lower"], arm=None)})
+    alone = Observation({"finger": rig.reset().tactile["lower"]}, {}, 0.0)
+    target = Grip(spec)(alone).tool["finger"]
+    assert target is not None
+    assert target.position == pytest.approx([0, 0, 0.1e-3])
+    assert np.array_equal(target.quaternion, [0, 0, 0, 1])

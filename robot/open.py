@@ -173,7 +173,12 @@ def _open_replay(facts: RigFacts) -> Rig:
     """Recorded sensors and arms. The control period is that of the recording."""
     from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor
 
-    recorded = {name: sensor for name, sensor in facts.sensors.items() if isinstance(sensor, ReplaySensorFacts)}
+    there = {name: arm for name, arm in facts.arms.items() if isinstance(arm, ReplayArmFacts) and arm.source is not None}
+    recorded = {
+        name: sensor if sensor.arm in there else sensor.model_copy(update={"arm": None})
+        for name, sensor in facts.sensors.items()
+        if isinstance(sensor, ReplaySensorFacts)
+    }
     clock = ReplayClock(_common_period(facts.name, recorded))
     with ExitStack() as stack:
         sensors: dict[str, ReplaySensor] = {}
@@ -183,8 +188,7 @@ def _open_replay(facts: RigFacts) -> Rig:
             stack.callback(sensors[name].close)
             normalisers[name] = _replay_normaliser(sensor, name, sensors[name].spec.image_shape, facts.canonical)
         arms: dict[str, Arm] = {}
-        for name, arm in facts.arms.items():
-            assert isinstance(arm, ReplayArmFacts)
+        for name, arm in there.items():
             arms[name] = ReplayArm(arm, name, clock)
             stack.callback(arms[name].close)
         rig = Rig(

@@ -101,10 +101,10 @@ def _contact(world: World, scene: Scene, seen: SurfaceSample, sensor: SensorMode
     sensor_pose, indenter = world.pose("lower"), world.pose("indenter")
     at = se3.transform(se3.relative(indenter, sensor_pose), gel)
     near = (np.abs(at) <= extent(geometry) / 2 + BRIDGED * scene.element).all(axis=1) & seen.valid.ravel()
-    gap = np.full(len(at), np.inf)
+    gaps = np.full(len(at), np.inf)
     if near.any():
-        gap[near] = distance(geometry, at[near])
-    gap = gap.reshape(seen.valid.shape)
+        gaps[near] = distance(geometry, at[near])
+    gap = gaps.reshape(seen.valid.shape)
     reach = max(1, round(scene.element / sensor.geometry.pixel_pitch))
     joined = binary_closing(gap <= TOUCHING * scene.element, iterations=reach)
     enclosed: NDArray[np.bool_] = binary_fill_holes(joined)

@@ -21,15 +21,12 @@ from tacsim.rigfile import RigFacts
 from tacsim.tasks import Task, judge, make_task
 
 FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
-PEAK = 0.6  # share of a curve that lies before its peak: a trial goes on beyond the goal until this is so
+PEAK = 0.65  # share of a curve that lies before its peak: a trial goes on beyond the goal until this is so
 SEEN = 1.0  # mean difference from the image without contact that contact must make [grey levels]
-COMMON = (
-    "canonical.rows=80",  # heights from edge to edge of the gel, for the cut
-    "canonical.columns=80",
-    # Both schemes get the same time to settle after a motion. The seed's would take ten times longer in reposition.
-    "scene.settling.mach=0.1",
-    "scene.settling.max_substeps=60",
-)
+WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
+# The seed's scheme creeps: in reposition it takes some 1600 substeps after each motion until it counts as settled, ours
+# some 100. It gets a fixed time instead, faster than it settles; its body lags behind, the shape of its curve stays.
+SETTLING = {"seed": ("scene.settling.mach=0.15", "scene.settling.max_substeps=60"), "hybrid": ()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +41,16 @@ class Experiment:
 EXPERIMENTS = {
     "squeeze": Experiment(0.05e-3, ("task.max_step=0.4 mm",)),
     # Pressed well beyond a gentle touch: the cube is carried along, tips, and leaves a clear image.
-    "reposition": Experiment(0.1e-3, ("task.goal=[1 mm, 1 mm]", "task.max_step=0.5 mm", "task.touch_force=1.5 N")),
+    "reposition": Experiment(0.1e-3, ("task.goal=[1 mm, 1 mm]", "task.max_step=0.5 mm", "task.touch_force=1 N")),
 }
 
 
 class TrialFailed(RuntimeError):
     """A trial could not be run to its end."""
+
+
+class Stopped(RuntimeError):
+    """The trials were ended from outside."""
 
 
 def run_trials(
@@ -60,7 +61,7 @@ def run_trials(
     """Runs trials (task, physics), each in a process of its own kind, as many at once as there are processors.
 
     `on_step` is called after each control step of a trial; `stop` is asked all the time, and ends everything.
-    Raises TrialFailed with the cause, KeyboardInterrupt when stopped.
+    Raises TrialFailed with the cause, Stopped.
     """
     context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
     steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
@@ -71,7 +72,7 @@ def run_trials(
             if stop():
                 for worker in multiprocessing.active_children():
                     worker.terminate()
-                raise KeyboardInterrupt
+                raise Stopped("stopped before all trials were over")
             try:
                 on_step(*steps.get(timeout=0.1))
             except queue.Empty:
@@ -111,7 +112,8 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
     from robot.open import open_rig
 
     planned = EXPERIMENTS[task]
-    facts = load_rig("sim", task=task, overrides=[f"scene.physics={physics}", *planned.overrides, *COMMON]).facts
+    overrides = [f"scene.physics={physics}", *SETTLING[physics], *planned.overrides, *WHOLE_GEL]
+    facts = load_rig("sim", task=task, overrides=overrides).facts
     if facts.task is None:
         raise ValueError(f"rig 'sim' with task '{task}' has no task")
     goal = make_task(facts.task)

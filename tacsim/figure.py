@@ -14,6 +14,7 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.image import imsave
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from scipy.stats import pearsonr
 
 from tacsim.record.episode import Episode, Step
 
@@ -125,8 +126,9 @@ def signal_against_force(episode: Episode) -> dict[str, tuple[NDArray[np.float64
         both = [(f, s) for f, s in zip(forces, signal, strict=True) if f is not None and s is not None]
         values = np.array([pair for pair in both if np.isfinite(pair).all()], dtype=np.float64).reshape(-1, 2)
         varies = len(values) >= 3 and bool((np.ptp(values, axis=0) > 1e-12).all())
-        correlation = float(np.corrcoef(values.T)[0, 1]) if varies else None
-        pairs[name] = (values[:, 0], values[:, 1], correlation)
+        force, contact = values[:, 0], values[:, 1]
+        correlation = float(pearsonr(force, contact).statistic) if varies else None
+        pairs[name] = (force, contact, correlation)
     return {name: pair for name, pair in pairs.items() if len(pair[0])}
 
 
@@ -261,7 +263,7 @@ def _band(figure: Figure, top: float, tall: float) -> SubplotSpec:
 
 def _aspect(episode: Episode, name: str) -> float:
     image = next(step.frames[name].image for step in episode.steps if name in step.frames)
-    return image.shape[0] / image.shape[1]
+    return float(image.shape[0] / image.shape[1])
 
 
 def _draw_strip(figure: Figure, place: SubplotSpec, episode: Episode, name: str) -> None:

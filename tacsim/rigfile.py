@@ -26,7 +26,7 @@ class ReplayArmFacts(Facts):
     """Arm states of a recording: an episode (.mcap), or a CSV file with a row a frame."""
 
     driver: Literal["replay"]
-    source: str | None = None
+    source: str | None = None  # None: nothing was recorded of this arm, the rig is opened without it
     force_column: str = "force_N"  # normal force, positive when pressed [N]
     width_column: str | None = "gripper_width_m"  # opening of a parallel gripper [m]
 
@@ -77,7 +77,7 @@ class RepositionFacts(Facts):
     scene: Scene = Scene()
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
     max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
-    touch_force: Annotated[Force, Field(gt=0)] = 0.3
+    touch_force: Annotated[Force, Field(gt=0)] = 1.0  # firm: at less, the upper gel slides instead of taking the body along
     placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.1e-3
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3

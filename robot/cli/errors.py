@@ -50,7 +50,7 @@ def explain(error: Exception) -> tuple[str, int]:
         return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
     if isinstance(error, OSError):
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
-        return f"{where}{error.strerror or error or type(error).__name__}", FAILED
+        return f"{where}{error.strerror or str(error) or type(error).__name__}", FAILED
     if type(error).__module__.partition(".")[0] in OURS or _raised_by_us(error):
         return str(error) or type(error).__name__, FAILED
     return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", FAILED

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.output import (
     Out,
@@ -85,7 +86,7 @@ def press(
         pressed = presses.press(scene, sensor, motion)
     facts = presses.facts_of(scene, motion, pressed, sensor)
     presses.write(make(folder), pressed, facts)
-    results.print(f"force            {facts['force']:.4g} N")
+    results.print(f"force            {facts['force']:.4f} N")
     results.print(f"contact radius   {facts['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {facts['deepest'] * 1e3:.3f} mm")
     if not facts["settled"]:
@@ -143,7 +144,11 @@ def reproduce(
     notes.print("The first run compiles the kernels of each physics, up to a minute.")
     with Interrupt() as interrupt, progress() as bar:
         rows = {trial: bar.add_task(", ".join(trial), total=None) for trial in wanted}
-        found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)
+        try:
+            found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)
+        except experiment.Stopped:
+            complain("stopped by a signal; nothing is written")
+            raise typer.Exit(interrupt.exit_code) from None
     trials = {task: {scheme: found[task, scheme] for scheme in schemes} for task in experiment.EXPERIMENTS}
     make(folder)
     picture, table = folder / "fig4.png", folder / "fig4.json"

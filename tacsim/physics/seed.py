@@ -29,7 +29,8 @@ CELL = 2  # grid spacing / particle spacing: 8 particles a cell
 COURANT = 0.5  # dt / (grid spacing / wave speed); unstable from 1.0
 REACH = 1.5  # [cells] gap at which contact through the grid begins
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
-BODY_DAMPING = 0.2  # rate against the driven motion [c / mm]
+BODY_DAMPING = 0.2  # rate against the driven motion [c / mm], along z: near critical for the bounce between the gels
+SWAY_DAMPING = 0.03  # likewise across z, where the gels are softer
 SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
 FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
 MARGIN = 3  # [cells] of grid round the particles
@@ -250,7 +251,8 @@ class SeedWorld:
         thickness = self.scene.gel.size[2] * MM
         step = Step(  # type: ignore[call-arg]  # a Taichi dataclass
             dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
-            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING, gels=self._gels,
+            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING,
+            sway_damping=SWAY_DAMPING, gels=self._gels,
         )  # fmt: skip
         advance(
             self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive, self._motion,

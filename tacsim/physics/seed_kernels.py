@@ -49,7 +49,8 @@ class Step:
     thickness: f32  # of a gel
     reach: f32  # a gel and a body closer than this touch
     gel_damping: f32  # rate [1/mm]
-    body_damping: f32
+    body_damping: f32  # along z
+    sway_damping: f32  # of the body, along x and y
     cells: ti.i32  # node layers between the two backing planes
     gels: ti.i32  # particles of one gel
 
@@ -323,7 +324,9 @@ def advection(
             mean += v[p]
             count += 1
             lowest, highest = ti.min(lowest, at[2]), ti.max(highest, at[2])
-            v[p] = v[p] - step.body_damping * step.dt * (v[p] - body_reference(drive, n, at[2], motion, step))
+            excess = v[p] - body_reference(drive, n, at[2], motion, step)
+            rate = Vec3(step.sway_damping, step.sway_damping, step.body_damping)
+            v[p] = v[p] - step.dt * rate * excess
     if count > 0:
         for a in ti.static(range(3)):
             motion[a] = mean[a] / count

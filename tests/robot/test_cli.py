@@ -18,7 +18,7 @@ from typer.testing import CliRunner, Result
 
 from robot.cli import app
 from robot.cli.errors import explain
-from robot.reproduce import EXPERIMENTS, as_json, image_difference, shortcomings, telling
+from robot.reproduce import EXPERIMENTS, TrialFailed, as_json, image_difference, run_trials, shortcomings, telling
 from tacsim.config import ConfigError
 from tacsim.figure4 import Trial
 from tacsim.interface import IncompatibleRig, TactileFrame
@@ -200,10 +200,9 @@ def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch:
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
     words = ("run", "--steps", "100000", "--task", "reposition", "--out", "r", *TINY)
     process = subprocess.Popen(
-        [*START, *words], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*START, *words], env=_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
         _wait_for_steps(tmp_path / "r" / "episode.mcap", process)
@@ -219,6 +218,11 @@ def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.S
     assert (tmp_path / "r" / "report.html").exists()
     assert "report.html" in output
     assert "Traceback" not in errors
+
+
+def _environment() -> dict[str, str]:
+    """So that a process started elsewhere finds the packages."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
 
 
 def _wait_for_steps(path: Path, process: subprocess.Popen[str]) -> None:
@@ -261,6 +265,50 @@ def test_what_the_reproduction_tells() -> None:
     json.dumps(facts, allow_nan=False)
     dark, bright = (TactileFrame(np.full((2, 2, 3), value, np.uint8), 0.0, 0) for value in (250, 10))
     assert image_difference({"a": bright, "b": dark}, {"a": dark, "b": dark}) == 120.0  # no wrap-around of uint8
+
+
+def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
+    with pytest.raises(TrialFailed, match=r"squeeze by physics 'magic' failed: KeyError"):
+        run_trials([("squeeze", "magic")])
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for the processes in /proc")
+def test_a_signal_ends_the_reproduction_and_its_processes(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*START, "reproduce", "--out", "f"], env=_environment(), stderr=subprocess.PIPE, text=True
+    )
+    try:
+        children = _wait_for_children(process)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 143, errors
+    assert "Traceback" not in errors
+    assert not (tmp_path / "f").exists()
+    end = time.monotonic() + 10
+    while any(map(_lives, children)) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not list(filter(_lives, children))
+
+
+def _lives(number: int) -> bool:
+    """True while the process runs; an ended one may wait for its parent (state Z)."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def _wait_for_children(process: subprocess.Popen[str]) -> list[int]:
+    """Process ids of the workers, once there are some."""
+    end = time.monotonic() + 60
+    while time.monotonic() < end and process.poll() is None:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        if len(children) >= 2:
+            return [int(word) for word in children]
+        time.sleep(0.1)
+    pytest.fail("no processes were started")
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ REACH = 1.5  # [cells] gap at which contact through the grid begins
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
 BODY_DAMPING = 0.2  # rate against the driven motion [c / mm], along z: near critical for the bounce between the gels
 SWAY_DAMPING = 0.03  # likewise across z, where the gels are softer
+GENTLE = 60  # substeps of the shortest motion: a start in fewer is a blow, which leaves false plastic strain
 SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
 FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
 MARGIN = 3  # [cells] of grid round the particles
@@ -186,6 +187,8 @@ class SeedWorld:
         self._check_room(end)
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
         path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
+        if 0 < path.substeps < GENTLE:
+            path = Path(path.start, path.end, GENTLE, path.dt)
         before = self.snapshot()
         try:
             stats = move_and_settle(path, self.scene.settling, self._advance, balanced=True)

@@ -80,7 +80,7 @@ def driven_velocity(drive: ti.template(), n, sensor, at, dt):
 def vertical(drive: ti.template(), n, step):
     """Origin and spacing of the grid in z: both backing planes lie on node planes, so no gel can slip.
 
-    A backing plane that moves through the nodes of a fixed grid loses up to a cell of gel (docs/decisions).
+    A backing plane that moves through the nodes of a fixed grid lets its gel slip by up to a cell.
     """
     low = face(drive, n, 0, step.dt)[2] - step.thickness
     high = face(drive, n, 1, step.dt)[2] + step.thickness

@@ -173,7 +173,9 @@ def _open_replay(facts: RigFacts) -> Rig:
     """Recorded sensors and arms. The control period is that of the recording."""
     from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor
 
-    there = {name: arm for name, arm in facts.arms.items() if isinstance(arm, ReplayArmFacts) and arm.source is not None}
+    there = {
+        name: arm for name, arm in facts.arms.items() if isinstance(arm, ReplayArmFacts) and arm.source is not None
+    }
     recorded = {
         name: sensor if sensor.arm in there else sensor.model_copy(update={"arm": None})
         for name, sensor in facts.sensors.items()

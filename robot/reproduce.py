@@ -21,7 +21,7 @@ from tacsim.rigfile import RigFacts
 from tacsim.tasks import Task, judge, make_task
 
 FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
-PEAK = 0.65  # share of a curve that lies before its peak: a trial goes on beyond the goal until this is so
+PEAK = 0.7  # share of a curve that lies before its peak: a trial goes on beyond the goal until this is so
 FINE = 0.25  # share of a step that is taken near the goal, so that the peak is not stepped over
 SEEN = 1.0  # mean difference from the image without contact that contact must make [grey levels]
 WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
@@ -137,7 +137,9 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             on_step()
             if _is_over(distances, planned.best) or step == planned.steps:
                 break
-            longest = (FINE if _is_near(distances) else 1.0) * facts.task.max_step / 2  # the policy's own rate
+            longest = (
+                (FINE if _is_near(distances, planned.best) else 1.0) * facts.task.max_step / 2
+            )  # the policy's own rate
             observation, _ = rig.step(_shortened(policy(observation), observation, longest))
     return _trial(facts, goal, distances, differences, moments)
 
@@ -148,10 +150,10 @@ def _is_over(distances: list[float], best: float) -> bool:
     return peak <= PEAK * last and distances[-1] - distances[peak] > 1.2 * FALL * best
 
 
-def _is_near(distances: list[float]) -> bool:
-    """True where another whole step might jump over the goal."""
+def _is_near(distances: list[float], best: float) -> bool:
+    """True before the goal where another whole step might jump over it."""
     longest = float(np.abs(np.diff(distances)).max(initial=0.0))
-    return distances[-1] < 1.2 * longest
+    return min(distances) > best / 2 and distances[-1] < 1.2 * longest
 
 
 def _shortened(action: Action, observation: Observation, longest: float) -> Action:

@@ -77,7 +77,7 @@ class RepositionFacts(Facts):
     scene: Scene = Scene()
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
     max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
-    touch_force: Annotated[Force, Field(gt=0)] = 1.0  # firm: at less, the upper gel slides instead of taking the body along
+    touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
     placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.1e-3
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3

@@ -75,7 +75,7 @@ def test_release_takes_all_force_away_and_leaves_the_body_flat() -> None:
 
 
 def test_an_off_centre_body_shows_where_it_is_in_both_frames() -> None:
-    """Sensors moved by (-2, +1) mm: the body is at (+2, -1) in the lower, at (+2, +1) in the half-turned upper frame."""
+    """Sensors at (-2, +1) mm: the body is at (+2, -1) in the lower, at (+2, +1) in the half-turned upper frame."""
     w = world(settling={"tolerance": 2e-2})
     w.move({**shift(w, "lower", (-2e-3, 1e-3, 0)), **shift(w, "upper", (-2e-3, 1e-3, 0))})
     squeeze(w, 0.4e-3)

@@ -100,6 +100,16 @@ def test_replay_says_how_to_name_a_recording() -> None:
         open_rig("replay")
 
 
+def test_pictures_alone_are_a_rig_without_arms(tmp_path: Path) -> None:
+    from PIL import Image
+
+    for k in range(2):
+        Image.fromarray(np.full((48, 64, 3), 100 + 20 * k, np.uint8)).save(tmp_path / f"{k}.png")
+    with open_rig("replay", overrides=[f"sensors.finger.source={tmp_path}"]) as rig:
+        observation = rig.reset()
+        assert (rig.spec.arms, rig.spec.sensors["finger"].arm, dict(observation.arms)) == ((), None, {})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

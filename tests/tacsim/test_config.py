@@ -267,7 +267,10 @@ def test_what_yaml_1_1_would_guess_stays_a_text(text: str) -> None:
 
 
 plain = st.recursive(
-    st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**9), 10**9)
+    | st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
     | st.text(st.characters(exclude_categories=["Cs", "Cc"]) | st.sampled_from("0123456789eE.+-:#'\" ~"), max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.from_regex(r"\A[a-z]{1,4}\Z"), inner, max_size=3),
     max_leaves=8,

@@ -1,11 +1,11 @@
 """Contact: particles against the deformed gel surface and its housing; friction with memory.
 
-The gel surface is the C1 quadratic B-spline over its top nodes; the renderer draws the same surface. Penalty normal
-force; Coulomb friction by an elastic slip with memory (Cundall & Strack 1979): without memory, friction creeps and
+The gel surface is the C1 quadratic B-spline over its top nodes; the renderer draws the same surface. The normal force
+is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992); Coulomb friction by an elastic slip with memory (Cundall & Strack 1979): without memory, friction creeps and
 holds nothing at rest.
 """
 
-from tacsim.physics.material import vec3
+from tacsim.physics.material import vec3, vec4
 from tacsim.runtime import ti
 
 vec2 = ti.types.vector(2, ti.f32)
@@ -13,6 +13,7 @@ ivec2 = ti.types.vector(2, ti.i32)
 
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
+MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
 
 
 @ti.func
@@ -77,16 +78,19 @@ def contact_ceiling(u: ti.template(), h, radius):
 
 @ti.func
 def particle_contact(
-    g, x, v, slip, u: ti.template(), gv: ti.template(), gf: ti.template(), h, radius, k_n, mu, housing, dt,
+    g, x, v, memory, u: ti.template(), gv: ti.template(), gf: ti.template(), h, radius, k_n, mu, housing, dt,
     health: ti.template(),
 ):  # fmt: skip
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
-    x, v: position, and velocity relative to the moving sensor. Returns touching, force, new slip, overlap.
+    x, v: position, and velocity relative to the moving sensor. memory: elastic slip, and the multiplier as the overlap
+    whose penalty it equals [mm]. Returns touching, force, new memory, overlap.
     """
     nx, ny = float(u.shape[1] - 1), float(u.shape[2] - 1)
     touching = False
     force = vec3(0.0)
+    slip = vec3(memory[0], memory[1], memory[2])
+    taken = memory[3]
     overlap = 0.0
     reach = 2.2 * 0.5 * h
     thickness = h * (u.shape[3] - 1)
@@ -96,7 +100,7 @@ def particle_contact(
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
             depth = us[2] + radius - x[2]
-            if depth > 0.0:
+            if depth + taken > 0.0:
                 i, wx, dx = spline(a[0])
                 j, wy, dy = spline(a[1])
                 t1, t2, vs = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0)
@@ -106,13 +110,14 @@ def particle_contact(
                     t2 += (wx[p] * dy[q] / h) * u[node]
                     vs += (wx[p] * wy[q]) * gv[node]
                 n = t1.cross(t2).normalized()
-                gap = depth * n[2]
+                gap = depth * n[2]  # overlap; negative where they have parted
                 if gap > 4.0 * radius:  # an overlap found late must not explode; counted
                     gap = 4.0 * radius
                     health[4] += 1.0
                 vr = v - vs
                 vn = vr.dot(n)
-                fn = ti.max(k_n * gap - c_n * vn, 0.0)
+                fn = ti.max(k_n * (gap + taken) - c_n * vn, 0.0)
+                taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vr - vn * n, fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
                 touching = True
@@ -122,16 +127,18 @@ def particle_contact(
                     gf[node] = gf[node] - (wx[p] * wy[q]) * force
         elif housing >= 0.0:
             gap = radius - housing - x[2]
-            if gap > 0.0:
+            if gap + taken > 0.0:
                 if gap > 4.0 * radius:
                     gap = 4.0 * radius
                     health[4] += 1.0
                 n = vec3(0.0, 0.0, 1.0)
-                fn = ti.max(k_n * gap - c_n * v[2], 0.0)
+                fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)
+                taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vec3(v[0], v[1], 0.0), fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
                 touching = True
                 overlap = gap
-    if not touching:
-        slip = vec3(0.0)
-    return force, slip, overlap
+    kept = vec4(0.0)
+    if touching:
+        kept = vec4(slip[0], slip[1], slip[2], taken)
+    return touching, force, kept, overlap

@@ -36,7 +36,7 @@ CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 Array1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Array3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
 Array4 = ti.types.ndarray(dtype=ti.f32, ndim=4)
-SlipMemory = ti.types.ndarray(dtype=vec3, ndim=2)
+ContactMemory = ti.types.ndarray(dtype=vec4, ndim=2)
 
 
 @ti.func
@@ -83,7 +83,7 @@ def grid_update(grid: ti.template(), origin, cell, drive: ti.template(), it, dam
 
 @ti.func
 def touch(
-    g, rotate, it, drive: ti.template(), x: ti.template(), v: ti.template(), slip: ti.template(),
+    g, rotate, it, drive: ti.template(), x: ti.template(), v: ti.template(), memory: ti.template(),
     u: ti.template(), gv: ti.template(), gf: ti.template(), h, mass, radius, k_n, mu, housing, dt,
     health: ti.template(),
 ):  # fmt: skip
@@ -95,20 +95,20 @@ def touch(
     total, moment = vec3(0.0), vec3(0.0)
     for p in range(x.shape[0]):
         arm = x[p] - origin
-        memory = vec3(0.0)
+        kept = vec4(0.0)
         if outward.dot(arm) < highest:  # most of the body is far away: one dot product decides
             local = back @ arm
             relative = back @ (v[p] - velocity - spin.cross(arm))
-            force, kept, overlap = particle_contact(
-                g, local, relative, slip[g, p], u, gv, gf, h, radius, k_n, mu, housing, dt, health
+            touching, force, kept_now, overlap = particle_contact(
+                g, local, relative, memory[g, p], u, gv, gf, h, radius, k_n, mu, housing, dt, health
             )
-            memory = kept
-            if overlap > 0.0:
+            kept = kept_now
+            if touching:
                 v[p] = v[p] + (dt / mass) * (rotate @ force)
                 total -= force
                 moment -= local.cross(force)
                 health[5] = ti.max(health[5], overlap)
-        slip[g, p] = memory
+        memory[g, p] = kept
     return total, moment
 
 
@@ -116,7 +116,7 @@ def touch(
 def substeps(
     n: ti.i32, dt: ti.f32, drive: Array4,
     u: Nodes, gv: Nodes, gf: Nodes, h: ti.f32, gel_mu: ti.f32, gel_lam: ti.f32, gel_damping: ti.f32,
-    x: Vectors, v: Vectors, c: Matrices, e: Strains, slip: SlipMemory, mean: Array1,
+    x: Vectors, v: Vectors, c: Matrices, e: Strains, memory: ContactMemory, mean: Array1,
     grid: Grid, ox: ti.f32, oy: ti.f32, oz: ti.f32, spacing: ti.f32,
     mu: ti.f32, bulk: ti.f32, limit: ti.f32, body_damping: ti.f32, lightness: ti.f32,
     k_n: ti.f32, friction_lower: ti.f32, friction_upper: ti.f32, housing: ti.f32,
@@ -134,7 +134,24 @@ def substeps(
             rotate = rotation(drive, it, g)
             friction = friction_lower if g == 0 else friction_upper
             force, moment = touch(
-                g, rotate, it, drive, x, v, slip, u, gv, gf, h, mass, 0.5 * spacing, k_n, friction, housing, dt, health
+                g,
+                rotate,
+                it,
+                drive,
+                x,
+                v,
+                memory,
+                u,
+                gv,
+                gf,
+                h,
+                mass,
+                0.5 * spacing,
+                k_n,
+                friction,
+                housing,
+                dt,
+                health,
             )
             gel_forces(g, u, gf, h, gel_mu, gel_lam, health)
             held = rotate @ gel_advance(g, u, gv, gf, h, gel_lam + 2.0 * gel_mu, gel_damping, dt)
@@ -167,7 +184,7 @@ class HybridWorld:
         height = float(extent(scene.body.geometry)[2])
         points = (particles(scene.body.geometry, scene.spacing) + [0.0, 0.0, height / 2 + CLEARANCE]) * MM
         self._particles = body_state(points)
-        self._slip = np.zeros((2, len(points), 3), np.float32)  # elastic slip of the friction law, sensor frames
+        self._memory = np.zeros((2, len(points), 4), np.float32)  # of the contact law, sensor frames [mm]
         self._mean = np.zeros(3, np.float32)  # the body's mean velocity
         self._wrench = np.zeros((2, 2, 3), np.float32)
         self._backing = np.zeros((2, 3), np.float32)
@@ -193,7 +210,7 @@ class HybridWorld:
         b = self._particles
         return {
             "gel_displacement": self._gels.u, "gel_velocity": self._gels.v, "gel_force": self._gels.f,
-            "position": b.x, "velocity": b.v, "affine": b.c, "strain": b.e, "slip": self._slip,
+            "position": b.x, "velocity": b.v, "affine": b.c, "strain": b.e, "contact": self._memory,
             "mean_velocity": self._mean, "wrench": self._wrench, "backing": self._backing,
         }  # fmt: skip
 
@@ -263,7 +280,7 @@ class HybridWorld:
         substeps(
             len(drive), dt, drive,
             g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
-            b.x, b.v, b.c, b.e, self._slip, self._mean,
+            b.x, b.v, b.c, b.e, self._memory, self._mean,
             self._grid, *(float(o) for o in origin), body.spacing, body.mu, body.bulk, body.limit,
             BODY_DAMPING, self._lightness,
             self._stiffness, self.scene.friction["lower"], self.scene.friction["upper"],

@@ -1,8 +1,9 @@
 """Contact: particles against the deformed gel surface and its housing; friction with memory.
 
 The gel surface is the C1 quadratic B-spline over its top nodes; the renderer draws the same surface. The normal force
-is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992); Coulomb friction by an elastic slip with memory (Cundall & Strack 1979): without memory, friction creeps and
-holds nothing at rest.
+is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992), so that nothing overlaps at
+rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 1979): without it, friction creeps and
+holds nothing.
 """
 
 from tacsim.physics.material import vec3, vec4

@@ -34,7 +34,7 @@ def squeeze(w: HybridWorld, by: float) -> None:
 @pytest.fixture(scope="module")
 def squeezed() -> HybridWorld:
     w = world()
-    squeeze(w, 1.0e-3)
+    squeeze(w, 1.4e-3)
     return w
 
 
@@ -47,7 +47,7 @@ def test_forces_balance_and_point_into_the_gels(squeezed: HybridWorld) -> None:
 
 def test_the_body_yields_and_keeps_its_volume(squeezed: HybridWorld) -> None:
     truth = squeezed.truth()
-    assert 4.2e-3 < truth.height < 4.7e-3  # 1 mm less, minus what the gels give
+    assert 4.0e-3 < truth.height < 4.5e-3  # 1.4 mm less, minus what the gels give
     j = np.sqrt(np.linalg.det(full(squeezed.snapshot()["strain"]) + np.eye(3)))
     assert 0.97 < j.mean() < 1.0
     width = np.ptp(truth.points[:, 0]) + 0.5e-3
@@ -67,11 +67,11 @@ def test_squeezing_is_symmetric(squeezed: HybridWorld) -> None:
 
 def test_release_takes_all_force_away_and_leaves_the_body_flat() -> None:
     w = world()
-    squeeze(w, 1.0e-3)
+    squeeze(w, 1.4e-3)
     w.move({**shift(w, "lower", (0, 0, -1.5e-3)), **shift(w, "upper", (0, 0, 1.5e-3))})
     assert np.abs([w.wrench("lower"), w.wrench("upper")]).max() == 0
     assert np.abs(w.surface("upper").displacement).max() < 5e-6
-    assert w.truth().height < 4.9e-3  # plastic: it does not spring back
+    assert w.truth().height < 4.7e-3  # plastic: it does not spring back
 
 
 def test_an_off_centre_body_shows_where_it_is_in_both_frames() -> None:

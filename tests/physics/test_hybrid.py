@@ -71,7 +71,7 @@ def test_release_takes_all_force_away_and_leaves_the_body_flat() -> None:
     w.move({**shift(w, "lower", (0, 0, -1.5e-3)), **shift(w, "upper", (0, 0, 1.5e-3))})
     assert np.abs([w.wrench("lower"), w.wrench("upper")]).max() == 0
     assert np.abs(w.surface("upper").displacement).max() < 5e-6
-    assert w.truth().height < 4.7e-3  # plastic: it does not spring back
+    assert w.truth().height < 4.8e-3  # the elastic strain at yield (6 %) springs back, the rest is plastic
 
 
 def test_an_off_centre_body_shows_where_it_is_in_both_frames() -> None:

@@ -70,22 +70,28 @@ def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lev
 
 @dataclass(frozen=True)
 class Reading:
-    """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw."""
+    """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
+
+    moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
+    """
 
     contact: NDArray[np.float64]  # (gels, 3)
     backing: NDArray[np.float64]  # (gels, 3)
     overlap: float  # [mm]
     guard_hits: int
+    moment: NDArray[np.float64] | None = None  # (gels, 3)
     floor: float = FORCE_FLOOR  # [N] residuals are relative to at least this
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
-    """Largest force imbalance, or change since the last look, relative to the largest contact force [-].
+    """Largest force imbalance, or change of force or moment since the last look, relative to the largest force [-].
 
     `balanced`: the contact forces of all gels must add up to zero (a free body between them).
     """
     scale = max(float(np.abs(now.contact).max()), now.floor)
     parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
+    if now.moment is not None and before.moment is not None:  # a twist settles later than the forces
+        parts.append(np.abs(now.moment - before.moment).max())
     if balanced:
         parts.append(np.abs(now.contact.sum(axis=0)).max())
     return float(max(parts)) / scale

@@ -272,7 +272,8 @@ class HybridWorld:
         self._speed = health.fastest
         rotations = path.drive(last - 1, last)[0, :, :3]
         contact = np.einsum("gij,gj->gi", rotations, self._wrench[:, 0]).astype(np.float64)
-        return Reading(contact, self._backing.astype(np.float64), health.overlap, health.capped)
+        moment = self._wrench[:, 1].astype(np.float64) / max(self._gel.half)
+        return Reading(contact, self._backing.astype(np.float64), health.overlap, health.capped, moment)
 
     def _launch(self, drive: np.ndarray, dt: float, origin: np.ndarray, health: np.ndarray) -> None:
         g, b, gel, body = self._gels, self._particles, self._gel, self._body

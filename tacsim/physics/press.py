@@ -147,7 +147,11 @@ class PressWorld:
 
         health = attempt(self._arrays(), launch, lambda: f"substeps {first} to {last} of a motion of {path.substeps}")
         return Reading(
-            self._wrench[:, 0].astype(np.float64), self._backing.astype(np.float64), health.overlap, health.capped
+            self._wrench[:, 0].astype(np.float64),
+            self._backing.astype(np.float64),
+            health.overlap,
+            health.capped,
+            self._wrench[:, 1].astype(np.float64) / max(self._gel.half),
         )
 
 

@@ -246,7 +246,7 @@ class SeedWorld:
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
             raise SimulationDiverged("every particle of the body left the grid", where, "move slower, or less far")
-        return Reading(backing + self._gain, backing, self._overlap(path, last), left, self._floor)
+        return Reading(backing + self._gain, backing, self._overlap(path, last), left, floor=self._floor)
 
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance

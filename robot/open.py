@@ -46,7 +46,7 @@ def open_rig(rig: str | Path | LoadedRig | RigFacts, *, task: str | None = None,
         facts = rig.facts if isinstance(rig, LoadedRig) else rig
     else:
         facts = load_rig(rig, task=task, overrides=overrides).facts
-    _check_drivers(facts)
+    _check_parts(facts)
     return _open_sim(facts) if facts.clock == "sim" else _open_replay(facts)
 
 
@@ -71,8 +71,8 @@ def make_env(
         raise
 
 
-def _check_drivers(facts: RigFacts) -> None:
-    """All parts of a rig go by one clock."""
+def _check_parts(facts: RigFacts) -> None:
+    """All parts of a rig go by one clock, and every recorded sensor names its recording."""
     parts = {f"arms.{name}": arm.driver for name, arm in facts.arms.items()}
     parts |= {f"sensors.{name}": sensor.driver for name, sensor in facts.sensors.items()}
     for key, driver in parts.items():
@@ -81,6 +81,10 @@ def _check_drivers(facts: RigFacts) -> None:
                 f"rig '{facts.name}': {key} has driver '{driver}', which cannot go by clock '{facts.clock}'; "
                 f"give it driver '{facts.clock}', or change the clock"
             )
+    for name, sensor in facts.sensors.items():
+        if isinstance(sensor, ReplaySensorFacts) and sensor.source is None:
+            key = f"sensors.{name}.source"
+            raise CannotOpen(f"rig '{facts.name}': {key}: no recording given; name one with --set {key}=PATH")
 
 
 def _open_sim(facts: RigFacts) -> Rig:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,8 +50,8 @@ class Pressed:
     moves: tuple[MoveStats, ...]
 
 
-def press(scene: Scene, sensor: SensorModel, motion: Press, progress: Callable[[], None] = lambda: None) -> Pressed:
-    """Presses the scene's indenter, then slides and twists it. `progress` is called after each motion.
+def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
+    """Presses the scene's indenter, then slides and twists it.
 
     Raises ValueError for a scene without indenter or a depth that is not within the gel, SimulationDiverged.
     """
@@ -62,10 +61,8 @@ def press(scene: Scene, sensor: SensorModel, motion: Press, progress: Callable[[
     if not 0 < motion.depth < thickness:
         raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
     world = make_world(scene)
-    moves = []
-    for target in _targets(world.pose("indenter"), scene.indenter.geometry, motion):
-        moves.append(world.move({"indenter": target}))
-        progress()
+    targets = _targets(world.pose("indenter"), scene.indenter.geometry, motion)
+    moves = tuple(world.move({"indenter": target}) for target in targets)
     surface = world.surface("lower")
     seen = sample_surface(surface, image_grid(sensor.geometry))
     contact = _contact(world, scene, seen, sensor)
@@ -76,7 +73,7 @@ def press(scene: Scene, sensor: SensorModel, motion: Press, progress: Callable[[
         contact=contact,
         wrench=world.wrench("lower"),
         contact_radius=math.sqrt(area / math.pi),
-        moves=tuple(moves),
+        moves=moves,
     )
 
 

@@ -137,9 +137,8 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             on_step()
             if _is_over(distances, planned.best) or step == planned.steps:
                 break
-            longest = (
-                (FINE if _is_near(distances, planned.best) else 1.0) * facts.task.max_step / 2
-            )  # the policy's own rate
+            share = FINE if _is_near(distances, planned.best) else 1.0
+            longest = share * facts.task.max_step / 2  # half of max_step is the policy's own rate
             observation, _ = rig.step(_shortened(policy(observation), observation, longest))
     return _trial(facts, goal, distances, differences, moments)
 

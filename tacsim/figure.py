@@ -148,7 +148,8 @@ def _draw_reward(axes: Axes, episode: Episode) -> None:
     _series(axes, episode.steps, [step.reward for step in episode.steps], INK)
     axes.axhline(0.0, color=GOAL, linestyle="--", linewidth=1)
     axes.text(1.0, 0.0, "goal ", color=GOAL, fontsize=8, va="bottom", ha="right", transform=axes.get_yaxis_transform())
-    best, at = max((step.reward, step.index) for step in episode.steps if step.reward is not None)
+    judged = [(step.reward, step.index) for step in episode.steps if step.reward is not None]
+    best, at = max(judged, key=lambda pair: pair[0])  # of equal ones the first, as in the plot of distance
     axes.plot([at], [best], "o", color=GOAL, markersize=6)
     axes.margins(y=0.12)
 
@@ -169,7 +170,8 @@ def _draw_force(axes: Axes, episode: Episode) -> None:
     plain(axes, "force on each arm, |Fz|", "step", "N")
     for name, colour in _colours({name for step in episode.steps for name in step.arms}):
         _series(axes, episode.steps, [normal_force(step).get(name) for step in episode.steps], colour, name)
-    axes.set_ylim(bottom=0.0)
+    axes.margins(y=0.12)
+    axes.set_ylim(0.0, max(axes.get_ylim()[1], 1.12 * axes.dataLim.ymax))  # a nearly constant force is not cut off
     _legend(axes)
 
 

@@ -94,7 +94,7 @@ def _results(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     rewards = [value for value in facts["reward"] if value is not None]
     rows_of_force = zip(facts["step"], facts["force"], strict=True)
     forces = [(value, arm, k) for k, row in rows_of_force for arm, value in row.items() if value is not None]
-    peak = max(forces, default=None)
+    peak = max(forces, key=lambda row: row[0], default=None)  # of equal ones the first
     rows = [
         ("steps", f"{facts['steps']}" + ("" if facts["complete"] else " (recording incomplete)")),
         ("best distance", f"{best[0] * 1e3:.3f} mm at step {best[1]}" if best else "–"),

@@ -44,12 +44,10 @@ class ReplaySensorFacts(Facts):
     source: str | None = None
     arm: Name | None = None
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # of a folder of images
+    # Gel corners in the image (u, v) [px]: top left, top right, bottom right, bottom left; None: the whole image.
     corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
-    size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)
+    size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
     reference: str | None = None  # picture without contact; None: the first frame
-
-    # corners: gel corners in the image [px], top left, top right, bottom right, bottom left; None: the whole image.
-    # size: width and height of the gel between those corners [m].
 
 
 ArmFacts = Annotated[SimArmFacts | ReplayArmFacts, Field(discriminator="driver")]

@@ -29,9 +29,7 @@ class Guarded(TyperGroup):
             complain("interrupted")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
-            of_typer = isinstance(error, typer.Abort) or hasattr(
-                error, "exit_code"
-            )  # wrong usage, Exit: it handles them
+            of_typer = isinstance(error, typer.Abort) or hasattr(error, "exit_code")  # it handles its own
             if of_typer or ctx.meta["tacsim.debug"]:
                 raise
             message, code = explain(error)
@@ -41,9 +39,12 @@ class Guarded(TyperGroup):
 
 def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
+    from robot.open import CannotOpen
+    from robot.policy import PolicyNotFound
     from tacsim.config import ConfigError
+    from tacsim.interface import IncompatibleRig
 
-    if isinstance(error, ConfigError):
+    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig)):
         return str(error), UNUSABLE
     if isinstance(error, ExceptionGroup):
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]

@@ -8,7 +8,6 @@ import mimetypes
 import queue
 import threading
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, Self
 
 from google.protobuf.message import Message
@@ -127,9 +126,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def _run(self) -> None:

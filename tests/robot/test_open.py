@@ -12,7 +12,7 @@ import pytest
 from robot.open import RIG_ATTACHMENT, CannotOpen, open_rig
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Action, Needs
-from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
+from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_attachments
 from tacsim.record.writer import Recorder
 
@@ -96,7 +96,7 @@ def test_a_replayed_episode_is_observed_as_it_was_then(tmp_path: Path) -> None:
 
 
 def test_replay_says_how_to_name_a_recording() -> None:
-    with pytest.raises(EpisodeError, match=r"sensors\.finger\.source: no recording given; name one with --set"):
+    with pytest.raises(CannotOpen, match=r"sensors\.finger\.source: no recording given; name one with --set"):
         open_rig("replay")
 
 

@@ -179,6 +179,28 @@ def test_table_names_the_best_the_peak_and_what_was_lost() -> None:
         assert words in text
 
 
+def test_of_equal_steps_the_first_is_named() -> None:
+    """A policy that holds at the goal repeats its best step; the table and both plots name the same one."""
+    episode = made_up()
+    held = [replace(episode.steps[5], index=k) for k in (6, 7, 8)]
+    episode.steps[6:] = held
+    text = shown(episode)
+    assert "0.100 mm at step 5" in text
+    assert "2.50 N (upper, step 5)" in text or "2.50 N (lower, step 5)" in text
+    dots = [line for axes in figure.plots(episode).axes for line in axes.lines if line.get_marker() == "o"]
+    assert [list(line.get_xdata()) for line in dots] == [[5], [5]]  # of reward and of distance
+
+
+def test_a_nearly_constant_force_is_not_cut_off() -> None:
+    episode = made_up()
+    wrench = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+    arms = {"upper": ArmState(Pose(), np.zeros(6), wrench, None, 0.0)}
+    episode.steps[:] = [replace(step, arms=arms) for step in episode.steps]
+    (force,) = (axes for axes in figure.plots(episode).axes if axes.get_ylabel() == "N")
+    assert force.get_ylim()[0] == 0.0
+    assert force.get_ylim()[1] > 1.1
+
+
 def shown(episode: Episode) -> str:
     """The table at the end of a run as text."""
     console = Console(file=StringIO(), width=140)

@@ -26,8 +26,17 @@ class EpisodeFailed(RuntimeError):
         self.episode = episode
 
 
+class RecordingFailed(RuntimeError):
+    """Nothing can be recorded any more, e.g. because the disk is full."""
+
+
 class StepRecorder(Protocol):
     """What takes the steps of an episode: tacsim.record.writer.Recorder."""
+
+    @property
+    def error(self) -> Exception | None:
+        """What ended the recording early."""
+        ...
 
     def write(self, step: Step) -> bool: ...
 
@@ -62,7 +71,7 @@ def run_episode(
 
     Raises:
         IncompatibleRig: the rig lacks what policy or task needs; nothing has moved.
-        EpisodeFailed: policy or rig raised; the arms are stopped, the episode is kept in the exception.
+        EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the episode is kept in the exception.
     """
     if steps < 0:
         raise ValueError(f"steps must be 0 or more, got {steps}")
@@ -80,6 +89,8 @@ def run_episode(
         episode.steps.append(step)
         if sink is not None and not sink.write(step):
             episode.dropped += 1
+            if sink.error is not None:
+                raise RecordingFailed(f"the recording ended early: {sink.error}")
         if on_step is not None:
             on_step(step)
 
@@ -95,7 +106,7 @@ def run_episode(
         pass
     except KeyboardInterrupt:
         pass
-    except Exception as failure:
+    except (Exception, SystemExit) as failure:  # a policy may call sys.exit
         done = max(len(episode.steps) - 1, 0)
         why = f"{type(failure).__name__}: {failure}"
         raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", episode) from failure

@@ -109,6 +109,7 @@ TASK = make_task(SqueezeFacts(kind="squeeze", goal=7e-3))
 class Recorder:
     def __init__(self, meta: EpisodeMeta) -> None:
         self.meta, self.steps = meta, list[Step]()
+        self.error: Exception | None = None
 
     def write(self, step: Step) -> bool:
         self.steps.append(step)
@@ -135,6 +136,22 @@ def test_exactly_so_many_steps_after_the_reset() -> None:
     assert last.frames["lower"].image.max() == 4
     assert last.seconds > 0
     assert run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, 0).steps[-1].index == 0
+
+
+def test_a_recording_that_can_go_on_no_more_ends_the_episode_with_the_arms_stopped() -> None:
+    class FullDisk(Recorder):
+        def write(self, step: Step) -> bool:
+            if len(self.steps) == 2:
+                self.error = OSError(28, "No space left on device")
+                return False
+            self.steps.append(step)
+            return True
+
+    hand = Hand()
+    with pytest.raises(EpisodeFailed, match=r"after 2 of 40 steps: RecordingFailed: .* No space") as failed:
+        run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 40, recorder=FullDisk)
+    assert len(failed.value.episode.steps) == 3
+    assert hand.stops > 0
 
 
 def test_every_step_goes_to_the_recorder_with_meta_and_references() -> None:

@@ -67,7 +67,7 @@ def _attribute(name: str) -> object:
                 f"policy '{name}': module '{module_name}' itself imports '{failure.name}', which is missing"
             ) from failure
         raise PolicyNotFound(f"policy '{name}': no module '{failure.name}'; is its folder on PYTHONPATH?") from failure
-    except Exception as failure:
+    except (Exception, SystemExit) as failure:  # a script may end Python when it is imported
         raise PolicyNotFound(f"policy '{name}': importing '{module_name}' failed: {failure!r}") from failure
     for part in path.split("."):
         if not hasattr(found, part):
@@ -85,6 +85,10 @@ def _as_policy(found: object, name: str) -> Policy:
                 f"policy '{name}': the class cannot be made without arguments: {failure!r}"
             ) from failure
     if isinstance(found, Policy):
+        if not isinstance(found.needs, Needs):
+            raise PolicyNotFound(
+                f"policy '{name}': its needs must be a tacsim.interface.Needs, got {type(found.needs).__name__}"
+            )
         return found
     if callable(found):
         return FunctionPolicy(found)

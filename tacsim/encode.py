@@ -102,7 +102,10 @@ def action_from(
 
     Raises ActionError for a wrong shape, a component that is not finite, or one outside [-1, 1].
     """
-    values = np.asarray(vector, dtype=np.float64)
+    given = np.asarray(vector)
+    if given.dtype.kind not in "fiub":
+        raise ActionError(f"action must be an array of {len(axes)} real numbers, got {vector!r}")
+    values = given.astype(np.float64)
     if values.shape != (len(axes),):
         raise ActionError(f"action must have shape ({len(axes)},), one number for each free axis, got {values.shape}")
     # The margin admits 1.0 in any float precision.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -279,5 +280,7 @@ def _draw_strip(figure: Figure, place: SubplotSpec, episode: Episode, name: str)
 
 
 def save(figure: Figure, path: Path, metadata: Mapping[str, str] | None = None) -> None:
-    """Writes a figure as PNG."""
-    figure.savefig(path, format="png", metadata=dict(metadata or {}))
+    """Writes a figure as PNG. A character of a name that the font lacks is drawn as a box, without a warning."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        figure.savefig(path, format="png", metadata=dict(metadata or {}))

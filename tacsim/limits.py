@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tacsim import pose as se3
 from tacsim.interface import Action, Pose
+
+FARTHEST = 1e3  # a pose beyond is no target of anything that carries a sensor [m]
 
 
 class ActionError(ValueError):
@@ -22,12 +24,22 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
     """
     if not isinstance(action, Action):
         raise ActionError(f"rig '{rig}' takes a tacsim.interface.Action, got {type(action).__name__}")
+    if not isinstance(action.tool, Mapping):
+        raise ActionError(
+            "Action.tool must be a mapping from arm names to poses, such as {'upper': pose}, "
+            f"got {type(action.tool).__name__}"
+        )
     for name, target in action.tool.items():
         if name not in movable:
             names = ", ".join(sorted(movable)) or "(none)"
             raise ActionError(f"action for '{name}', but rig '{rig}' moves only: {names}")
         if target is not None and not isinstance(target, Pose):
             raise ActionError(f"action for '{name}' must be a tacsim.interface.Pose or None (holds), got {target!r}")
+        if target is not None and np.abs(target.position).max() > FARTHEST:
+            raise ActionError(
+                f"target of arm '{name}' is at {target.position.tolist()} m, more than {FARTHEST:g} m from the origin; "
+                "poses are in metres, in the world frame"
+            )
     return action
 
 

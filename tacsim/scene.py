@@ -12,17 +12,20 @@ from pydantic import Field, model_validator
 
 from tacsim.quantity import Angle, Facts, Length, Pressure
 
+Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
+Modulus = Annotated[Pressure, Field(ge=1.0, le=1e12)]  # from a foam of liquid to beyond diamond [Pa]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
 # particle spacing and gel element size [m] of each preset
 PRESETS = {"draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3)}
+MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
 class GelMaterial(Facts):
     """Elastic gel (neo-Hookean)."""
 
-    youngs_modulus: Annotated[Pressure, Field(gt=0)] = 0.145e6
+    youngs_modulus: Modulus = 0.145e6
     poisson_ratio: PoissonRatio = 0.48
     source: str = ""
 
@@ -33,7 +36,7 @@ class BodyMaterial(Facts):
     Give the yield as a stress or as the seed's strain k; with neither the body is elastic.
     """
 
-    youngs_modulus: Annotated[Pressure, Field(gt=0)] = 0.5e6
+    youngs_modulus: Modulus = 0.5e6
     poisson_ratio: PoissonRatio = 0.45
     yield_stress: Annotated[Pressure, Field(gt=0)] | None = None
     yield_norm: Literal["uniaxial", "frobenius"] = "uniaxial"
@@ -77,20 +80,20 @@ class Gel(Facts):
 
 class Box(Facts):
     shape: Literal["box"] = "box"
-    size: Size3 = (10e-3, 10e-3, 10e-3)  # [m]
+    size: tuple[Edge, Edge, Edge] = (10e-3, 10e-3, 10e-3)  # [m]
 
 
 class Sphere(Facts):
     shape: Literal["sphere"] = "sphere"
-    radius: Annotated[Length, Field(gt=0)] = 5e-3  # [m]
+    radius: Edge = 5e-3  # [m]
 
 
 class Cylinder(Facts):
     """Upright cylinder: axis along z."""
 
     shape: Literal["cylinder"] = "cylinder"
-    radius: Annotated[Length, Field(gt=0)] = 5e-3  # [m]
-    height: Annotated[Length, Field(gt=0)] = 10e-3  # [m]
+    radius: Edge = 5e-3  # [m]
+    height: Edge = 10e-3  # [m]
 
 
 class Mesh(Facts):
@@ -150,6 +153,24 @@ class Scene(Facts):
         missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
         if missing:
             raise ValueError(f"friction of the surface '{missing[0]}' is missing; give both lower and upper")
+        return self
+
+    @model_validator(mode="after")
+    def _resolvable(self) -> Self:
+        """Each gel gets at least two layers of elements, and no more cells than a machine has memory for."""
+        name, edge = ("particle_spacing", self.spacing) if self.physics == "seed" else ("element_size", self.element)
+        edge = min(edge, self.gel.size[2] / 2)  # a thin gel is resolved finer than its preset
+        cells = math.prod(side / edge for side in self.gel.size)
+        if cells > MAX_CELLS:
+            raise ValueError(
+                f"a gel of {' x '.join(f'{side:g}' for side in self.gel.size)} m has {cells:.3g} cells at "
+                f"{name} {edge:g} m, the limit is {MAX_CELLS:,}; choose a larger {name} or a smaller gel"
+            )
+        if self.element_size is not None and self.element_size > self.gel.size[2] / 2 * (1 + 1e-9):
+            raise ValueError(
+                f"element_size {self.element_size:g} m is too coarse for a gel {self.gel.size[2]:g} m thick: it needs "
+                f"two layers of elements; choose at most {self.gel.size[2] / 2:g} m"
+            )
         return self
 
     @property

@@ -89,6 +89,7 @@ class SimClock:
             "settled": float(stats.settled),
             "overlap": stats.overlap,
             "guard_hits": float(stats.guard_hits),
+            "retries": float(stats.retries),
             "shortened": float(sum(self._limited.values())),
         }
 

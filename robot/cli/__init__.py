@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from robot.cli.bench import bench
+from robot.cli.debug import debug
 from robot.cli.errors import Guarded
 from robot.cli.look import doctor, schema
 from robot.cli.run import replay, run
@@ -21,7 +23,7 @@ app = typer.Typer(
     epilog="Example: [bold]tacsim run --task squeeze --out runs/first[/]   "
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
 )
-for command in (run, press, reproduce, replay, schema, doctor):
+for command in (run, press, reproduce, replay, bench, debug, schema, doctor):
     # typer takes the first line of help from the docstring, and the example from the epilog
     text, _, example = (command.__doc__ or "").partition("Example:")
     app.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)

@@ -13,9 +13,11 @@ MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fai
 
 
 def schema(
-    kind: Annotated[str, typer.Argument(help="What the file describes, for example rig or scene.")] = "rig",
+    kind: Annotated[str, typer.Argument(help="What the file describes, for example rig or scene; or bench.")] = "rig",
 ) -> None:
     """Print the JSON schema of a configuration file; editors complete and check YAML with it.
+
+    `bench` is the schema of what `tacsim bench --json` writes.
 
     Example: tacsim schema rig > rig.schema.json
     """
@@ -23,8 +25,13 @@ def schema(
 
     from tacsim.config import KINDS, json_schema
 
+    if kind == "bench":
+        from robot.bench import schema as report
+
+        typer.echo(json.dumps(report.json_schema(), indent=2))
+        return
     if kind not in KINDS:
-        raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}", param_hint="KIND")
+        raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}, bench", param_hint="KIND")
     typer.echo(json.dumps(json_schema(kind), indent=2))
 
 

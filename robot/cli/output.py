@@ -42,6 +42,18 @@ def make(folder: Path) -> Path:
 
 
 @contextmanager
+def writing(folder: Path) -> Iterator[Path]:
+    """Makes an OSError name `folder` when it names no file: a disk that fills up in the middle of a write says
+    nothing of where."""
+    try:
+        yield folder
+    except OSError as failure:
+        if failure.filename is None:
+            failure.filename = str(folder)
+        raise
+
+
+@contextmanager
 def progress() -> Iterator[Progress]:
     """A progress bar on stderr; on no terminal it is silent."""
     columns = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results
+from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results, writing
 
 if TYPE_CHECKING:
     from robot.deploy import EpisodeFacts
@@ -55,7 +56,8 @@ def run(
     folder = new_directory(out, loaded.facts.name if own_task is None else own_task.kind)
     if steps is None:
         steps = NO_END if own_task is None else own_task.steps
-    name = policy or ("grip" if own_task is None else "scripted")
+    name = policy if policy is not None else ("grip" if own_task is None else "scripted")
+    sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     with Interrupt() as interrupt:
         failed = _run(loaded, name, steps, seed, folder, interrupt)
         if interrupt():
@@ -71,19 +73,20 @@ def _run(loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, in
         from robot.deploy import EpisodeFacts
         from robot.open import open_rig
         from robot.policy import load_policy
+        from tacsim.physics.dump import dumps_in
         from tacsim.tasks import make_task
     if not notes.is_terminal:
         notes.print(STARTING)
     task = None if loaded.facts.task is None else make_task(loaded.facts.task)
     facts = EpisodeFacts(policy, seed, {"rig.yaml": loaded.text.encode()})
-    with open_rig(loaded) as rig:
+    with dumps_in(folder / "diverged"), open_rig(loaded) as rig:
         acting = load_policy(policy, task, rig.spec)
         with Recording(folder, loaded.facts.canonical.pitch) as recording:
             episode, failure = _drive(rig, acting, task, steps, facts, recording, interrupt)
     for problem in (failure, recording.problem(len(episode.steps))):
         if problem:
             complain(problem)
-    if not recording.opened:
+    if not recording.opened or not episode.steps:
         return True
     episode.dropped = recording.dropped
     _report(episode, folder, [folder / "episode.mcap"])
@@ -129,8 +132,8 @@ class Recording:
         """Raises OSError."""
         from tacsim.record.writer import Recorder
 
-        make(self._folder)
-        self._recorder = self._stack.enter_context(Recorder(self._folder / "episode.mcap", meta, pitch=self._pitch))
+        with writing(make(self._folder)):
+            self._recorder = self._stack.enter_context(Recorder(self._folder / "episode.mcap", meta, pitch=self._pitch))
         return self._recorder
 
     @property
@@ -166,11 +169,14 @@ def replay(
     """
     folder = new_directory(out, "replay")
     with busy("reading"):
+        from tacsim.record.episode import EpisodeError
         from tacsim.record.reader import read_episode
 
         episode = read_episode(file)
     if not episode.complete:
         notes.print(f"The recording ended without its footer; {len(episode.steps)} steps could be read.")
+    if not episode.steps:
+        raise EpisodeError(f"{file}: no step can be read, there is nothing to show")
     make(folder)
     _report(episode, folder, [])
 
@@ -179,7 +185,7 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     """Writes the report and ends with the table."""
     from tacsim.report import end_table, summary, write_report
 
-    with busy("writing the report"):
+    with busy("writing the report"), writing(folder):
         paths = write_report(episode, folder)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
     results.print(end_table(summary(episode), listed))

@@ -22,6 +22,7 @@ from robot.cli.output import (
     quantity,
     results,
     say_files,
+    writing,
 )
 
 if TYPE_CHECKING:
@@ -85,7 +86,8 @@ def press(
         motion = presses.Press(depth, slide, twist)
         pressed = presses.press(scene, sensor, motion)
     facts = presses.facts_of(scene, motion, pressed, sensor)
-    presses.write(make(folder), pressed, facts)
+    with writing(make(folder)):
+        presses.write(folder, pressed, facts)
     results.print(f"force            {facts['force']:.4f} N")
     results.print(f"contact radius   {facts['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {facts['deepest'] * 1e3:.3f} mm")
@@ -138,11 +140,12 @@ def reproduce(
     with busy("loading"):
         from robot import reproduce as experiment
         from tacsim.figure4 import figure4
+        from tacsim.physics.dump import dumps_in
 
     # The longest first, so that no processor waits for it at the end.
     wanted = [(task, scheme) for scheme in schemes for task in ("reposition", "squeeze")]
     notes.print("The first run compiles the kernels of each physics, up to a minute.")
-    with Interrupt() as interrupt, progress() as bar:
+    with Interrupt() as interrupt, dumps_in(folder / "diverged"), progress() as bar:
         rows = {trial: bar.add_task(", ".join(trial), total=None) for trial in wanted}
         try:
             found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)

@@ -29,7 +29,7 @@ class SensorGeometry(Facts):
 
     width: Annotated[int, Field(ge=16, le=4096)] = 320
     height: Annotated[int, Field(ge=16, le=4096)] = 240
-    pixel_pitch: Annotated[Length, Field(gt=0)] = 0.0625e-3  # [m]
+    pixel_pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.0625e-3  # [m]
     centre: tuple[float, float] | None = None  # (u0, v0) [px]
 
     @property
@@ -108,5 +108,5 @@ class CanonicalGrid(Facts):
 
     rows: Annotated[int, Field(ge=8, le=1024)] = 64
     columns: Annotated[int, Field(ge=8, le=1024)] = 64
-    pitch: Annotated[Length, Field(gt=0)] = 0.25e-3  # [m]
+    pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.25e-3  # [m]
     image_scale: Annotated[int, Field(ge=1, le=8)] = 2  # image pixels per grid cell, each way

@@ -7,21 +7,22 @@ start and stop, not the speed; hence every motion starts and ends with zero velo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
+from tacsim.physics.health import Place
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Settling
 
 MM = 1e3
 PEAK = 1.875  # peak slope of the quintic ramp over its mean
 CHECK = 20  # substeps between two looks at the residual
-FORCE_FLOOR = 2e-3  # [N] residuals are relative to the contact force, but to no less than this by default
+FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
 def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -31,22 +32,31 @@ def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Path:
-    """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1]."""
+    """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
+
+    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal.
+    """
 
     start: Sequence[Pose]
     end: Sequence[Pose]
     substeps: int
     dt: float
+    refine: int = 1
 
-    def drive(self, first: int, last: int, refine: int = 1) -> NDArray[np.float32]:
-        """(n, frames, 6, 3) f32 for substeps first..last, each cut in `refine`.
+    @property
+    def step(self) -> float:
+        """A real substep [mm, wave speed 1]."""
+        return self.dt / self.refine
+
+    def drive(self, first: int, last: int) -> NDArray[np.float32]:
+        """(n, frames, 6, 3) f32 for substeps first..last, n = (last - first) refine.
 
         Rows: the rotation matrix, position [mm], velocity, angular velocity; all in world.
         """
-        knots = np.arange(first * refine, last * refine + 1) / (max(self.substeps, 1) * refine)
+        knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
         s = ramp(np.clip(knots, 0.0, 1.0))
         out = np.empty((len(s) - 1, len(self.start), 6, 3))
-        step = self.dt / refine
+        step = self.step
         for index, (a, b) in enumerate(zip(self.start, self.end, strict=True)):
             position = (a.position + s[:, None] * (b.position - a.position)) * MM
             turn_from = Rotation.from_quat(a.quaternion)
@@ -56,6 +66,20 @@ class Path:
             out[:, index, 4] = np.diff(position, axis=0) / step
             out[:, index, 5] = np.diff(s)[:, None] * vector / step
         return np.ascontiguousarray(out, np.float32)
+
+    def place(self, names: Iterable[str], first: int, last: int) -> Place:
+        """Where the frames called `names` are on substeps first..last."""
+        part = (
+            f"substeps {first} to {last} of {self.substeps} of the motion"
+            if self.substeps
+            else "the hold after the motion"
+        )
+        ends = self.drive(last - 1, last)[-1].astype(np.float64)
+        poses = {
+            name: Pose(end[3] / MM, Rotation.from_matrix(end[:3]).as_quat())
+            for name, end in zip(names, ends, strict=True)
+        }
+        return Place(f"in {part}", poses)
 
 
 def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float) -> Path:
@@ -68,6 +92,11 @@ def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lev
     return Path(start, end, substeps, dt)
 
 
+def force_floor(modulus: float, thickness: float) -> float:
+    """The smallest force [N] that residuals are relative to, of a gel with Young's modulus [MPa] and thickness [mm]."""
+    return FLOOR * modulus * thickness**2
+
+
 @dataclass(frozen=True)
 class Reading:
     """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
@@ -77,10 +106,10 @@ class Reading:
 
     contact: NDArray[np.float64]  # (gels, 3)
     backing: NDArray[np.float64]  # (gels, 3)
+    floor: float  # [N] residuals are relative to at least this
     overlap: float  # [mm]
     guard_hits: int
     moment: NDArray[np.float64] | None = None  # (gels, 3)
-    floor: float = FORCE_FLOOR  # [N] residuals are relative to at least this
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
@@ -106,7 +135,7 @@ def move_and_settle(
     for first in range(0, path.substeps, CHECK):
         reading = advance(path, first, min(first + CHECK, path.substeps))
         hits += reading.guard_hits
-    rest = Path(path.end, path.end, 0, path.dt)
+    rest = replace(path, start=path.end, substeps=0)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
         count = min(CHECK, settling.max_substeps - held)

@@ -1,25 +1,78 @@
-"""When a simulation leaves what is physical: what kernels watch, how a step is retried, and the error that says so."""
+"""When a simulation leaves what is physical: what is watched, how a motion is retried, and the error that says so.
+
+A launch that ends unphysical is not repeated by itself: an instability grows for many launches before it shows, so the
+state at the start of the bad launch is not to be trusted. The whole motion starts again, from the state before it, with
+half the time step.
+"""
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element; below, it counts as inverted
+from tacsim.interface import Pose
+from tacsim.physics import diagnosis
+from tacsim.physics.world import MoveStats
+from tacsim.scene import Scene
+
+SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element, elastic volume ratio of a particle; below, it counts as inverted
+SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned inside out
 SMALLEST_STEP_VOLUME = 0.1  # det(I + dt C) of a particle in one substep
-FASTEST = 0.5  # particle speed / wave speed
-RETRIES = 4  # each halves the time step
+FASTEST = 0.5  # speed of a particle or gel node / wave speed
+RETRIES = 2  # each halves the time step
+LARGEST_GRID = 20_000_000  # nodes, 16 bytes each
+
+State = Mapping[str, NDArray[Any]]
+ADVICE = "move less far or slower, or use a finer preset"
+NEW_WORLD = "restore a snapshot, or make a new world"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where in a motion a launch is, in words, and the poses of the driven frames at its end."""
+
+    words: str
+    poses: Mapping[str, Pose]
+
+    def __str__(self) -> str:
+        at = (f"{name} at {diagnosis.millimetres(1e3 * pose.position)} mm" for name, pose in self.poses.items())
+        return ", ".join([self.words, *at])
 
 
 class SimulationDiverged(RuntimeError):
-    """No step size gave a finite, physical state. The world was rolled back to its last good state."""
+    """No step size gave a finite, physical state. The world is as it was before the motion.
 
-    def __init__(self, cause: str, where: str, advice: str) -> None:
-        super().__init__(f"simulation diverged: {cause}; {where}; {advice}")
+    good, failed: arrays at the start and at the end of the launch that went wrong, where they are known; health: what
+    its kernels saw. `dump`: the folder that `tacsim debug` reads, if one was written.
+    """
+
+    def __init__(self, cause: str, where: str, advice: str = ADVICE) -> None:
+        super().__init__(cause, where, advice)
         self.cause, self.where, self.advice = cause, where, advice
+        self.place = ""  # of the worst entry: which particle or node, where [mm]
+        self.quantity: diagnosis.Quantity = "not finite"  # by which the worst entry is found
+        self.good: State = {}
+        self.failed: State = {}
+        self.poses: Mapping[str, Pose] = {}  # of the driven frames at the end of that launch
+        self.health: Health | None = None
+        self.refine = 1  # the step was cut into so many at the last attempt
+        self.dump: Path | None = None
+        self.no_dump = ""  # why there is none, though one was asked for
+
+    def __str__(self) -> str:
+        steps = f"even with 1/{self.refine} of the time step; " if self.refine > 1 else ""
+        place = f" at {self.place}" if self.place else ""
+        text = f"simulation diverged: {self.cause}{place}; {self.where}; {steps}{self.advice}"
+        if self.dump is not None:
+            return f"{text}; to look into it: tacsim debug {self.dump}"
+        return f"{text}; {self.no_dump}" if self.no_dump else text
 
 
 @dataclass(frozen=True)
@@ -39,55 +92,134 @@ class Health:
 
     @classmethod
     def read(cls, a: NDArray[np.float32]) -> Health:
-        return cls(float(a[0]), int(a[1]), float(a[2]), float(a[3]), int(a[4]), float(a[5]))
+        counts = [int(a[i]) if math.isfinite(a[i]) else -1 for i in (1, 4)]
+        return cls(float(a[0]), counts[0], float(a[2]), float(a[3]), counts[1], float(a[5]))
 
-    def complaint(self) -> str | None:
-        """What is unphysical, for a person; None when all is well."""
+    def complaint(self) -> tuple[str, diagnosis.Quantity] | None:
+        """What is unphysical, and the quantity that shows where; None when all is well."""
         if not self.smallest_volume_ratio > SMALLEST_VOLUME_RATIO:
-            return f"a gel element is inverted or crushed (volume ratio {self.smallest_volume_ratio:.3g})"
+            return f"a gel element is inverted or crushed (volume ratio {self.smallest_volume_ratio:.3g})", "node speed"
         if not self.smallest_step_volume > SMALLEST_STEP_VOLUME:
-            return f"a particle lost its volume in one substep (ratio {self.smallest_step_volume:.3g})"
+            return f"a particle lost its volume in one substep (ratio {self.smallest_step_volume:.3g})", "speed"
         if not self.fastest < FASTEST:
-            return f"a particle moves at {self.fastest:.3g} of the wave speed (limit {FASTEST})"
+            return f"a particle moves at {self.fastest:.3g} of the wave speed (limit {FASTEST})", "speed"
         if self.off_grid:
-            return f"particles left the grid ({self.off_grid} particle substeps)"
+            return f"particles left the grid ({self.off_grid} particle substeps)", "speed"
         return None
 
 
-def attempt(
-    arrays: Mapping[str, NDArray[np.float32]], launch: Callable[[int], Health], where: Callable[[], str]
-) -> Health:
-    """Runs `launch(refine)`; if the result is unphysical, restores `arrays` and retries with the step halved.
+def attempt(arrays: State, launch: Callable[[], Health], where: Place) -> Health:
+    """Runs one launch of kernels, which changes `arrays` in place, and looks at what came out.
 
-    Raises SimulationDiverged, with the arrays as they were, when the smallest step fails too.
+    Raises SimulationDiverged if that is unphysical; whoever runs the motion (see `retried`) rolls back and retries.
     """
-    complaint = ""
-    saved = {name: a.copy() for name, a in arrays.items()}
-    for retry in range(RETRIES + 1):
-        health = launch(2**retry)
-        complaint = health.complaint() or _not_finite(arrays) or ""
-        if not complaint:
-            return health
-        for name, a in arrays.items():
-            a[...] = saved[name]
-    raise SimulationDiverged(
-        complaint, where(), f"even with 1/{2**RETRIES} of the time step; move less far or slower, or use a finer preset"
-    )
+    good = {name: a.copy() for name, a in arrays.items()}
+    health = launch()
+    complaint = health.complaint() or _complaint(arrays)
+    if complaint is None:
+        return health
+    words, quantity = complaint
+    failure = SimulationDiverged(words, str(where))
+    failure.quantity, failure.health, failure.poses = quantity, health, where.poses
+    failure.good, failure.failed = good, {name: a.copy() for name, a in arrays.items()}
+    raise failure
 
 
-def require_finite(arrays: Mapping[str, NDArray[np.float32]]) -> None:
-    """Raises SimulationDiverged when a state was already broken before a motion begins."""
-    complaint = _not_finite(arrays)
-    if complaint:
-        raise SimulationDiverged(complaint, "before the motion began", "restore a snapshot, or make a new world")
-
-
-def _not_finite(arrays: Mapping[str, NDArray[np.float32]]) -> str | None:
-    for name, a in arrays.items():
-        if not np.isfinite(a).all():
-            index = np.argwhere(~np.isfinite(a))[0]
-            return f"{name}{[int(i) for i in index]} is {a[tuple(index)]}"
+def _complaint(arrays: State) -> tuple[str, diagnosis.Quantity] | None:
+    """What the kernels don't watch: numbers that are not finite, gel nodes too fast, crushed particles."""
+    found = diagnosis.not_finite(arrays)
+    if found is not None:
+        return found, "not finite"
+    speed = diagnosis.fastest_node(arrays)
+    if speed > FASTEST:
+        return f"a gel node moves at {speed:.3g} of the wave speed (limit {FASTEST})", "node speed"
+    volumes = diagnosis.particle_volumes(arrays)
+    if volumes is not None and not volumes.min() > SMALLEST_VOLUME_RATIO:
+        return f"a particle is crushed (elastic volume ratio {volumes.min():.3g})", "particle volume"
     return None
+
+
+class Driven(Protocol):
+    """What `retried` needs of a world."""
+
+    scene: Scene
+
+    def pose(self, name: str) -> Pose: ...
+    def snapshot(self) -> Mapping[str, NDArray[Any]]: ...
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
+
+
+def retried(world: Driven, targets: Mapping[str, Pose], motion: Callable[[int], MoveStats]) -> MoveStats:
+    """Runs `motion(refine)`, which drives `world` to `targets` with 1/refine of its time step; refine = 1, 2, 4.
+
+    After every failure, an interruption included, the world is as it was before. Raises SimulationDiverged when no step
+    does, or when the state was broken already; writes a dump then if one is asked for (tacsim.physics.dump).
+    """
+    before = world.snapshot()
+    broken = diagnosis.not_finite(before)
+    if broken is not None:
+        failure = SimulationDiverged(broken, "before the motion began", NEW_WORLD)
+        failure.good = failure.failed = before
+    else:
+        for retry in range(RETRIES + 1):
+            try:
+                stats = motion(2**retry)
+                _require_upright(world, targets)
+                return replace(stats, retries=retry)
+            except SimulationDiverged as diverged:
+                failure, failure.refine = diverged, 2**retry
+                world.restore(before)
+            except BaseException:
+                world.restore(before)
+                raise
+    failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, world.scene.gel.size)
+    _dump(world, targets, before, failure)
+    raise failure
+
+
+def _require_upright(world: Driven, targets: Mapping[str, Pose]) -> None:
+    """Raises SimulationDiverged if a motion ended with a gel element inside out."""
+    state, thickness = world.snapshot(), world.scene.gel.size[2] * 1e3
+    if "gel_displacement" not in state or diagnosis.nearly_at_rest(state, thickness):
+        return
+    corners = diagnosis.corner_volumes(state, thickness)
+    if corners is not None and not corners.min() > SMALLEST_CORNER:
+        words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
+        end = Place("at the end of the motion and its hold", {**_poses(world), **targets})
+        failure = SimulationDiverged(words, str(end))
+        failure.quantity, failure.failed, failure.poses = "corner", state, end.poses
+        raise failure
+
+
+def _poses(world: Driven) -> dict[str, Pose]:
+    scene = world.scene
+    frames = (*scene.sensors, *(() if scene.indenter is None else ("indenter",)))
+    return {name: world.pose(name) for name in frames}
+
+
+def _dump(world: Driven, targets: Mapping[str, Pose], before: State, failure: SimulationDiverged) -> None:
+    """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
+    folder = os.environ.get("TACSIM_DUMPS")
+    if not folder:
+        return
+    from tacsim.physics import dump
+
+    try:
+        failure.dump = dump.write(Path(folder), world.scene, _poses(world), targets, before, failure)
+    except (OSError, ValueError) as error:
+        failure.no_dump = f"no dump could be written to {folder}: {error}"
+
+
+def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place) -> None:
+    """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] that would have too many nodes."""
+    counts = (np.asarray(high, np.float64) - np.asarray(low, np.float64)) / cell + 1
+    if not float(np.prod(counts)) <= LARGEST_GRID:
+        size = " x ".join(f"{length:.4g}" for length in (counts - 1) * cell)
+        raise SimulationDiverged(
+            f"particles spread over {size} mm, which needs a grid of {np.prod(counts):.3g} nodes "
+            f"(limit {LARGEST_GRID:.3g})",
+            str(where),
+        )
 
 
 def as_float32(arrays: Sequence[NDArray[np.float32]]) -> None:

@@ -1,14 +1,15 @@
 """Two gels (FEM in their sensor frames) round a plasticine body (MLS-MPM), coupled by contact with friction memory."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.contact import contact_ceiling, particle_contact
-from tacsim.physics.controller import Path, Reading, merged, move_and_settle, plan
-from tacsim.physics.gel import MM, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
-from tacsim.physics.health import Health, as_float32, attempt, require_finite
+from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
+from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
+from tacsim.physics.health import Health, as_float32, attempt, require_room, retried
 from tacsim.physics.material import vec3, vec4
 from tacsim.physics.plasticine import (
     Grid,
@@ -30,7 +31,7 @@ from tacsim.shapes import extent, particles
 
 COURANT = 0.4  # dt / (smallest spacing / wave speed)
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
-BODY_DAMPING = 0.1  # rate against the driven affine motion [c / mm]
+BODY_DAMPING = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
 Array1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -200,6 +201,7 @@ class HybridWorld:
         # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were lighter by
         # the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below the step limit.
         self._lightness = max(1.0, height * MM / self._body.spacing)
+        self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._grid = np.zeros((1, 1, 1, 4), np.float32)
         self._speed = scene.settling.mach  # fastest particle seen in the last launch
         as_float32(list(self._arrays().values()))
@@ -247,33 +249,39 @@ class HybridWorld:
     # ----------------------------------------------------------------- motion
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
-        require_finite(self._arrays())
         end = merged(self._poses, targets)
         lever = max(self._gel.half)
         path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
-        stats = move_and_settle(path, self.scene.settling, self._advance, balanced=True)
+
+        def motion(refine: int) -> MoveStats:
+            finer = replace(path, refine=refine)
+            return move_and_settle(finer, self.scene.settling, self._advance, balanced=True)
+
+        stats = retried(self, targets, motion)
         self._poses = end
         return stats
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         span = (last - first) * self._dt
         margin = 2 * self._body.cell + 2 * span * max(self._speed, self.scene.settling.mach)
-        origin, shape = fit_grid(self._particles.x, self._body.cell, margin)
+        where = path.place(self._poses, first, last)
+        x = self._particles.x
+        require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
+        origin, shape = fit_grid(x, self._body.cell, margin)
         if self._grid.shape[:3] != shape:
             self._grid = np.zeros((*shape, 4), np.float32)
-        arrays = self._arrays()
 
-        def launch(refine: int) -> Health:
+        def launch() -> Health:
             health = Health.array()
-            self._launch(path.drive(first, last, refine), self._dt / refine, origin, health)
+            self._launch(path.drive(first, last), path.step, origin, health)
             return Health.read(health)
 
-        health = attempt(arrays, launch, lambda: f"substeps {first} to {last} of a motion of {path.substeps}")
+        health = attempt(self._arrays(), launch, where)
         self._speed = health.fastest
-        rotations = path.drive(last - 1, last)[0, :, :3]
+        rotations = path.drive(last - 1, last)[-1, :, :3]
         contact = np.einsum("gij,gj->gi", rotations, self._wrench[:, 0]).astype(np.float64)
         moment = self._wrench[:, 1].astype(np.float64) / max(self._gel.half)
-        return Reading(contact, self._backing.astype(np.float64), health.overlap, health.capped, moment)
+        return Reading(contact, self._backing.astype(np.float64), self._floor, health.overlap, health.capped, moment)
 
     def _launch(self, drive: np.ndarray, dt: float, origin: np.ndarray, health: np.ndarray) -> None:
         g, b, gel, body = self._gels, self._particles, self._gel, self._body
@@ -283,7 +291,7 @@ class HybridWorld:
             g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
             b.x, b.v, b.c, b.e, self._memory, self._mean,
             self._grid, *(float(o) for o in origin), body.spacing, body.mu, body.bulk, body.limit,
-            BODY_DAMPING, self._lightness,
+            BODY_DAMPING / gel.thickness, self._lightness,
             self._stiffness, self.scene.friction["lower"], self.scene.friction["upper"],
             -1.0 if housing is None else housing * MM,
             self._wrench, self._backing, health,

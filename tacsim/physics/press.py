@@ -1,13 +1,14 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import Path, Reading, merged, move_and_settle, plan
-from tacsim.physics.gel import MM, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
-from tacsim.physics.health import Health, as_float32, attempt, require_finite
+from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
+from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
+from tacsim.physics.health import Health, as_float32, attempt, retried
 from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
 from tacsim.physics.material import vec3
@@ -80,6 +81,7 @@ class PressWorld:
         self._wrench = np.zeros((1, 2, 3), np.float32)
         self._backing = np.zeros((1, 3), np.float32)
         self._dt = COURANT * self._gel.spacing
+        self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._stiffness = self._gel.density * self._gel.spacing / (2 * self._dt**2)
         self._kind, self._size, self._values, self._origin, self._spacing = _distance_facts(scene)
         height = float(extent(scene.indenter.geometry)[2])
@@ -119,12 +121,16 @@ class PressWorld:
         return None
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
-        require_finite(self._arrays())
         end = merged(self._poses, targets)
         path = plan(
             list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, max(self._gel.half)
         )
-        stats = move_and_settle(path, self.scene.settling, self._advance, balanced=False)
+
+        def motion(refine: int) -> MoveStats:
+            finer = replace(path, refine=refine)
+            return move_and_settle(finer, self.scene.settling, self._advance, balanced=False)
+
+        stats = retried(self, targets, motion)
         self._poses = end
         return stats
 
@@ -132,12 +138,12 @@ class PressWorld:
         assert self.scene.indenter is not None
         friction = self.scene.indenter.friction
 
-        def launch(refine: int) -> Health:
-            both = path.drive(first, last, refine)
+        def launch() -> Health:
+            both = path.drive(first, last)
             drive = relative_drive(both[:, 0], both[:, 1])
             g, gel, health = self._gels, self._gel, Health.array()
             press_substeps(
-                len(drive), self._dt / refine, drive,
+                len(drive), path.step, drive,
                 g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
                 self._slip, self._pressure, self._kind, *self._size,
                 self._values, *self._origin, self._spacing, self._stiffness, friction,
@@ -145,10 +151,11 @@ class PressWorld:
             )  # fmt: skip
             return Health.read(health)
 
-        health = attempt(self._arrays(), launch, lambda: f"substeps {first} to {last} of a motion of {path.substeps}")
+        health = attempt(self._arrays(), launch, path.place(self._poses, first, last))
         return Reading(
             self._wrench[:, 0].astype(np.float64),
             self._backing.astype(np.float64),
+            self._floor,
             health.overlap,
             health.capped,
             self._wrench[:, 1].astype(np.float64) / max(self._gel.half),

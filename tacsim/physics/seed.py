@@ -8,7 +8,7 @@ to the scheme itself: bodies stick to each other (no friction coefficient), begi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle, plan
-from tacsim.physics.health import Health, SimulationDiverged, as_float32, attempt
+from tacsim.physics.health import Health, Place, SimulationDiverged, as_float32, attempt, require_room, retried
 from tacsim.physics.world import MoveStats
 from tacsim.runtime import start
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
@@ -29,8 +29,8 @@ CELL = 2  # grid spacing / particle spacing: 8 particles a cell
 COURANT = 0.5  # dt / (grid spacing / wave speed); unstable from 1.0
 REACH = 1.5  # [cells] gap at which contact through the grid begins
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
-BODY_DAMPING = 0.2  # rate against the driven motion [c / mm], along z: near critical for the bounce between the gels
-SWAY_DAMPING = 0.03  # likewise across z, where the gels are softer
+BODY_DAMPING = 0.8  # likewise, rate against the driven motion, along z: near critical for the bounce between the gels
+SWAY_DAMPING = 0.12  # likewise across z, where the gels are softer
 GENTLE = 60  # substeps of the shortest motion: a start in fewer is a blow, which leaves false plastic strain
 SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
 FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
@@ -182,19 +182,18 @@ class SeedWorld:
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         """See World. Raises ValueError for a tilted target, or one that would crush the gels."""
-        self._check_finite()
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
         self._check_room(end)
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
         path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
         if 0 < path.substeps < GENTLE:
-            path = Path(path.start, path.end, GENTLE, path.dt)
-        before = self.snapshot()
-        try:
-            stats = move_and_settle(path, self.scene.settling, self._advance, balanced=True)
-        except SimulationDiverged:
-            self.restore(before)
-            raise
+            path = replace(path, substeps=GENTLE)
+
+        def motion(refine: int) -> MoveStats:
+            finer = replace(path, refine=refine)
+            return move_and_settle(finer, self.scene.settling, self._advance, balanced=True)
+
+        stats = retried(self, targets, motion)
         self._poses = end
         return stats
 
@@ -213,14 +212,6 @@ class SeedWorld:
         yaw = Rotation.from_euler("z", np.arctan2(turn[1, 0], turn[0, 0]))
         return Pose(pose.position, (yaw * flip).as_quat())
 
-    def _check_finite(self) -> None:
-        for name, a in self._arrays().items():
-            if not np.isfinite(a).all():
-                index = tuple(int(i) for i in np.argwhere(~np.isfinite(a))[0])
-                raise SimulationDiverged(
-                    f"{name}{list(index)} is {a[index]}", "before the motion", "restore a snapshot, or make a new world"
-                )
-
     def _check_room(self, poses: Mapping[str, Pose]) -> None:
         thickness = self.scene.gel.size[2]
         room = float(poses["upper"].position[2] - poses["lower"].position[2])
@@ -231,22 +222,22 @@ class SeedWorld:
             )
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
-        """Substeps first to last of a path, in one launch; with a smaller step if that goes wrong."""
+        """Substeps first to last of a path, in one launch."""
         aside = int(self._aside.sum())
-        x0, y0 = self._fit_grid(path, first, last)
+        where = path.place(self.sensors, first, last)
+        x0, y0 = self._fit_grid(path, first, last, where)
 
-        def launch(refine: int) -> Health:
+        def launch() -> Health:
             health = Health.array()
-            self._launch(path.drive(first, last, refine), self._dt / refine, x0, y0, health)
+            self._launch(path.drive(first, last), path.step, x0, y0, health)
             return Health.read(health)
 
-        where = f"substeps {first} to {last} of a motion of {path.substeps}"
-        attempt(self._arrays(), launch, lambda: where)
+        attempt(self._arrays(), launch, where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
-            raise SimulationDiverged("every particle of the body left the grid", where, "move slower, or less far")
-        return Reading(backing + self._gain, backing, self._overlap(path, last), left, floor=self._floor)
+            raise SimulationDiverged("every particle of the body left the grid", str(where), "move slower, or less far")
+        return Reading(backing + self._gain, backing, self._floor, self._overlap(path, last), left)
 
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance
@@ -254,19 +245,19 @@ class SeedWorld:
         thickness = self.scene.gel.size[2] * MM
         step = Step(  # type: ignore[call-arg]  # a Taichi dataclass
             dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
-            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING,
-            sway_damping=SWAY_DAMPING, gels=self._gels,
+            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING / thickness,
+            sway_damping=SWAY_DAMPING / thickness, gels=self._gels,
         )  # fmt: skip
         advance(
             self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive, self._motion,
             self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
         )  # fmt: skip
 
-    def _fit_grid(self, path: Path, first: int, last: int) -> tuple[float, float]:
+    def _fit_grid(self, path: Path, first: int, last: int, where: Place) -> tuple[float, float]:
         """Makes the grid cover what the particles can reach; returns x, y of node (0, 0), whole multiples of dx."""
         from tacsim.physics.seed_kernels import PAD
 
-        layers = self._fit_layers(path.drive(first, last)[:, :, 3, 2])
+        faces = path.drive(first, last)[:, :, 3, 2]
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
         low, high = gels.min(axis=0), gels.max(axis=0)
         side = SIDE * float((high - low).max())
@@ -274,6 +265,9 @@ class SeedWorld:
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
         margin = MARGIN * self._dx + 2 * self.scene.settling.mach * (last - first) * self._dt
+        room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
+        require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
+        layers = self._fit_layers(faces)
         corner = np.floor((low - margin) / self._dx)
         nodes = np.ceil((high + margin) / self._dx) - corner + 1
         shape = (int(nodes[0]), int(nodes[1]), layers + 2 * PAD + 1)

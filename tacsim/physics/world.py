@@ -23,6 +23,7 @@ class MoveStats:
     settled: bool  # residual <= the scene's tolerance
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
     guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped)
+    retries: int = 0  # times the motion was begun anew with half the time step
 
 
 class World(Protocol):

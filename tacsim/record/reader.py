@@ -59,7 +59,7 @@ class EpisodeFile:
         self._closing: dict[str, int] | None = None
         try:
             if not self.path.is_file():
-                raise EpisodeError(f"{self.path}: no such file")
+                raise EpisodeError(f"{self.path}: {'is no file' if self.path.exists() else 'no such file'}")
             self._file = self.path.open("rb")
         except OSError as failure:
             raise EpisodeError(f"{self.path}: cannot be opened: {failure.strerror}") from failure

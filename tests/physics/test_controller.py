@@ -1,5 +1,7 @@
 """Ramped paths."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -32,7 +34,7 @@ def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
 
 def test_refining_cuts_the_same_path_finer() -> None:
     path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0)
-    coarse, fine = path.drive(5, 9), path.drive(5, 9, refine=4)
+    coarse, fine = path.drive(5, 9), replace(path, refine=4).drive(5, 9)
     assert len(fine) == 16
     assert fine[3::4, 0, 3] == pytest.approx(coarse[:, 0, 3], abs=1e-6)
 

@@ -86,6 +86,43 @@ def test_the_law_is_objective(seed: int, size: float) -> None:
     assert np.abs(turn @ tau @ turn.T - tau_turned).max() < 1e-5 * max(np.abs(tau).max(), 0.01)
 
 
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.floats(1e-3, 0.3), limit=st.sampled_from([0.02, 0.1, 1e9]))
+def test_the_law_is_isotropic(seed: int, size: float, limit: float) -> None:
+    """Stress and elastic state share the axes of b: they commute with it, whatever the axes are."""
+    b = random_b(1, size, seed)
+    b_new, tau = run(b, limit)
+    for found in (tau, b_new):
+        assert np.abs(found @ b - b @ found).max() < 1e-5 * np.abs(b - np.eye(3)).max() * max(np.abs(found).max(), 0.01)
+    swap = np.eye(3)[[1, 2, 0]]  # the material does not know x from y from z
+    _, swapped = run(swap @ b @ swap.T, limit)
+    assert np.abs(swap @ tau @ swap.T - swapped).max() < 1e-5 * max(np.abs(tau).max(), 0.01)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.floats(1e-3, 0.4), limit=st.floats(1e-3, 0.2))
+def test_plastic_flow_dissipates(seed: int, size: float, limit: float) -> None:
+    """tau : d >= 0, d the plastic Hencky strain of the return: what the elastic strain lost, along its axes."""
+    b = random_b(20, size, seed)
+    b_new, tau = run(b, limit)
+    lost = logarithm(b) / 2 - logarithm(b_new) / 2
+    work = (tau * lost).sum(axis=(1, 2))
+    norm = np.linalg.norm(deviator(logarithm(b) / 2), axis=(1, 2))
+    resolution = 2e-6 * max(np.abs(tau).max(), 0.01)  # of float32
+    assert work.min() > -resolution
+    exact = 2 * MU * limit * np.maximum(norm - limit, 0.0)  # |dev tau| times the flow
+    assert np.abs(work - exact).max() < 2e-3 * exact.max() + resolution
+
+
+def logarithm(b: np.ndarray) -> np.ndarray:
+    values, axes = np.linalg.eigh(b)
+    return np.einsum("nik,nk,njk->nij", axes, np.log(values), axes)
+
+
+def deviator(m: np.ndarray) -> np.ndarray:
+    return m - np.trace(m, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+
+
 def test_convection_is_f_b_f_transposed() -> None:
     start()
     rng = np.random.default_rng(3)

@@ -18,6 +18,7 @@ from typer.testing import CliRunner, Result
 
 from robot.cli import app
 from robot.cli.errors import explain
+from robot.cli.output import writing
 from robot.reproduce import EXPERIMENTS, TrialFailed, as_json, image_difference, run_trials, shortcomings, telling
 from tacsim.config import ConfigError
 from tacsim.figure4 import Trial
@@ -25,7 +26,7 @@ from tacsim.interface import IncompatibleRig, TactileFrame
 from tacsim.record.episode import EpisodeError
 from tacsim.record.reader import read_episode
 
-COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor")
+COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", "bench")
 TINY = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")  # a world of seconds
 START = (sys.executable, "-c", "from robot.cli import main; main()")
 
@@ -75,6 +76,9 @@ def test_version() -> None:
         (("press", "sphere", "--slide", "1 mm"), "2 are needed"),
         (("schema", "rigg"), "rig, task, scene"),
         (("run", "--policy", "no.such:thing"), "no.such:thing"),
+        (("run", "--policy", ""), "no policy ''"),
+        (("run", "--set", "scene.element_size=1e-9"), "the limit is 5,000,000"),
+        (("press", "sphere", "--radius", "1e308"), "radius"),
         (("run", "--set", "arms.upper.driver=replay"), "arms.upper"),
         (("run", "replay"), "sensors.finger.source"),
     ],
@@ -191,13 +195,33 @@ def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
 
 
 def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "mine.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    result = tacsim("run", "--policy", "mine:act", "--steps", "3", "--out", "r", *TINY)
+    (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the command adds the current folder
+    result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
     assert result.exit_code == 1
     assert "no idea" in result.stderr
     assert json.loads((tmp_path / "r" / "summary.json").read_text())["steps"] == 0
     assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 1
+
+
+def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) -> None:
+    text = "class Act:\n    needs = Needs()\n    def reset(self): raise OSError('no gripper')\n"
+    text += "    def __call__(self, observation): return None\n"
+    (tmp_path / "unready.py").write_text("from tacsim.interface import Needs\n" + text)
+    result = tacsim("run", "--policy", "unready:Act", "--out", "r", *TINY)
+    assert result.exit_code == 1
+    assert "no gripper" in result.stderr
+    assert "report" not in result.stderr
+    again = tacsim("replay", "r/episode.mcap", "--out", "again")
+    assert again.exit_code == 1
+    assert "no step can be read" in again.stderr
+    assert not (tmp_path / "again").exists()
+
+
+def test_a_full_disk_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No space") as caught, writing(tmp_path):
+        raise OSError(28, "No space left on device")
+    assert explain(caught.value) == (f"{tmp_path}: No space left on device", 1)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

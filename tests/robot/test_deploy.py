@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -239,6 +240,14 @@ def test_a_policy_that_raises_stops_the_arms_and_keeps_the_episode() -> None:
     assert hand.stops > 0
 
 
+def test_a_policy_that_ends_python_ends_the_episode() -> None:
+    def act(observation: Observation) -> Action:
+        sys.exit(7)
+
+    with pytest.raises(EpisodeFailed, match="ended after 0 of 5 steps: SystemExit: 7"):
+        run_episode(make_rig(Hand()), FunctionPolicy(act), TASK, 5)
+
+
 def test_negative_steps_are_refused() -> None:
     with pytest.raises(ValueError, match="-1"):
         run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, -1)
@@ -258,6 +267,9 @@ class Counting:
 class Demanding(Counting):
     def __init__(self, force): pass
 
+class Needless(Counting):
+    needs = None
+
 ready = Counting()
 number = 3
 """
@@ -268,6 +280,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_policies.py").write_text(MODULE)
     (tmp_path / "broken_policies.py").write_text("import no_such_package\n")
     (tmp_path / "failing_policies.py").write_text("1 / 0\n")
+    (tmp_path / "ending_policies.py").write_text("import sys\nsys.exit(3)\n")
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
@@ -299,6 +312,8 @@ def test_policies_by_name() -> None:
         ("my_policies:Demanding", "cannot be made without arguments"),
         ("broken_policies:hold", "itself imports 'no_such_package', which is missing"),
         ("failing_policies:hold", "importing 'failing_policies' failed: ZeroDivisionError"),
+        ("ending_policies:hold", r"importing 'ending_policies' failed: SystemExit\(3\)"),
+        ("my_policies:Needless", "its needs must be a tacsim.interface.Needs, got NoneType"),
     ],
 )
 def test_a_name_that_leads_nowhere_says_why(name: str, message: str) -> None:

@@ -110,6 +110,8 @@ def test_an_arm_that_holds_is_zero_in_the_vector() -> None:
         ([0.0, np.nan, 0.0], "finite"),
         ([0.0, 1.01, 0.0], r"within \[-1, 1\], got \[0.0, 1.01, 0.0\]"),
         ([0.0, -np.inf, 0.0], "finite"),
+        ("up", "3 real numbers, got .*'up'"),
+        (np.array([1j, 0.0, 0.0]), "real numbers"),
     ],
 )
 def test_a_vector_that_is_no_action_is_refused(vector: Any, message: str) -> None:

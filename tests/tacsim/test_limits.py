@@ -79,6 +79,8 @@ def test_a_good_action_passes() -> None:
         ),  # type: ignore[dict-item]
         ({"upper": START}, r"rig 'bench' takes a tacsim.interface.Action, got dict"),
         (None, "got NoneType"),
+        (Action([START]), "Action.tool must be a mapping from arm names to poses.*got list"),  # type: ignore[arg-type]
+        (Action({"upper": Pose(np.array([0.0, 1e308, 0.0]))}), "target of arm 'upper' is at .* more than 1000 m"),
     ],
 )
 def test_what_a_rig_cannot_take_is_refused(action: object, message: str) -> None:

@@ -191,6 +191,13 @@ def test_of_equal_steps_the_first_is_named() -> None:
     assert [list(line.get_xdata()) for line in dots] == [[5], [5]]  # of reward and of distance
 
 
+def test_a_character_that_the_font_lacks_is_no_warning(tmp_path: Path) -> None:
+    drawing = figure.canvas(2.0, 1.0)
+    drawing.text(0.1, 0.5, "\N{COLLISION SYMBOL}")
+    figure.save(drawing, tmp_path / "a.png")  # warnings are errors in tests
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
 def test_a_nearly_constant_force_is_not_cut_off() -> None:
     episode = made_up()
     wrench = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])

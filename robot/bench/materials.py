@@ -1,0 +1,354 @@
+"""Materials group: laws, elements and transfers against closed forms, and what a substep costs."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.bench.measure import Measurement, Timing, timed
+from robot.bench.runner import Case
+from robot.bench.squeeze import close, normal_forces
+from tacsim.interface import FloatArray
+from tacsim.physics import reference
+from tacsim.physics.world import MoveStats
+from tacsim.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Scene
+
+CLAY = BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=30e3)
+RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
+COURANT = 0.4
+HALF_PERIODS = 4  # of a standing wave that are timed
+
+
+def yield_scene(side: float, spacing: float, gel_element: float) -> Scene:
+    """A cube between two frictionless plates (gels 200 times as stiff as the body)."""
+    return Scene.model_validate(
+        {
+            "body": Body(geometry=Box(size=(side, side, side)), material=CLAY),
+            "gel": Gel(size=(side + 4e-3, side + 4e-3, 2e-3), material=RIGID, housing=None),
+            "friction": {"lower": 0.0, "upper": 0.0},
+            "particle_spacing": spacing,
+            "element_size": gel_element,
+        }
+    )
+
+
+def uniaxial_stress(force: float, volume: float, height: float) -> float:
+    """Mean Kirchhoff stress of a prism [Pa]: force [N] over its section, which is its volume [m^3] over its height."""
+    return force * height / volume
+
+
+def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
+    """A cube shortened by 10 % yields at F/A = sigma_y."""
+    from tacsim.physics.hybrid import HybridWorld
+
+    world = HybridWorld(yield_scene(side, spacing, 1e-3))
+    body = world.truth()
+    gap = float(world.pose("upper").position[2]) - body.height
+    particles = len(body.points)
+    close(world, gap)
+    begin = world.snapshot()
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        return close(world, 0.1 * side)
+
+    timing, stats = timed(run, repeat, warm=lambda: None)
+    strain = world.snapshot()["strain"].astype(np.float64)
+    jacobian = np.sqrt(np.linalg.det(full(strain) + np.eye(3)))
+    assert CLAY.yield_stress is not None
+    # Kirchhoff stress yields: sigma = tau / J
+    stress = uniaxial_stress(float(normal_forces(world).mean()), side**3, world.truth().height)
+    return [
+        Measurement(
+            timing, abs(stress / CLAY.yield_stress - 1) * 100, "%", "F/A = yield stress", "cube shortened by 10 %",
+            stats.substeps, {**step_cost(timing, stats.substeps, particles, "particle"), "stress_pa": stress,
+                             "mean_j": float(jacobian.mean()), "residual": stats.residual},
+            "" if stats.settled else "not settled",
+        )
+    ]  # fmt: skip
+
+
+def textbook_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
+    """The same cube by textbook MLS-MPM: SVD, atomics, plates of grid nodes."""
+    from robot.bench.textbook import yield_plateau as by_the_book  # compiles nothing before it is asked for
+
+    return by_the_book(side * 1e3, spacing * 1e3, repeat)
+
+
+def gel_step(repeat: int) -> list[Measurement]:
+    """Two standard gels and next to no body: 0.2 mm of motion on a tiny, elastic cube."""
+    from tacsim.physics.hybrid import HybridWorld
+
+    scene = Scene.model_validate(
+        {
+            "preset": "standard",
+            "body": Body(geometry=Box(size=(1e-3, 1e-3, 1e-3)), material=BodyMaterial()),
+        }
+    )
+    world = HybridWorld(scene)
+    body = world.truth()
+    close(world, float(world.pose("upper").position[2]) - body.height)
+    begin = world.snapshot()
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        return close(world, 0.2e-3)
+
+    timing, stats = timed(run, repeat, warm=lambda: None)
+    elements = 2 * math.prod(round(side / scene.element) for side in scene.gel.size)
+    forces = normal_forces(world)
+    return [
+        Measurement(
+            timing, abs(float(forces[0] - forces[1])) / float(forces.mean()) * 100, "% imbalance",
+            "equal forces on both sensors", f"{elements} elements, {len(body.points)} particles", stats.substeps,
+            step_cost(timing, stats.substeps, elements, "element"), "" if stats.settled else "not settled",
+        )
+    ]  # fmt: skip
+
+
+def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str, float]:
+    """Time of a substep [ns] over the number of particles or elements; all else that a substep does is in it."""
+    each = 1e9 / (substeps * count)
+    return {f"wall_per_{what}_substep_ns": timing.median * each, f"cpu_per_{what}_substep_ns": timing.processor * each}
+
+
+def oedometer(element: float, repeat: int) -> list[Measurement]:
+    """Confined compression by 10 %: P = mu (s - 1/s) + lambda ln(s)/s at the backing."""
+    from robot.bench.blocks import gel_substeps
+    from tacsim.physics.gel import GelState, gel_facts, gel_state
+    from tacsim.runtime import start
+
+    start()
+    facts = gel_facts(Gel(size=(4e-3, 4e-3, 4e-3), material=GelMaterial(poisson_ratio=0.45)), element)
+    dt, stretch = COURANT * facts.spacing, 0.9
+    ramp = round(0.1 * facts.thickness / (0.02 * dt))
+    speed = -(1 - stretch) * facts.thickness / (ramp * dt)
+    hold = round(40 * facts.thickness / dt)
+    backing, health = np.zeros(3, np.float32), np.zeros(8, np.float32)
+
+    def run() -> GelState:
+        state = gel_state(facts, 1)
+        material = (facts.spacing, facts.mu, facts.lam, 1.0 / facts.thickness)
+        for count, rate in ((ramp, speed), (hold, 0.0)):
+            gel_substeps(
+                count, dt, state.u, state.v, state.f, *material, 0.0, 0.0, 1.0, 1, rate, backing, health
+            )  # fmt: skip
+        return state
+
+    timing, state = timed(run, repeat)
+    reached = 1 + float(state.u[0, :, :, -1, 2].mean()) / facts.thickness
+    stress = facts.mu * (reached - 1 / reached) + facts.lam * math.log(reached) / reached
+    pressure = float(backing[2]) / (facts.elements[0] * facts.elements[1] * facts.spacing**2)
+    error = abs(abs(pressure / stress) - 1) * 100
+    figures = {"stretch": reached, "pressure_mpa": abs(pressure)}
+    return [Measurement(timing, error, "%", "neo-Hookean closed form", "shortened by 10 %", ramp + hold, figures)]
+
+
+def simple_shear(repeat: int) -> list[Measurement]:
+    """64,000 material points sheared by 0.5: tau_xy = sigma_y / sqrt 2 (Frobenius norm of the yield stress)."""
+    from robot.bench.blocks import shear_points
+    from tacsim.physics.plasticine import body_facts
+    from tacsim.runtime import start
+
+    start()
+    facts = body_facts(CLAY, 0.25e-3)
+    steps, increment, points = 250, 2e-3, 64_000
+
+    def run() -> NDArray[np.float32]:
+        strain, tau = np.zeros((points, 6), np.float32), np.zeros((points, 6), np.float32)
+        shear_points(steps, increment, strain, tau, facts.mu, facts.bulk, facts.limit)
+        return tau
+
+    timing, tau = timed(run, repeat)
+    b, exact = np.eye(3), np.zeros((3, 3))
+    f = np.eye(3)
+    f[0, 1] = increment
+    for _ in range(steps):
+        b, exact = reference.hencky_return(f @ b @ f.T, facts.mu, facts.bulk, facts.limit)
+    radius = 2 * facts.mu * facts.limit  # sigma_y
+    closed = radius / math.sqrt(2)
+    off = float(np.abs(full(tau.astype(np.float64)) - exact).max()) / radius * 100
+    error = abs(float(tau[:, 3].mean(dtype=np.float64)) / closed - 1) * 100
+    figures = {
+        "against_float64_percent": off,
+        "float64_against_closed_form_percent": abs(exact[0, 1] / closed - 1) * 100,
+    }
+    return [
+        Measurement(timing, error, "%", "tau_xy = sigma_y / sqrt 2", "sheared by 0.5", steps, figures,
+                    "the closed form is that of small elastic strain")
+    ]  # fmt: skip
+
+
+def gel_wave(element: float, repeat: int) -> list[Measurement]:
+    """Standing quarter wave in a layer, pressure and shear: frequency c / 4H."""
+    from robot.bench.blocks import gel_substeps
+    from tacsim.physics.gel import gel_facts, gel_state
+    from tacsim.runtime import start
+
+    start()
+    facts = gel_facts(Gel(size=(4e-3, 4e-3, 4e-3), material=GelMaterial(poisson_ratio=0.45)), element)
+    dt, height = COURANT * facts.spacing, facts.thickness
+    depth = np.arange(facts.elements[2] + 1) * facts.spacing
+    shape = np.sin(np.pi * depth / (2 * height))
+    backing, health = np.zeros(3, np.float32), np.zeros(8, np.float32)
+    rows = []
+    for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(facts.mu / facts.density))):
+        keep = [float(d == axis) for d in range(3)]
+        count = math.ceil((HALF_PERIODS + 1) * 2 * height / (speed * dt))
+
+        def run(axis: int = axis, keep: list[float] = keep, count: int = count) -> FloatArray:
+            state = gel_state(facts, 1)
+            state.v[0, ..., axis] = 1e-3 * shape
+            heard = np.empty(count)
+            for step in range(count):
+                heard[step] = state.v[0, 1, 1, :, axis] @ shape
+                gel_substeps(
+                    1, dt, state.u, state.v, state.f, facts.spacing, facts.mu, facts.lam, 0.0, *keep, 0, 0.0,
+                    backing, health,
+                )  # fmt: skip
+            return heard
+
+        timing, heard = timed(run, repeat)
+        rows.append(_wave_row(timing, half_period(heard) * dt, 2 * height / speed, f"gel, {name}", count))
+    return rows
+
+
+def body_wave(spacing: float, repeat: int) -> list[Measurement]:
+    """Standing half wave in a free block, other directions held: frequency c / 2L."""
+    from robot.bench.blocks import body_substeps
+    from tacsim.physics.plasticine import body_facts, body_state, fit_grid
+    from tacsim.runtime import start
+    from tacsim.shapes import particles
+
+    start()
+    facts = body_facts(BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45), spacing)
+    dt, length = COURANT * facts.cell, 8.0
+    rest = particles(Box(size=(4e-3, 4e-3, 8e-3)), spacing) * 1e3
+    phase = np.pi * (rest[:, 2] - rest[:, 2].min() + facts.spacing / 2) / length
+    origin, shape = fit_grid(rest, facts.cell, 2 * facts.cell)
+    rows = []
+    for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(facts.mu / facts.density))):
+        keep = [float(d == axis) for d in range(3)]
+        count = math.ceil((HALF_PERIODS + 1) * length / (speed * dt))
+
+        def run(axis: int = axis, keep: list[float] = keep, count: int = count) -> FloatArray:
+            state, grid = body_state(rest), np.zeros((*shape, 4), np.float32)
+            health = np.zeros(8, np.float32)
+            state.v[:, axis] = 1e-3 * np.cos(phase)
+            state.c[:, axis, 2] = -1e-3 * np.pi / length * np.sin(phase)
+            heard = np.empty(count)
+            for step in range(count):
+                heard[step] = state.v[:, axis] @ np.cos(phase)
+                body_substeps(
+                    1, dt, state.x, state.v, state.c, state.e, grid, *map(float, origin), facts.spacing,
+                    facts.mu, facts.bulk, facts.limit, *keep, health,
+                )  # fmt: skip
+            return heard
+
+        timing, heard = timed(run, repeat)
+        rows.append(_wave_row(timing, half_period(heard) * dt, length / speed, f"plasticine, {name}", count))
+    return rows
+
+
+def half_period(heard: FloatArray) -> float:
+    """Mean distance of the first zero crossings of a signal [samples]. Raises ValueError when there are too few."""
+    at = np.flatnonzero(np.sign(heard[:-1]) * np.sign(heard[1:]) < 0)
+    if len(at) <= HALF_PERIODS:
+        raise ValueError(f"the wave crossed zero {len(at)} times, {HALF_PERIODS + 1} are needed: it does not oscillate")
+    crossing = at + heard[at] / (heard[at] - heard[at + 1])
+    return float(crossing[HALF_PERIODS] - crossing[0]) / HALF_PERIODS
+
+
+def _wave_row(timing: Timing, found: float, truth: float, variant: str, count: int) -> Measurement:
+    figures = {"half_period": found, "half_period_truth": truth}
+    return Measurement(
+        timing, abs(truth / found - 1) * 100, "%", "wave speed of the continuum", variant, count, figures
+    )
+
+
+def momentum(repeat: int) -> list[Measurement]:
+    """A free body that spins, stretches and yields over 5,000 substeps."""
+    from robot.bench.blocks import body_substeps
+    from tacsim.physics.plasticine import BodyState, body_facts, body_state, fit_grid
+    from tacsim.runtime import start
+    from tacsim.shapes import particles
+
+    start()
+    spacing, steps, batch = 0.5e-3, 5000, 20
+    facts = body_facts(CLAY, spacing)
+    dt = COURANT * facts.cell
+    rest = particles(Box(size=(4e-3, 3e-3, 5e-3)), spacing) * 1e3
+    gradient = np.array([[0.02, -0.02, 0.0], [0.03, -0.02, 0.01], [0.0, -0.01, 0.01]]) * 0.5
+    drift = np.array([0.004, -0.002, 0.003])
+    health = np.zeros(8, np.float32)
+
+    def initial() -> BodyState:
+        state = body_state(rest)
+        state.v[:] = rest @ gradient.T + drift
+        state.c[:] = gradient
+        return state
+
+    def run() -> BodyState:
+        state, grid = initial(), np.zeros((1, 1, 1, 4), np.float32)
+        for _ in range(0, steps, batch):
+            reach = 2 * facts.cell + 2 * batch * dt * float(np.abs(state.v).max())
+            origin, shape = fit_grid(state.x, facts.cell, reach)
+            if grid.shape[:3] != shape:
+                grid = np.zeros((*shape, 4), np.float32)
+            body_substeps(
+                batch, dt, state.x, state.v, state.c, state.e, grid, *map(float, origin), facts.spacing,
+                facts.mu, facts.bulk, facts.limit, 1.0, 1.0, 1.0, health,
+            )  # fmt: skip
+        return state
+
+    timing, state = timed(run, repeat)
+    before, after = momenta(initial(), facts.cell), momenta(state, facts.cell)
+    linear, angular = (float(np.linalg.norm(b - a) / scale) for a, b, scale in zip(
+        before[:2], after[:2], before[2:], strict=True))  # fmt: skip
+    return [
+        Measurement(timing, max(linear, angular), "relative drift", "conservation of momentum and angular momentum",
+                    f"{len(rest)} particles", steps, {"momentum": linear, "angular_momentum": angular})
+    ]  # fmt: skip
+
+
+def momenta(state: object, cell: float) -> tuple[FloatArray, FloatArray, float, float]:
+    """Linear and angular momentum of particles of mass 1, the affine part included, and their scales.
+
+    L = sum x cross v + dx^2/4 skew(C) (Jiang et al. 2015, eq. 10); the scales are sum |v| and sum |x - mean| |v|.
+    """
+    x, v, c = (np.asarray(getattr(state, name), np.float64) for name in ("x", "v", "c"))
+    skew = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=1)
+    angular = (np.cross(x, v) + cell**2 / 4 * skew).sum(axis=0)
+    speed = np.linalg.norm(v, axis=1)
+    arm = np.linalg.norm(x - x.mean(axis=0), axis=1)
+    return v.sum(axis=0), angular, float(speed.sum()), float((arm * speed).sum())
+
+
+def full(s: FloatArray) -> FloatArray:
+    """(n, 6) as symmetric (n, 3, 3)."""
+    return s[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
+
+
+CUBES = (  # side, spacing [m]
+    ("yield_plateau", "dx 0.5 mm", 4e-3, 0.25e-3),
+    ("yield_plateau", "dx 0.25 mm", 4e-3, 0.125e-3),
+    ("plasticine_step", "dx 0.5 mm, 64000 particles", 10e-3, 0.25e-3),
+)
+
+CASES = (
+    Case("materials", "oedometer", "tacsim", "h 1 mm", partial(oedometer, 1e-3)),
+    Case("materials", "oedometer", "tacsim", "h 0.5 mm", partial(oedometer, 0.5e-3)),
+    Case("materials", "simple_shear", "tacsim", "64000 points", simple_shear),
+    Case("materials", "wave_speed", "tacsim", "h 0.5 mm", partial(gel_wave, 0.5e-3)),
+    Case("materials", "wave_speed", "tacsim", "dx 0.5 mm", partial(body_wave, 0.25e-3)),
+    Case("materials", "momentum", "tacsim", "dx 1 mm", momentum),
+    *(Case("materials", name, "tacsim", at, partial(yield_plateau, side, fine)) for name, at, side, fine in CUBES),
+    *(
+        Case("materials", name, "textbook", at, partial(textbook_plateau, side, fine), baseline=True)
+        for name, at, side, fine in CUBES
+    ),
+    Case("materials", "gel_step", "tacsim", "h 0.5 mm", gel_step),
+)

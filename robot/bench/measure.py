@@ -1,0 +1,81 @@
+"""Time and memory of one case, inside the process that runs it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+BUDGET = 1.0  # [s] no further repetition once the timed ones took this long
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Timed repetitions of one thing [s]."""
+
+    samples: tuple[float, ...]  # wall
+    processor: float  # median time of all threads together
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.samples))
+
+    @property
+    def spread(self) -> float | None:
+        """Interquartile range; None with fewer than three repetitions."""
+        if len(self.samples) < 3:
+            return None
+        low, high = np.percentile(self.samples, [25, 75])
+        return float(high - low)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What a case found: a row of the report without the names of the case."""
+
+    timing: Timing
+    error: float
+    error_unit: str
+    against: str
+    variant: str = ""
+    substeps: int | None = None
+    figures: dict[str, float] = field(default_factory=dict)
+    note: str = ""
+
+
+def timed(run: Callable[[], T], repeat: int, warm: Callable[[], object] | None = None) -> tuple[Timing, T]:
+    """Times `run` up to `repeat` times, and at least once; returns the times and what the last run gave.
+
+    `warm` (`run` itself by default) goes first, untimed: it compiles kernels or loads them from their cache.
+    """
+    (run if warm is None else warm)()
+    samples: list[float] = []
+    processor: list[float] = []
+    while not samples or (len(samples) < repeat and sum(samples) < BUDGET):
+        cpu, wall = time.process_time(), time.perf_counter()
+        result = run()
+        samples.append(time.perf_counter() - wall)
+        processor.append(time.process_time() - cpu)
+    return Timing(tuple(samples), float(np.median(processor))), result
+
+
+def peak_memory() -> float:
+    """The most memory this process has held [MB].
+
+    On Linux from /proc: getrusage counts what the parent process held when it started this one.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

@@ -1,0 +1,188 @@
+"""Runs cases one after the other, each in a process of its own, and collects the report.
+
+A process a case: its peak memory is its own, Taichi starts once in it, and one that dies takes no other along.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from robot.bench.measure import Measurement, peak_memory
+from robot.bench.schema import Failure, Group, Machine, Metadata, Report, Row
+
+EXIT = 10.0  # [s] a process may take to end after its last word
+PACKAGES = ("tacsim", "taichi", "numpy", "scipy")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One case, by one method at one resolution. `measure` must be importable by name (or a partial of such)."""
+
+    group: Group
+    name: str
+    method: str
+    resolution: str
+    measure: Callable[[int], list[Measurement]]  # repetitions -> rows
+    baseline: bool = False  # only with --baselines: long, or a method that is not ours
+
+
+class Stopped(RuntimeError):
+    """The run was stopped from outside."""
+
+
+def run_cases(
+    cases: Sequence[Case], repeat: int, *, baselines: bool,
+    on_start: Callable[[Case], None] = lambda case: None, stop: Callable[[], bool] = lambda: False,
+) -> Report:  # fmt: skip
+    """Runs `cases` in turn. A case that raises or dies becomes a failure of the report. Raises Stopped."""
+    began, load = time.perf_counter(), _load()
+    rows: list[Row] = []
+    failures: list[Failure] = []
+    for case in cases:
+        on_start(case)
+        found = _in_own_process(case, repeat, stop)
+        if isinstance(found, str):
+            failures.append(
+                Failure(group=case.group, case=case.name, method=case.method, resolution=case.resolution, cause=found)
+            )
+        else:
+            rows += found
+    groups = list(dict.fromkeys(case.group for case in cases))
+    commit, modified = _commit()
+    return Report(
+        metadata=Metadata(
+            date=datetime.now(UTC).replace(microsecond=0),
+            commit=commit,
+            modified=modified,
+            versions=_versions(),
+            machine=_machine(load),
+            groups=groups,
+            baselines=baselines,
+            repeat=repeat,
+            seconds=time.perf_counter() - began,
+        ),
+        results=rows,
+        failures=failures,
+    )
+
+
+def _in_own_process(case: Case, repeat: int, stop: Callable[[], bool]) -> list[Row] | str:
+    """Rows of the case, or what went wrong in words."""
+    context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(case, repeat, there), daemon=True)
+    process.start()
+    there.close()
+    try:
+        while not here.poll(0.1):
+            if stop():
+                raise Stopped("stopped before all cases were over")
+        found: list[Row] | str = here.recv()
+        process.join(EXIT)
+    except EOFError:
+        process.join(EXIT)
+        found = f"its process died with exit code {process.exitcode}"
+    finally:
+        process.kill()  # nothing happens to one that is over
+        process.join()
+        here.close()
+    return found
+
+
+def _work(case: Case, repeat: int, report: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    try:
+        report.send(measure(case, repeat))
+    except Exception as error:  # whatever it is, the other cases go on, and the report names it
+        report.send(f"{type(error).__name__}: {error}")
+    report.close()
+
+
+def measure(case: Case, repeat: int) -> list[Row]:
+    """Runs one case in this process."""
+    found = case.measure(repeat)
+    memory = peak_memory()
+    return [
+        Row(
+            group=case.group,
+            case=case.name,
+            variant=one.variant,
+            method=case.method,
+            resolution=case.resolution,
+            seconds=one.timing.median,
+            spread=one.timing.spread,
+            cpu_seconds=one.timing.processor,
+            repeats=len(one.timing.samples),
+            error=one.error,
+            error_unit=one.error_unit,
+            against=one.against,
+            peak_mb=memory,
+            substeps=one.substeps,
+            figures=one.figures,
+            note=one.note,
+        )
+        for one in found
+    ]
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def _load() -> list[float] | None:
+    return [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None
+
+
+def _machine(load_before: list[float] | None) -> Machine:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    memory = None
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
+    system = f"{platform.system()} {platform.machine()}"
+    return Machine(
+        cpu=_cpu(), cores=cores, memory_gb=memory, system=system, load_before=load_before, load_after=_load()
+    )
+
+
+def _cpu() -> str:
+    listed = Path("/proc/cpuinfo")
+    if listed.exists():
+        for line in listed.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine() or sys.platform
+
+
+def _commit() -> tuple[str | None, bool | None]:
+    """Commit of the checkout this file lies in, and whether it has changes; None for an installed package."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None, None
+    try:
+        commit = _git(root, "rev-parse", "--short=12", "HEAD")
+        return commit, bool(_git(root, "status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.SubprocessError):
+        return None, None
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10, check=True)
+    return done.stdout.strip()

@@ -1,0 +1,85 @@
+"""What a benchmark says: rows with time, error and memory from one run, and the machine they were measured on."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+Group = Literal["press", "squeeze", "materials"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Row(_Frozen):
+    """One thing measured by one method at one resolution."""
+
+    group: Group
+    case: str
+    variant: str = ""  # of the case: a depth, a material
+    method: str  # tacsim; or what it is compared with: seed, textbook, tacchi-settings, layer
+    resolution: str
+    seconds: NotNegative  # median of the timed repetitions; compiling is not in it
+    spread: NotNegative | None  # interquartile range of the same [s]; None with fewer than three repetitions
+    cpu_seconds: NotNegative  # median processor time, all threads together: what a busy machine leaves unchanged
+    repeats: Annotated[int, Field(ge=1)]
+    error: NotNegative
+    error_unit: str
+    against: str  # what the error is measured against
+    peak_mb: Annotated[FiniteFloat, Field(gt=0)]  # of the process that measured this case alone [MB]
+    substeps: Annotated[int, Field(ge=0)] | None = None
+    figures: dict[str, FiniteFloat] = {}  # further numbers of the same run, the unit at the end of each name
+    note: str = ""
+
+
+class Failure(_Frozen):
+    """A case that gave no row."""
+
+    group: Group
+    case: str
+    method: str
+    resolution: str
+    cause: str
+
+
+class Machine(_Frozen):
+    """Where it was measured. The load averages tell how much else went on."""
+
+    cpu: str
+    cores: Annotated[int, Field(ge=1)]
+    memory_gb: NotNegative | None
+    system: str
+    load_before: list[float] | None  # load averages of 1, 5 and 15 minutes; None where the system has none
+    load_after: list[float] | None
+
+
+class Metadata(_Frozen):
+    date: datetime
+    commit: str | None  # of the checkout; None without one
+    modified: bool | None  # the checkout has changes that are not committed
+    versions: dict[str, str]  # Python and packages
+    machine: Machine
+    groups: list[Group]
+    baselines: bool
+    repeat: Annotated[int, Field(ge=1)]
+    seconds: NotNegative  # the whole run
+
+
+class Report(_Frozen):
+    """What `tacsim bench --json FILE` writes."""
+
+    schema_version: Literal[1] = 1
+    metadata: Metadata
+    results: list[Row]
+    failures: list[Failure] = []
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of the file that `tacsim bench --json` writes."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Report.model_json_schema()}

@@ -1,0 +1,200 @@
+"""Squeeze group: a plasticine cube between two gels, against the slow limit of the same mesh, and against symmetry."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot.bench.cache import cached
+from robot.bench.measure import Measurement, timed
+from robot.bench.runner import Case
+from tacsim.interface import Pose
+from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.scene import Scene
+
+if TYPE_CHECKING:
+    from tacsim.interface import FloatArray
+
+SQUEEZE = 3e-3  # both sensors together, from touching [m]
+TOUCH = 0.05e-3  # first indentation of each gel: contact is surely made [m]
+SLOW = {"mach": 0.003, "tolerance": 1e-3, "max_substeps": 100_000}
+NOT_SETTLED = {"max_substeps": 0}
+
+
+def squeeze_scene(preset: str, physics: str = "hybrid", **settling: float) -> Scene:
+    """The shipped scene: cube of 10 mm, two gels of 20 x 20 x 4 mm, friction 0.6."""
+    from tacsim.config import load_scene
+
+    overrides = [f"preset={preset}", f"physics={physics}", *(f"settling.{k}={v}" for k, v in settling.items())]
+    return load_scene("squeeze", overrides)
+
+
+def touching(scene: Scene) -> World:
+    """A new world whose gels have just met the body, at rest."""
+    world = make_world(scene)
+    truth = world.truth()
+    assert truth is not None
+    gap = float(world.pose("upper").position[2]) - truth.height
+    close(world, gap + 2 * TOUCH)
+    return world
+
+
+def close(world: World, by: float) -> MoveStats:
+    """Moves both sensors towards each other, by `by` [m] in all."""
+    targets = {}
+    for name, sign in (("lower", 1.0), ("upper", -1.0)):
+        pose = world.pose(name)
+        targets[name] = Pose(pose.position + [0.0, 0.0, sign * by / 2], pose.quaternion)
+    return world.move(targets)
+
+
+def normal_forces(world: World) -> FloatArray:
+    """[N] of lower and upper sensor, positive when pressed."""
+    return np.array([-float(world.wrench(name)[2]) for name in world.sensors])
+
+
+def slow_force(preset: str, physics: str = "hybrid") -> float:
+    """Force [N] after a squeeze so slow that speed plays no part, on the same mesh. Minutes at `standard`; kept."""
+    scene = squeeze_scene(preset, physics, **SLOW)
+
+    def compute() -> list[float]:
+        world = touching(scene)
+        stats = close(world, SQUEEZE)
+        if not stats.settled:
+            raise RuntimeError(f"the slow squeeze did not settle: residual {stats.residual:.2g}")
+        return [float(normal_forces(world).mean())]
+
+    return cached(f"squeeze-{preset}-{physics}", scene.model_dump_json(), compute)[0]
+
+
+def squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]:
+    """3 mm from touch: driven only, then settled to 1 %."""
+    truth = slow_force(preset, physics)
+    rows = []
+    for settling, name in ((NOT_SETTLED, "not settled"), ({}, "settled to 1 %")):
+        start = touching(squeeze_scene(preset, physics))
+        world = make_world(squeeze_scene(preset, physics, **settling))
+        world.restore(start.snapshot())
+        rows += _squeeze_rows(world, truth, name, repeat, overlaps=physics == "hybrid")  # a grid has none
+    return rows
+
+
+def _squeeze_rows(world: World, truth: float, variant: str, repeat: int, *, overlaps: bool) -> list[Measurement]:
+    begin = world.snapshot()
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        return close(world, SQUEEZE)
+
+    # `touching` has used every kernel already
+    timing, stats = timed(run, repeat, warm=lambda: None)
+    forces = normal_forces(world)
+    held = stats.hold > 0
+    mean, gap = float(forces.mean()), abs(float(forces[0] - forces[1]))
+    figures = {"force_n": mean, "truth_n": truth}
+    if held:
+        figures["residual"] = stats.residual
+    note = "" if stats.settled or not held else f"not settled within {stats.hold} substeps of hold"
+    rows = [
+        Measurement(
+            timing, abs(mean / truth - 1) * 100, "% of force", "same mesh, Mach 0.003, tolerance 1e-3", variant,
+            stats.substeps, figures, note,
+        )
+    ]  # fmt: skip
+    if not held:
+        return rows
+    rows.append(
+        Measurement(
+            timing, gap / mean * 100, "% imbalance", "equal forces on both sensors", "force balance",
+            stats.substeps, {"lower_n": float(forces[0]), "upper_n": float(forces[1])}, note,
+        )
+    )  # fmt: skip
+    if overlaps:
+        rows.append(
+            Measurement(
+                timing, stats.overlap * 1e3, "mm overlap", "no overlap of body and gel", "overlap", stats.substeps,
+                {}, note,
+            )
+        )  # fmt: skip
+    return rows  # fmt: skip
+
+
+def control_step(preset: str, physics: str, repeat: int) -> list[Measurement]:
+    """0.1 mm of motion in the middle of a squeeze, settled as by default, and both images of 320 x 240."""
+    from tacsim.config import load_sensor
+    from tacsim.optics.render import Renderer
+
+    scene = squeeze_scene(preset, physics)
+    sensor = load_sensor("ideal", ["geometry.width=320", "geometry.height=240"])
+    camera = Renderer(sensor, scene.gel.size[:2])
+    world = touching(scene)
+    close(world, 1e-3)
+    begin = world.snapshot()
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        stats = close(world, 0.1e-3)
+        for name in world.sensors:
+            camera(world.surface(name))
+        return stats
+
+    timing, stats = timed(run, repeat)
+    forces = normal_forces(world)
+    imbalance = abs(float(forces[0] - forces[1])) / float(forces.mean()) * 100
+    return [
+        Measurement(timing, imbalance, "% imbalance", "equal forces on both sensors", "0.1 mm and two images",
+                    stats.substeps, {"residual": stats.residual}, "" if stats.settled else "not settled")
+    ]  # fmt: skip
+
+
+def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
+    """Pressed 0.5 mm, then the upper sensor moves 3 mm along x: by symmetry the body ends half-way."""
+    way = 3e-3
+    world = touching(squeeze_scene(preset, physics))
+    close(world, 0.5e-3)
+    begin = world.snapshot()
+    centre = world.truth()
+    pose = world.pose("upper")
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        return world.move({"upper": Pose(pose.position + [way, 0.0, 0.0], pose.quaternion)})
+
+    timing, stats = timed(run, repeat, warm=lambda: None)
+    moved = world.truth()
+    assert centre is not None and moved is not None
+    travel = float(moved.position[0] - centre.position[0])
+    return [
+        Measurement(timing, abs(travel - way / 2) * 1e3, "mm", "half the sensor's way, by symmetry", "3 mm sideways",
+                    stats.substeps, {"travel_mm": travel * 1e3, "residual": stats.residual},
+                    "" if stats.settled else "not settled")
+    ]  # fmt: skip
+
+
+SEED_DRAFT = "particles 0.5 mm, dx 1 mm"
+PRESETS = {"draft": "particles 0.5 mm, gel 1 mm", "standard": "particles 0.25 mm, gel 0.5 mm"}
+
+
+def _cases(physics: str, method: str) -> tuple[Case, ...]:
+    return tuple(
+        Case(
+            "squeeze",
+            run.__name__,
+            method,
+            PRESETS[preset] if physics == "hybrid" else SEED_DRAFT,
+            partial(run, preset, physics),
+            baseline,
+        )
+        for preset, run, baseline in (
+            ("draft", squeeze, method != "tacsim"),
+            ("draft", control_step, method != "tacsim"),
+            ("draft", reposition, method != "tacsim"),
+            ("standard", squeeze, True),
+        )
+        if method == "tacsim" or preset == "draft"  # the seed's scheme at `standard` takes many minutes
+    )
+
+
+CASES = (*_cases("hybrid", "tacsim"), *_cases("seed", "seed"))

@@ -1,0 +1,137 @@
+"""`tacsim bench`: time, error and memory, from one run."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import busy, notes, progress, results, say_files
+
+if TYPE_CHECKING:
+    from robot.bench.schema import Report
+
+
+class Groups(StrEnum):
+    """What is measured."""
+
+    all = "all"
+    press = "press"
+    squeeze = "squeeze"
+    materials = "materials"
+
+
+def bench(
+    group: Annotated[Groups, typer.Argument(help="Which cases.")] = Groups.all,
+    json_: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Write the report here, and speed_vs_error.png beside it."),
+    ] = None,
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="Also other methods and fine meshes: many minutes.")
+    ] = False,
+    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Timed repetitions; a case stops at 1 s of them.")] = 5,
+    docs: Annotated[
+        Path | None, typer.Option("--docs", metavar="DIR", help="Write benchmarks.md and its picture here.")
+    ] = None,
+    from_: Annotated[
+        Path | None, typer.Option("--from", metavar="FILE", help="Measure nothing: show this report of an earlier run.")
+    ] = None,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="First compute the limit of the ball's press anew: half an hour.")
+    ] = False,
+) -> None:
+    """Measure how fast, how exact and how large: every row is time, error and peak memory of one run.
+
+    Each case runs in a process of its own; compiling is not timed. Exit code 1 if a case failed.
+
+    Example: tacsim bench press --json press.json
+    """
+    if from_ is not None:
+        report = _read(from_)
+    else:
+        if renew:
+            from robot.bench.limit import renew as compute
+
+            with busy("computing the limit of fine meshes"):
+                compute(notes.print)
+        report = _measure(group, repeat, baselines)
+    _show(report)
+    written: list[Path] = []
+    with busy("writing") if json_ or docs else progress():
+        if json_ is not None:
+            from robot.bench.page import PICTURE, draw
+
+            json_.parent.mkdir(parents=True, exist_ok=True)
+            json_.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
+            draw(report.results, json_.with_name(PICTURE))
+            written += [json_, json_.with_name(PICTURE)]
+        if docs is not None:
+            from robot.bench.page import write_page
+
+            written += write_page(report, docs)
+    say_files(*written)
+    if report.failures:
+        raise typer.Exit(1)
+
+
+def _read(path: Path) -> Report:
+    from pydantic import ValidationError
+
+    from robot.bench.schema import Report
+
+    try:
+        return Report.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the whole file"
+        words = f"{path} is no report of tacsim bench: {place}: {first['msg']} ({error.error_count()} problems)"
+        raise typer.BadParameter(words, param_hint="--from") from None
+
+
+def _measure(group: Groups, repeat: int, baselines: bool) -> Report:
+    with busy("loading"):
+        from robot.bench.cases import chosen
+        from robot.bench.runner import Case, Stopped, run_cases
+        from robot.bench.schema import GROUPS
+
+    wanted = [name for name in GROUPS if group in (Groups.all, name)]
+    cases = chosen(wanted, baselines=baselines)
+    with Interrupt() as interrupt, progress() as bar:
+        row = bar.add_task("starting", total=len(cases))
+        begun = 0
+
+        def say(case: Case) -> None:
+            nonlocal begun
+            words = f"{case.name}, {case.method}, {case.resolution}"
+            bar.update(row, completed=begun, description=words)
+            if not notes.is_terminal:  # a log has no bar
+                notes.print(f"{begun + 1}/{len(cases)} {words}", markup=False)
+            begun += 1
+
+        try:
+            return run_cases(cases, repeat, baselines=baselines, on_start=say, stop=interrupt)
+        except Stopped:
+            complain("stopped by a signal; nothing is written")
+            raise typer.Exit(interrupt.exit_code) from None
+
+
+def _show(report: Report) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from robot.bench.page import COLUMNS, cells
+
+    table = Table(box=None, padding=(0, 1))
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column in COLUMNS[:3] else "right", overflow="fold")
+    for row in report.results:
+        table.add_row(*cells(row))
+    # a file or a pipe has no width; a table folded to 80 columns cannot be read there
+    Console(width=None if results.is_terminal else 160, highlight=False).print(table)
+    for failure in report.failures:
+        complain(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")

@@ -1,0 +1,209 @@
+"""Guards, rollback and retries, on a world of one particle and on real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacsim.interface import Pose
+from tacsim.physics import diagnosis, press
+from tacsim.physics.controller import Path
+from tacsim.physics.health import RETRIES, Health, Place, SimulationDiverged, attempt, require_room, retried
+from tacsim.physics.press import PressWorld
+from tacsim.physics.world import MoveStats
+from tacsim.scene import Gel, Indenter, Scene, Sphere
+
+STATS = MoveStats(10, 5, 0.001, True, 0.0, 0)
+HERE = Place("in substeps 0 to 20 of 40 of the motion", {"lower": Pose(np.array([0, 0, 1e-3]))})
+WELL = Health(1.0, 0, 1.0, 0.01, 0, 0.0)
+
+
+class Particles:
+    """A world whose motion is whatever a test wants."""
+
+    def __init__(self) -> None:
+        self.scene = Scene()
+        self.arrays = {"position": np.ones((4, 3), np.float32), "velocity": np.zeros((4, 3), np.float32)}
+
+    def pose(self, name: str) -> Pose:
+        return Pose()
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        return {name: a.copy() for name, a in self.arrays.items()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        for name, a in self.arrays.items():
+            a[...] = state[name]
+
+    def launch(self, change: Callable[[dict[str, np.ndarray]], Any], seen: Health = WELL) -> Health:
+        def kernels() -> Health:
+            change(self.arrays)
+            return seen
+
+        return attempt(self.arrays, kernels, HERE)
+
+
+def set_to(name: str, index: tuple[int, ...], value: float) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        arrays[name][index] = value
+
+    return change
+
+
+def nothing(arrays: dict[str, np.ndarray]) -> None:
+    del arrays
+
+
+@pytest.mark.parametrize(
+    ("seen", "words"),
+    [
+        (Health(0.01, 0, 1.0, 0.0, 0, 0.0), "inverted or crushed (volume ratio 0.01)"),
+        (Health(float("nan"), 0, 1.0, 0.0, 0, 0.0), "inverted or crushed"),
+        (Health(1.0, 0, 0.05, 0.0, 0, 0.0), "lost its volume in one substep"),
+        (Health(1.0, 0, 1.0, 0.7, 0, 0.0), "0.7 of the wave speed (limit 0.5)"),
+        (Health(1.0, 3, 1.0, 0.0, 0, 0.0), "left the grid (3 particle substeps)"),
+    ],
+)
+def test_what_the_kernels_saw_is_judged(seen: Health, words: str) -> None:
+    with pytest.raises(SimulationDiverged) as caught:
+        Particles().launch(nothing, seen)
+    assert words in caught.value.cause and "lower at (0.000, 0.000, 1.000) mm" in caught.value.where
+
+
+def test_a_sound_launch_passes() -> None:
+    assert Particles().launch(set_to("position", (1, 2), 1.5)) == WELL
+
+
+def test_the_cause_names_array_index_and_how_many() -> None:
+    with pytest.raises(SimulationDiverged, match=r"velocity\[2, 1\] is nan, with 1 more of 12"):
+        Particles().launch(lambda a: a["velocity"].__setitem__((slice(2, 4), 1), np.nan))
+
+
+def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
+    world = Particles()
+    world.arrays["gel_velocity"] = np.zeros((1, 2, 2, 2, 3), np.float32)
+    with pytest.raises(SimulationDiverged, match=r"gel node moves at 0\.6 of the wave speed"):
+        world.launch(set_to("gel_velocity", (0, 1, 1, 1, 2), -0.6))
+    world = Particles()
+    world.arrays["strain"] = np.zeros((4, 6), np.float32)
+    with pytest.raises(SimulationDiverged, match=r"a particle is crushed \(elastic volume ratio 0\.0316\)"):
+        world.launch(set_to("strain", (3, 2), -0.999))
+
+
+def test_a_motion_starts_again_from_the_state_before_it() -> None:
+    world, seen = Particles(), []
+
+    def motion(refine: int) -> MoveStats:
+        seen.append((refine, float(world.arrays["position"][0, 0])))
+        world.arrays["position"] += 1.0
+        world.launch(set_to("velocity", (0, 0), 0.0 if refine == 2 else np.nan))
+        return STATS
+
+    stats = retried(world, {}, motion)
+    assert seen == [(1, 1.0), (2, 1.0)]
+    assert stats.retries == 1 and world.arrays["position"][0, 0] == 2.0
+
+
+def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
+    world, steps = Particles(), []
+    before = world.snapshot()
+
+    def motion(refine: int) -> MoveStats:
+        steps.append(refine)
+        world.launch(nothing)
+        world.launch(lambda a: (a["position"].__iadd__(2.0), a["velocity"].__setitem__((1, 0), np.inf)))
+        return STATS
+
+    with pytest.raises(SimulationDiverged) as caught:
+        retried(world, {}, motion)
+    assert steps == [2**retry for retry in range(RETRIES + 1)]
+    assert all(world.arrays[name].tobytes() == before[name].tobytes() for name in before)
+    text = str(caught.value)
+    assert "velocity[1, 0] is inf at particle 1, (1.000, 1.000, 1.000) mm in the world" in text
+    assert f"even with 1/{2**RETRIES} of the time step" in text and "move less far" in text
+    assert caught.value.good["position"][0, 0] == 1.0 and caught.value.failed["position"][0, 0] == 3.0
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None:
+    world = Particles()
+
+    def motion(refine: int) -> MoveStats:
+        world.arrays["position"] += 1.0
+        raise error
+
+    with pytest.raises(error):
+        retried(world, {}, motion)
+    assert world.arrays["position"].max() == 1.0
+
+
+def test_a_broken_state_is_told_before_anything_moves() -> None:
+    world = Particles()
+    world.arrays["position"][3, 0] = np.nan
+    with pytest.raises(
+        SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
+    ):
+        retried(world, {}, lambda refine: pytest.fail("it moved"))
+
+
+def test_a_grid_without_end_is_refused() -> None:
+    require_room(np.zeros(3), np.full(3, 100.0), 1.0, HERE)
+    with pytest.raises(SimulationDiverged, match="spread over 1000 x 1000 x 1000 mm"):
+        require_room(np.zeros(3), np.full(3, 1000.0), 1.0, HERE)
+    with pytest.raises(SimulationDiverged):
+        require_room(np.zeros(3), np.array([1.0, 1.0, 1e38], np.float32), 1e-3, HERE)
+
+
+def test_volumes_are_those_of_the_determinant() -> None:
+    rng = np.random.default_rng(0)
+    u = rng.normal(0, 0.3, (2, 4, 3, 5, 3)).astype(np.float32)
+    centres, corners = (f({"gel_displacement": u}, 2.0) for f in (diagnosis.element_volumes, diagnosis.corner_volumes))
+    assert centres is not None and corners is not None and centres.shape == corners.shape == (2, 3, 2, 4)
+    h = 0.5
+    for gel, i, j, k in np.ndindex(centres.shape):
+        cell = u[gel, i : i + 2, j : j + 2, k : k + 2].astype(np.float64)
+        edges = [np.diff(cell, axis=axis) / h for axis in range(3)]
+        mean = np.stack([edge.mean(axis=(0, 1, 2)) for edge in edges], axis=1)
+        assert centres[gel, i, j, k] == pytest.approx(np.linalg.det(np.eye(3) + mean), rel=1e-6, abs=1e-9)
+        least = min(
+            np.linalg.det(np.eye(3) + np.stack([edges[0][0, b, c], edges[1][a, 0, c], edges[2][a, b, 0]], axis=1))
+            for a, b, c in np.ndindex(2, 2, 2)
+        )
+        assert corners[gel, i, j, k] == pytest.approx(least, rel=1e-6, abs=1e-9)
+    assert not diagnosis.nearly_at_rest({"gel_displacement": u}, 2.0)
+    assert diagnosis.nearly_at_rest({"gel_displacement": 0.1 * h * np.sign(u)}, 2.0)
+
+    f = np.eye(3) + rng.normal(0, 0.2, (50, 3, 3))
+    volumes = diagnosis.particle_volumes({"deformation_gradient": f})
+    assert volumes == pytest.approx(np.linalg.det(f), rel=1e-9)
+    e = f @ np.swapaxes(f, 1, 2) - np.eye(3)
+    six = np.stack([e[:, 0, 0], e[:, 1, 1], e[:, 2, 2], e[:, 0, 1], e[:, 0, 2], e[:, 1, 2]], axis=1)
+    assert diagnosis.particle_volumes({"strain": six}) == pytest.approx(np.abs(np.linalg.det(f)), rel=1e-9)
+
+
+def test_a_place_tells_where_the_frames_are() -> None:
+    path = Path([Pose()], [Pose(np.array([0, 0, 2e-3]))], substeps=40, dt=0.4)
+    assert str(path.place(["lower"], 0, 20)) == (
+        "in substeps 0 to 20 of 40 of the motion, lower at (0.000, 0.000, 1.000) mm"
+    )
+
+
+def test_a_press_with_too_long_a_step_comes_out_right_by_retrying(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pressed() -> tuple[float, int]:
+        world = PressWorld(
+            Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3,) * 2 + (4e-3,)))
+        )
+        retries = 0
+        for _ in range(3):
+            pose = world.pose("indenter")
+            retries += world.move({"indenter": Pose(pose.position - [0, 0, 0.3e-3])}).retries
+        return -float(world.wrench("lower")[2]), retries
+
+    truth, none = pressed()
+    monkeypatch.setattr(press, "COURANT", 1.2)
+    found, some = pressed()
+    assert none == 0 and some > 0
+    assert found == pytest.approx(truth, rel=0.08)

@@ -1,0 +1,143 @@
+"""Timing, memory, processes of their own, the cache, the report."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import time
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from robot.bench import cache, measure
+from robot.bench.cases import CASES, chosen, description
+from robot.bench.measure import Timing, peak_memory, timed
+from robot.bench.press import layer_press
+from robot.bench.runner import Case, Stopped, run_cases
+from robot.bench.schema import GROUPS, Report, Row, json_schema
+
+
+def test_the_first_run_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: 0.01 * next(clock) ** 2)
+    calls: list[int] = []
+    timing, last = timed(lambda: calls.append(0) or len(calls), 4)
+    assert last == 5 and len(timing.samples) == 4
+    assert timing.samples == pytest.approx([0.01, 0.05, 0.09, 0.13])  # each between two looks at the clock
+
+
+def test_repetitions_stop_at_the_budget_but_one_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: 0.6 * measure.BUDGET * next(clock))
+    assert len(timed(lambda: 0, 10)[0].samples) == 2
+    assert len(timed(lambda: 0, 1)[0].samples) == 1
+
+
+def test_median_and_spread() -> None:
+    timing = Timing((5.0, 1.0, 2.0, 4.0, 3.0), 1.0)
+    assert timing.median == 3.0 and timing.spread == 2.0
+    assert Timing((1.0, 9.0), 1.0).spread is None
+
+
+def test_peak_memory_sees_a_large_array_that_is_gone() -> None:
+    before = peak_memory()
+    block = bytearray(int(before * 1e6))
+    block[::4096] = b"x" * len(block[::4096])
+    del block
+    assert peak_memory() > 1.5 * before
+
+
+# Importable by name, as a spawned process needs it: json.loads(3) raises, os._exit(3) dies, time.sleep(30) hangs.
+RAISES = Case("press", "raises", "tacsim", "none", json.loads)
+DIES = Case("press", "dies", "tacsim", "none", os._exit)
+HANGS = Case("press", "hangs", "tacsim", "none", time.sleep)
+WORKS = Case("press", "sphere_press", "layer", "pixel 0.0625 mm", layer_press)
+
+
+def test_a_case_that_raises_or_dies_is_named_and_the_next_one_runs() -> None:
+    report = run_cases([RAISES, DIES, WORKS], 3, baselines=False)
+    assert [failure.case for failure in report.failures] == ["raises", "dies"]
+    assert "TypeError" in report.failures[0].cause
+    assert "exit code 3" in report.failures[1].cause
+    (row,) = report.results
+    assert 1 <= row.repeats <= 3 and row.seconds > 0 and row.cpu_seconds > 0
+    assert 20 < row.peak_mb < 1000
+    assert 2 < row.error < 20  # small strain without friction at a quarter of the thickness
+    assert report.metadata.machine.cores >= 1 and report.metadata.versions["numpy"]
+    assert Report.model_validate_json(report.model_dump_json()) == report
+
+
+def test_a_stop_ends_the_running_case_at_once() -> None:
+    began = time.perf_counter()
+    with pytest.raises(Stopped):
+        run_cases([HANGS], 30, baselines=False, stop=lambda: time.perf_counter() - began > 0.3)
+    assert time.perf_counter() - began < 10
+    assert not [child for child in multiprocessing.active_children() if child.name.startswith("SpawnProcess")]
+
+
+ROW = {
+    "group": "press", "case": "a", "method": "tacsim", "resolution": "h", "seconds": 1.0, "spread": None,
+    "cpu_seconds": 1.0, "repeats": 1, "error": 0.5, "error_unit": "%", "against": "truth", "peak_mb": 100.0,
+}  # fmt: skip
+
+
+def test_no_row_without_time_error_and_memory() -> None:
+    Row.model_validate(ROW)
+    for name in ("seconds", "cpu_seconds", "error", "error_unit", "against", "peak_mb"):
+        with pytest.raises(ValidationError, match=name):
+            Row.model_validate({key: value for key, value in ROW.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("error", float("nan")), ("seconds", -1.0), ("peak_mb", 0.0), ("group", "x"), ("more", 1)]
+)
+def test_rows_that_say_nothing_are_refused(name: str, value: object) -> None:
+    with pytest.raises(ValidationError, match=name):
+        Row.model_validate({**ROW, name: value})
+
+
+def test_the_schema_names_what_a_row_has() -> None:
+    row = json_schema()["$defs"]["Row"]
+    assert {"case", "method", "resolution", "seconds", "error", "error_unit", "peak_mb"} <= set(row["required"])
+    assert row["additionalProperties"] is False
+
+
+def test_cases_are_distinct_described_and_importable() -> None:
+    import pickle
+
+    names = [(case.group, case.name, case.method, case.resolution) for case in CASES]
+    assert len(set(names)) == len(names)
+    for case in CASES:
+        assert description(case.group, case.name, case.method).endswith((".", ":")), case.name
+        pickle.dumps(case)  # as it goes to its process
+
+
+def test_without_baselines_only_short_cases_of_ours() -> None:
+    for group in GROUPS:
+        short, every = chosen([group], baselines=False), chosen([group], baselines=True)
+        assert short and set(short) < set(every)
+        assert {case.method for case in short} <= {"tacsim", "layer"}
+
+
+def test_the_cache_answers_only_the_same_question_of_the_same_physics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path)
+    asked: list[str] = []
+
+    def answer(value: float) -> list[float]:
+        asked.append("")
+        return [value]
+
+    assert cache.cached("a", "question", lambda: answer(1.0)) == [1.0]
+    assert cache.cached("a", "question", lambda: answer(2.0)) == [1.0]
+    assert cache.cached("a", "other question", lambda: answer(3.0)) == [3.0]
+    assert len(asked) == 2
+    for kept in tmp_path.iterdir():
+        kept.write_text("[1.0", encoding="utf-8")
+    assert cache.cached("a", "question", lambda: answer(4.0)) == [4.0]
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "file.json" / "no folder")
+    (tmp_path / "file.json").write_text("", encoding="utf-8")
+    assert cache.cached("a", "question", lambda: answer(5.0)) == [5.0]

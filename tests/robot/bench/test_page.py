@@ -1,0 +1,105 @@
+"""The command, the page, the picture."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner, Result
+
+from robot.bench.page import PICTURE, cells, costs, draw, markdown
+from robot.bench.schema import Report
+from robot.cli import app
+
+ROOT = Path(__file__).resolve().parents[3]
+REFERENCE = ROOT / "benchmarks" / "reference.json"
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    return Report.model_validate_json(REFERENCE.read_bytes())
+
+
+def tacsim(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
+
+
+def test_the_published_page_is_that_of_the_published_report(report: Report) -> None:
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert page == markdown(report), "run: tacsim bench --from benchmarks/reference.json --docs docs"
+
+
+def test_the_published_report_is_whole(report: Report) -> None:
+    assert report.failures == []
+    assert {row.group for row in report.results} == {"press", "squeeze", "materials"}
+    assert {"tacsim", "layer", "seed", "textbook", "tacchi-settings"} == {row.method for row in report.results}
+
+
+def test_a_row_is_shown_with_time_error_and_memory(report: Report) -> None:
+    row = report.results[0].model_copy(
+        update={
+            "seconds": 0.12345,
+            "spread": 0.02,
+            "error": 3.4567,
+            "error_unit": "%",
+            "peak_mb": 171.3,
+            "variant": "v",
+        }
+    )
+    shown = cells(row)
+    assert shown[0] == f"{row.case}: v"
+    assert "0.123 ± 0.02" in shown and "3.46 %" in shown and "171" in shown
+    bare = row.model_copy(update={"figures": {"wall_per_particle_substep_ns": 75.4, "force_n": 1.0}})
+    assert costs(bare) == ["75 ns wall a substep and particle"]
+
+
+def test_a_report_is_shown_and_written_again_without_measuring(tmp_path: Path, report: Report) -> None:
+    result = tacsim(
+        "bench", "--from", REFERENCE, "--json", tmp_path / "new" / "again.json", "--docs", tmp_path / "docs"
+    )
+    assert result.exit_code == 0, result.output
+    assert "sphere_press" in result.stdout and "tacchi-settings" in result.stdout
+    again = json.loads((tmp_path / "new" / "again.json").read_text(encoding="utf-8"))
+    assert again == json.loads(REFERENCE.read_text(encoding="utf-8"))
+    assert imread(tmp_path / "new" / PICTURE).std() > 0.01
+    assert (tmp_path / "docs" / "benchmarks.md").is_file() and (tmp_path / "docs" / "images" / PICTURE).is_file()
+
+
+def test_a_picture_of_nothing_is_drawn_too(tmp_path: Path) -> None:
+    draw([], tmp_path / "empty.png")
+    assert imread(tmp_path / "empty.png").shape[2] in (3, 4)
+
+
+def test_a_failure_is_shown_and_is_the_exit_code(tmp_path: Path, report: Report) -> None:
+    failure = {"group": "press", "case": "lost", "method": "tacsim", "resolution": "h", "cause": "it broke | here"}
+    broken = json.loads(report.model_dump_json()) | {"failures": [failure]}
+    (tmp_path / "broken.json").write_text(json.dumps(broken), encoding="utf-8")
+    result = tacsim("bench", "--from", tmp_path / "broken.json")
+    assert result.exit_code == 1
+    assert "lost" in result.output and "it broke" in result.output
+
+
+def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text('{"results": []}', encoding="utf-8")
+    result = tacsim("bench", "--from", tmp_path / "other.json")
+    assert result.exit_code == 2
+    assert "metadata" in result.output
+    assert tacsim("bench", "--from", tmp_path / "none.json").exit_code != 0
+    assert tacsim("bench", "nothing").exit_code == 2
+    assert tacsim("bench", "--repeat", "0").exit_code == 2
+
+
+def test_help_and_schema() -> None:
+    assert "Example: tacsim bench" in tacsim("bench", "--help").stdout
+    schema = json.loads(tacsim("schema", "bench").stdout)
+    assert set(schema["required"]) == {"metadata", "results"}
+
+
+def test_listing_the_cases_starts_no_taichi() -> None:
+    code = "import sys, robot.bench.cases, robot.bench.page; print('taichi' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "False"

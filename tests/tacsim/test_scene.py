@@ -1,0 +1,47 @@
+"""What a scene refuses before anything is built from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from tacsim.optics.geometry import CanonicalGrid
+from tacsim.scene import BodyMaterial, Box, GelMaterial, Scene, Sphere
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"element_size": 1e-9}, r"1\.6e\+21 cells at element_size 1e-09 m, the limit is 5,000,000"),
+        ({"gel": {"size": [1e308, 1e308, 1e308]}}, "inf cells"),
+        ({"gel": {"size": [0.02, 0.02, 1e-6]}}, r"3\.2e\+09 cells at element_size 5e-07 m"),
+        ({"physics": "seed", "particle_spacing": 1e-5}, r"1\.6e\+09 cells at particle_spacing 1e-05 m"),
+        ({"element_size": 2.1e-3}, r"too coarse for a gel 0\.004 m thick.*at most 0\.002 m"),
+    ],
+)
+def test_a_resolution_that_no_machine_or_no_gel_has_is_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Scene.model_validate(values)
+
+
+def test_the_coarsest_gel_has_two_layers() -> None:
+    assert Scene(element_size=2e-3).element == 2e-3
+
+
+@pytest.mark.parametrize("modulus", [0.5, 1e308])
+def test_a_modulus_that_no_material_has_is_refused(modulus: float) -> None:
+    for material in (GelMaterial, BodyMaterial):
+        with pytest.raises(ValidationError, match="youngs_modulus"):
+            material(youngs_modulus=modulus)
+
+
+def test_sizes_beyond_what_touches_a_gel_are_refused() -> None:
+    for size in (1e-300, 1e308):
+        with pytest.raises(ValidationError, match="radius"):
+            Sphere(radius=size)
+        with pytest.raises(ValidationError, match="size"):
+            Box(size=(1e-2, size, 1e-2))
+        with pytest.raises(ValidationError, match="pitch"):
+            CanonicalGrid(pitch=size)

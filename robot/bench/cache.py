@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 
@@ -42,12 +43,15 @@ def folder() -> Path:
     return root / "tacsim" / "bench"
 
 
-def _key(question: str) -> str:
-    """Changes with the question and with every source file of the physics."""
-    import tacsim.physics
+def fingerprint(*packages: str) -> str:
+    """Changes with every source file of the packages, by name and content."""
+    digest = hashlib.sha256()
+    for package in packages:
+        (folder,) = import_module(package).__path__
+        for source in sorted(Path(folder).rglob("*.py")):
+            digest.update(source.relative_to(folder).as_posix().encode() + source.read_bytes())
+    return digest.hexdigest()
 
-    digest = hashlib.sha256(question.encode())
-    (package,) = tacsim.physics.__path__
-    for source in sorted(Path(package).glob("*.py")):
-        digest.update(source.name.encode() + source.read_bytes())
-    return digest.hexdigest()[:16]
+
+def _key(question: str) -> str:
+    return hashlib.sha256((question + fingerprint("tacsim.physics")).encode()).hexdigest()[:16]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -88,6 +89,8 @@ def _setting(report: Report) -> str:
         "no commit" if facts.commit is None else f"commit {facts.commit}{' with changes' if facts.modified else ''}"
     )
     versions = ", ".join(f"{name} {version}" for name, version in facts.versions.items())
+    if facts.changed:
+        commit += ", **and the code changed while this ran**: not all rows are of one version"
     return (
         f"{machine.cpu}, {machine.cores} cores, {machine.system}; {load} (others worked on the machine if it is above "
         f"the number of cores; compare CPU s then). {facts.date:%Y-%m-%d}, {commit}; {versions}."
@@ -128,13 +131,20 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     for index, ((_, _, title, unit), points) in enumerate(shown):
         axes = plain(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
         axes.set(xscale="log", yscale="log")
-        axes.margins(0.25)
         for row in points:
             colour = f"C{methods.index(row.method)}"
             axes.plot(row.seconds, row.error, "o", color=colour)
             words = f"{row.method}\n{row.resolution.partition(',')[0]}"
             axes.annotate(words, (row.seconds, row.error), (5, 4), textcoords="offset points", fontsize=7, color=colour)
+        if points:
+            axes.set_xlim(*_decades([row.seconds for row in points]))
+            axes.set_ylim(*_decades([row.error for row in points]))
     save(figure, path)
+
+
+def _decades(values: Sequence[float]) -> tuple[float, float]:
+    """Whole powers of ten round `values`, so that each axis has at least two numbers on it."""
+    return 10.0 ** math.floor(math.log10(min(values) / 1.2)), 10.0 ** math.ceil(math.log10(max(values) * 1.2))
 
 
 def _points(rows: Iterable[Row], case: str, variant: str) -> list[Row]:

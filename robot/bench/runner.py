@@ -19,6 +19,7 @@ from importlib import metadata
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from robot.bench.cache import fingerprint
 from robot.bench.measure import Measurement, peak_memory
 from robot.bench.schema import Failure, Group, Machine, Metadata, Report, Row
 
@@ -48,6 +49,7 @@ def run_cases(
 ) -> Report:  # fmt: skip
     """Runs `cases` in turn. A case that raises or dies becomes a failure of the report. Raises Stopped."""
     began, load = time.perf_counter(), _load()
+    (commit, modified), code = _commit(), fingerprint("tacsim", "robot", "calibration")
     rows: list[Row] = []
     failures: list[Failure] = []
     for case in cases:
@@ -60,12 +62,12 @@ def run_cases(
         else:
             rows += found
     groups = list(dict.fromkeys(case.group for case in cases))
-    commit, modified = _commit()
     return Report(
         metadata=Metadata(
             date=datetime.now(UTC).replace(microsecond=0),
             commit=commit,
             modified=modified,
+            changed=fingerprint("tacsim", "robot", "calibration") != code,
             versions=_versions(),
             machine=_machine(load),
             groups=groups,

@@ -61,8 +61,9 @@ class Machine(_Frozen):
 
 class Metadata(_Frozen):
     date: datetime
-    commit: str | None  # of the checkout; None without one
-    modified: bool | None  # the checkout has changes that are not committed
+    commit: str | None  # of the checkout when the run began; None without one
+    modified: bool | None  # the checkout had changes that were not committed
+    changed: bool  # the code changed while the run went on: its rows are not all of one version
     versions: dict[str, str]  # Python and packages
     machine: Machine
     groups: list[Group]

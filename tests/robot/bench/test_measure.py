@@ -135,9 +135,31 @@ def test_the_cache_answers_only_the_same_question_of_the_same_physics(
     assert cache.cached("a", "question", lambda: answer(2.0)) == [1.0]
     assert cache.cached("a", "other question", lambda: answer(3.0)) == [3.0]
     assert len(asked) == 2
+    monkeypatch.setattr(cache, "fingerprint", lambda package: "changed physics")
+    assert cache.cached("a", "question", lambda: answer(6.0)) == [6.0]
+    monkeypatch.undo()
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path)
     for kept in tmp_path.iterdir():
         kept.write_text("[1.0", encoding="utf-8")
     assert cache.cached("a", "question", lambda: answer(4.0)) == [4.0]
     monkeypatch.setattr(cache, "folder", lambda: tmp_path / "file.json" / "no folder")
     (tmp_path / "file.json").write_text("", encoding="utf-8")
     assert cache.cached("a", "question", lambda: answer(5.0)) == [5.0]
+
+
+def test_the_fingerprint_follows_the_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some_package").mkdir()
+    source = tmp_path / "some_package" / "__init__.py"
+    source.write_text("", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = cache.fingerprint("some_package")
+    assert cache.fingerprint("some_package") == before
+    source.write_text("# changed", encoding="utf-8")
+    assert cache.fingerprint("some_package") != before
+
+
+def test_a_report_says_when_the_code_changed_under_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = iter(("one", "two", "two", "two"))
+    monkeypatch.setattr("robot.bench.runner.fingerprint", lambda *packages: next(versions))
+    assert run_cases([], 1, baselines=False).metadata.changed
+    assert not run_cases([], 1, baselines=False).metadata.changed

@@ -10,7 +10,6 @@ from tacsim.physics.material import vec3, vec4
 from tacsim.runtime import ti
 
 vec2 = ti.types.vector(2, ti.f32)
-ivec2 = ti.types.vector(2, ti.i32)
 
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
@@ -72,9 +71,13 @@ def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
 
 
 @ti.func
-def contact_ceiling(u: ti.template(), h, radius):
-    """A particle higher than this above the rest surface cannot touch: a gel bulges by far less than its thickness."""
-    return 0.2 * h * (u.shape[3] - 1) + radius
+def contact_ceiling(u: ti.template(), g, radius):
+    """A particle higher than this above the rest surface touches nothing: a spline stays below its highest node."""
+    highest = 0.0
+    for i in range(u.shape[1]):
+        for j in range(u.shape[2]):
+            highest = ti.max(highest, u[g, i, j, u.shape[3] - 1][2])
+    return highest + 2.0 * radius  # one radius to touch, one for what the contact's memory still bridges
 
 
 @ti.func

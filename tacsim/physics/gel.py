@@ -28,7 +28,6 @@ class GelFacts:
     spacing: float  # [mm]
     mu: float  # [MPa]
     lam: float  # [MPa]
-    friction: float
 
     @property
     def density(self) -> float:
@@ -56,7 +55,7 @@ def gel_facts(gel: Gel, element: float) -> GelFacts:
             )
     nx, ny = (round(side / spacing) for side in gel.size[:2])
     mu, lam = lame(gel.material)
-    return GelFacts((nx, ny, counts[2]), spacing * MM, mu * MPA, lam * MPA, 0.0)
+    return GelFacts((nx, ny, counts[2]), spacing * MM, mu * MPA, lam * MPA)
 
 
 @dataclass

@@ -23,7 +23,7 @@ from tacsim.physics.plasticine import (
     grid_to_particles,
     particles_to_grid,
 )
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
 from tacsim.scene import GelSurface, Scene
@@ -92,7 +92,7 @@ def touch(
     origin, velocity, spin = row(drive, it, g, 3), row(drive, it, g, 4), row(drive, it, g, 5)
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    highest = contact_ceiling(u, h, radius)
+    highest = contact_ceiling(u, g, radius)
     total, moment = vec3(0.0), vec3(0.0)
     for p in range(x.shape[0]):
         arm = x[p] - origin
@@ -217,17 +217,12 @@ class HybridWorld:
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        state = {name: a.copy() for name, a in self._arrays().items()}
-        state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
+        state = taken(self._arrays(), self._poses)
         state["speed"] = np.array(self._speed)
         return state
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        for name, a in self._arrays().items():
-            if state[name].shape != a.shape:
-                raise ValueError(f"snapshot: {name} has shape {state[name].shape}, this world needs {a.shape}")
-            a[...] = state[name]
-        self._poses = {name: Pose(p[:3], p[3:]) for name, p in zip(self.sensors, state["poses"], strict=True)}
+        self._poses = put_back(self._arrays(), self.sensors, state)
         self._speed = float(state["speed"])
 
     def pose(self, name: str) -> Pose:

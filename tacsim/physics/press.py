@@ -12,7 +12,7 @@ from tacsim.physics.health import Health, as_float32, attempt, retried
 from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
 from tacsim.physics.material import vec3
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
 from tacsim.shapes import distance_grid, extent
@@ -96,16 +96,10 @@ class PressWorld:
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        state = {name: a.copy() for name, a in self._arrays().items()}
-        state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
-        return state
+        return taken(self._arrays(), self._poses)
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        for name, a in self._arrays().items():
-            if state[name].shape != a.shape:
-                raise ValueError(f"snapshot: {name} has shape {state[name].shape}, this world needs {a.shape}")
-            a[...] = state[name]
-        self._poses = {name: Pose(p[:3], p[3:]) for name, p in zip(self._poses, state["poses"], strict=True)}
+        self._poses = put_back(self._arrays(), list(self._poses), state)
 
     def pose(self, name: str) -> Pose:
         return self._poses[name]

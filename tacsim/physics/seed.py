@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from tacsim.interface import Pose, Truth
 from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle, plan
 from tacsim.physics.health import Health, Place, SimulationDiverged, as_float32, attempt, require_room, retried
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, put_back
 from tacsim.runtime import start
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 from tacsim.shapes import particles
@@ -136,14 +136,7 @@ class SeedWorld:
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Raises ValueError if `state` is no snapshot of such a world."""
-        arrays = {**self._arrays(), "poses": np.empty((2, 7))}
-        for name, a in arrays.items():
-            if name not in state or state[name].shape != a.shape:
-                found = state[name].shape if name in state else "nothing"
-                raise ValueError(f"snapshot: '{name}' must have shape {a.shape}, found {found}; is it of this scene?")
-        for name, a in self._arrays().items():
-            a[...] = state[name]
-        self._poses = {name: Pose(p[:3], p[3:]) for name, p in zip(self.sensors, state["poses"], strict=True)}
+        self._poses = put_back(self._arrays(), self.sensors, state)
 
     def pose(self, name: str) -> Pose:
         return self._poses[name]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -60,6 +60,27 @@ class World(Protocol):
         ...
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
+
+
+def taken(arrays: Mapping[str, NDArray[Any]], poses: Mapping[str, Pose]) -> dict[str, NDArray[Any]]:
+    """A snapshot: copies of a world's arrays, and the poses of its driven frames."""
+    state = {name: a.copy() for name, a in arrays.items()}
+    state["poses"] = np.array([[*p.position, *p.quaternion] for p in poses.values()])
+    return state
+
+
+def put_back(
+    arrays: Mapping[str, NDArray[Any]], frames: Sequence[str], state: Mapping[str, NDArray[Any]]
+) -> dict[str, Pose]:
+    """Copies a snapshot into a world's arrays; returns the poses. Raises ValueError, with nothing changed, if it does
+    not fit."""
+    for name, shape in {**{name: a.shape for name, a in arrays.items()}, "poses": (len(frames), 7)}.items():
+        if name not in state or state[name].shape != shape:
+            found = state[name].shape if name in state else "nothing"
+            raise ValueError(f"snapshot: '{name}' must have shape {shape}, found {found}; is it of this scene?")
+    for name, a in arrays.items():
+        a[...] = state[name]
+    return {name: Pose(p[:3], p[3:]) for name, p in zip(frames, state["poses"], strict=True)}
 
 
 def make_world(scene: Scene) -> World:

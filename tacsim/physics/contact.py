@@ -6,7 +6,8 @@ rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 197
 holds nothing.
 """
 
-from tacsim.physics.material import vec3, vec4
+from tacsim.physics.lanes import vec3, vec4
+from tacsim.physics.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
 from tacsim.runtime import ti
 
 vec2 = ti.types.vector(2, ti.f32)
@@ -27,30 +28,23 @@ def spline(a):
 
 
 @ti.func
-def top_node(u: ti.template(), g, i, j):
-    """Index of the surface node (i, j), repeated beyond the rim."""
-    return ti.Vector([g, ti.max(0, ti.min(i, u.shape[1] - 1)), ti.max(0, ti.min(j, u.shape[2] - 1)), u.shape[3] - 1])
-
-
-@ti.func
-def displacement_at(u: ti.template(), g, a):
+def displacement_at(skin: ti.template(), env, g, a):
     i, wx, _ = spline(a[0])
     j, wy, _ = spline(a[1])
-    us = vec3(0.0)
+    us = vec4(0.0)
     for p, q in ti.static(ti.ndrange(3, 3)):
-        us += (wx[p] * wy[q]) * u[top_node(u, g, i + p, j + q)]
+        us += (wx[p] * wy[q]) * skin[env, g, 0, i + p + 1, j + q + 1]
     return us
 
 
 @ti.func
-def material_point(u: ti.template(), g, x, h):
+def material_point(skin: ti.template(), env, g, x, h, nx, ny):
     """Lattice coordinates a of the surface point now under (x, y): three fixed-point steps of a h + u(a) = x."""
-    nx, ny = float(u.shape[1] - 1), float(u.shape[2] - 1)
     start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)
     a = start
-    us = vec3(0.0)
-    for _ in ti.static(range(3)):
-        us = displacement_at(u, g, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))))
+    us = vec4(0.0)
+    for _ in range(3):
+        us = displacement_at(skin, env, g, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))))
         a = start - vec2(us[0], us[1]) / h
     return a, us
 
@@ -71,54 +65,61 @@ def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
 
 
 @ti.func
-def contact_ceiling(u: ti.template(), g, radius):
+def surface_node(i, j, nx, ny):
+    """Index of the surface node (i, j) in a layer's row, repeated beyond the rim."""
+    return ti.max(0, ti.min(i, nx)) * (ny + 1) + ti.max(0, ti.min(j, ny))
+
+
+@ti.func
+def contact_ceiling(skin: ti.template(), env, g, radius):
     """A particle higher than this above the rest surface touches nothing: a spline stays below its highest node."""
     highest = 0.0
-    for i in range(u.shape[1]):
-        for j in range(u.shape[2]):
-            highest = ti.max(highest, u[g, i, j, u.shape[3] - 1][2])
+    for i in range(1, skin.shape[3] - 1):
+        for j in range(1, skin.shape[4] - 1):
+            highest = ti.max(highest, skin[env, g, 0, i, j][2])
     return highest + 2.0 * radius  # one radius to touch, one for what the contact's memory still bridges
 
 
 @ti.func
 def particle_contact(
-    g, x, v, memory, u: ti.template(), gv: ti.template(), gf: ti.template(), h, radius, k_n, mu, housing, dt,
-    health: ti.template(),
+    env, part, g, x, v, memory, radius, skin: ti.template(), touch: ti.template(), facts: ti.template(), layers, nx, ny,
+    partial: ti.template(),
 ):  # fmt: skip
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
     x, v: position, and velocity relative to the moving sensor. memory: elastic slip, and the multiplier as the overlap
-    whose penalty it equals [mm]. Returns touching, force, new memory, overlap.
+    whose penalty it equals [mm]. Returns touching, force, new memory.
     """
-    nx, ny = float(u.shape[1] - 1), float(u.shape[2] - 1)
+    h, k_n, dt = facts[env, GEL_SPACING], facts[env, STIFFNESS], facts[env, STEP]
+    mu, housing = facts[env, FRICTION + g], facts[env, HOUSING]
+    cap = 0.25 * facts[env, BODY_CELL]  # half a particle spacing
     touching = False
     force = vec3(0.0)
     slip = vec3(memory[0], memory[1], memory[2])
     taken = memory[3]
     overlap = 0.0
     reach = 2.2 * 0.5 * h
-    thickness = h * (u.shape[3] - 1)
     c_n = CONTACT_DAMPING * k_n * dt
-    if x[2] > -1.2 * thickness and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
-        a, us = material_point(u, g, x, h)
+    if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
+        a, us = material_point(skin, env, g, x, h, nx, ny)
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
             depth = us[2] + radius - x[2]
             if depth + taken > 0.0:
                 i, wx, dx = spline(a[0])
                 j, wy, dy = spline(a[1])
-                t1, t2, vs = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0)
+                t1, t2, vs = vec4(1.0, 0.0, 0.0, 0.0), vec4(0.0, 1.0, 0.0, 0.0), vec4(0.0)
                 for p, q in ti.static(ti.ndrange(3, 3)):
-                    node = top_node(u, g, i + p, j + q)
-                    t1 += (dx[p] * wy[q] / h) * u[node]
-                    t2 += (wx[p] * dy[q] / h) * u[node]
-                    vs += (wx[p] * wy[q]) * gv[node]
-                n = t1.cross(t2).normalized()
+                    node = skin[env, g, 0, i + p + 1, j + q + 1]
+                    t1 += (dx[p] * wy[q] / h) * node
+                    t2 += (wx[p] * dy[q] / h) * node
+                    vs += (wx[p] * wy[q]) * skin[env, g, 1, i + p + 1, j + q + 1]
+                n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
-                if gap > 4.0 * radius:  # an overlap found late must not explode; counted
-                    gap = 4.0 * radius
-                    health[4] += 1.0
-                vr = v - vs
+                if gap > 4.0 * cap:  # an overlap found late must not explode; counted
+                    gap = 4.0 * cap
+                    partial[env, part, CAPPED] += 1.0
+                vr = v - vec3(vs[0], vs[1], vs[2])
                 vn = vr.dot(n)
                 fn = ti.max(k_n * (gap + taken) - c_n * vn, 0.0)
                 taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
@@ -126,15 +127,16 @@ def particle_contact(
                 force = fn * n + ft
                 touching = True
                 overlap = gap
+                back = vec4(force[0], force[1], force[2], 0.0)
                 for p, q in ti.static(ti.ndrange(3, 3)):
-                    node = top_node(u, g, i + p, j + q)
-                    gf[node] = gf[node] - (wx[p] * wy[q]) * force
+                    node = surface_node(i + p, j + q, nx, ny)
+                    touch[env, part, g, node] = touch[env, part, g, node] - (wx[p] * wy[q]) * back
         elif housing >= 0.0:
             gap = radius - housing - x[2]
             if gap + taken > 0.0:
-                if gap > 4.0 * radius:
-                    gap = 4.0 * radius
-                    health[4] += 1.0
+                if gap > 4.0 * cap:
+                    gap = 4.0 * cap
+                    partial[env, part, CAPPED] += 1.0
                 n = vec3(0.0, 0.0, 1.0)
                 fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)
                 taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
@@ -145,4 +147,5 @@ def particle_contact(
     kept = vec4(0.0)
     if touching:
         kept = vec4(slip[0], slip[1], slip[2], taken)
-    return touching, force, kept, overlap
+        partial[env, part, OVERLAP] = ti.max(partial[env, part, OVERLAP], overlap)
+    return touching, force, kept

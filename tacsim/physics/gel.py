@@ -4,11 +4,14 @@ The lattice index k = 0 is the backing, k = nz the free surface (z = 0 of the se
 world; its gel does not notice. Inside: mm, N, MPa; density scaled so that the P-wave speed is 1.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.physics.material import log1p, vec3
+from tacsim.physics.lanes import LANES, PARTS, SLOTS, anchor, first_of, keep_or, padded, real, vec4
+from tacsim.physics.layout import BACKING, GEL_DAMPING, GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING, NEVER, SMALLEST_VOLUME, STEP
+from tacsim.physics.material import lanes_log1p
 from tacsim.runtime import ti
 from tacsim.scene import Gel, GelSurface, lame
 
@@ -17,7 +20,13 @@ MPA = 1e-6  # megapascals in a pascal
 HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
 SMALLEST_STRETCH = 0.05  # J below this counts as inverted
 
-Nodes = ti.types.ndarray(dtype=vec3, ndim=4)
+Nodes = ti.types.ndarray(dtype=ti.f32, ndim=6)
+# Lanes have one axis: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
+NodeLanes = ti.types.ndarray(dtype=real, ndim=1)
+Skin = ti.types.ndarray(dtype=vec4, ndim=5)
+Touch = ti.types.ndarray(dtype=vec4, ndim=4)
+Corners = ti.types.ndarray(dtype=real, ndim=1)
+Lattice = ti.types.ndarray(dtype=real, ndim=1)
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,11 @@ class GelFacts:
         return self.elements[0] * self.spacing / 2, self.elements[1] * self.spacing / 2
 
 
+    def facts(self) -> dict[int, float]:
+        """Entries of the array `facts` (tacsim.physics.layout)."""
+        return {GEL_SPACING: self.spacing, GEL_MU: self.mu, GEL_LAMBDA: self.lam, GEL_DENSITY: self.density}
+
+
 def gel_facts(gel: Gel, element: float) -> GelFacts:
     """Fits cubic elements of about `element` [m] into the gel. Raises ValueError if its sides do not fit one cube."""
     counts = tuple(max(2 if axis == 2 else 4, round(side / element)) for axis, side in enumerate(gel.size))
@@ -58,93 +72,265 @@ def gel_facts(gel: Gel, element: float) -> GelFacts:
     return GelFacts((nx, ny, counts[2]), spacing * MM, mu * MPA, lam * MPA)
 
 
-@dataclass
 class GelState:
-    """Displacement, velocity and force of all nodes of all gels: (gels, nx + 1, ny + 1, nz + 1, 3)."""
+    """Nodes of all gels of all environments, in the order that kernels like.
 
-    u: np.ndarray
-    v: np.ndarray
-    f: np.ndarray
+    nodes: (E, gels, 3, 3, nz + 1, P) displacement, velocity, force; axis; layer; the nodes of a layer as one row, node
+    (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
+    skin: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside.
+    touch: (E, PARTS, gels, P, 4) contact force on the surface nodes, one copy a part.
+    corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis.
+    lattice: (2, P) 1 at the first node of an element, else 0; and 1 / share of a node's mass, 0 where there is no node.
+    """
+
+    def __init__(self, facts: GelFacts, environments: int, gels: int) -> None:
+        nx, ny, nz = facts.elements
+        row = ny + 1
+        nodes = (nx + 1) * row
+        width = padded(nodes)
+        pieces = PARTS // gels if PARTS > 1 else 1
+        blocks = -(-nodes // LANES)
+        halo = -(-(row + 1) // LANES)
+        longest = -(-blocks // pieces)
+        self._row = row
+        # Elements and nodes meet at offsets 0, 1, row and row + 1. Lanes start at multiples of LANES, so each offset
+        # has a view of its own, shifted in memory.
+        self._nodes, self.nodes = shiftable((environments, gels, 3, 3, nz + 1, width), row + 1)
+        self.skin = np.zeros((environments, gels, 2, nx + 3, ny + 3, 4), np.float32)
+        self.touch = np.zeros((environments, PARTS, gels, width, 4), np.float32)
+        self._corners, self.corners = shiftable((environments, PARTS, 2, 24, (longest + halo) * LANES), row + 1)
+        self.lattice = np.zeros((2, width), np.float32)
+        whole = np.zeros((nx + 1, row), np.float32)
+        whole[:-1, :-1] = 1.0
+        share = np.full((nx + 1, row), 1.0, np.float32)
+        share[[0, -1], :] *= 0.5
+        share[:, [0, -1]] *= 0.5
+        self.lattice[0, :nodes] = whole.ravel()
+        self.lattice[1, :nodes] = 1.0 / share.ravel()
+        self._shape = (nx + 1, row)
+
+    def _view(self, quantity: int) -> np.ndarray:
+        nx1, ny1 = self._shape
+        flat = self.nodes[:, :, quantity, :, :, : nx1 * ny1]
+        lattice = flat.reshape(*flat.shape[:-1], nx1, ny1)
+        assert np.shares_memory(lattice, self.nodes)
+        return lattice.transpose(0, 1, 4, 5, 3, 2)
+
+    @property
+    def u(self) -> np.ndarray:
+        """Displacement [mm], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
+        return self._view(0)
+
+    @property
+    def v(self) -> np.ndarray:
+        """Velocity, (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
+        return self._view(1)
+
+    def refresh(self) -> None:
+        """The skin from the nodes: call it before a launch, since somebody may have written the nodes."""
+        for quantity in range(2):
+            top = self._view(quantity)[..., -1, :]
+            skin = self.skin[:, :, quantity, ..., :3]
+            skin[:, :, 1:-1, 1:-1] = top
+            skin[:, :, [0, -1], 1:-1] = top[:, :, [0, -1]]
+            skin[:, :, :, [0, -1]] = skin[:, :, :, [1, -2]]
+
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """What every kernel with gels takes, in this order; arrays of lanes are the same memory once more."""
+        shifts = (0, 1, self._row, self._row + 1)
+        return (
+            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts), self.skin, self.touch,
+            *(shifted(self._corners, self.corners, -shift) for shift in shifts),
+            self.lattice.reshape(-1, LANES),
+        )  # fmt: skip
 
 
-def gel_state(facts: GelFacts, gels: int) -> GelState:
-    shape = (gels, *(n + 1 for n in facts.elements), 3)
-    return GelState(*(np.zeros(shape, np.float32) for _ in range(3)))
+def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Zeros with `margin` more before and behind: the whole memory, and the array in its middle."""
+    margin = padded(margin)
+    memory = np.zeros(math.prod(shape) + 2 * margin, np.float32)
+    return memory, memory[margin:-margin].reshape(shape)
 
 
-def gel_surface(facts: GelFacts, state: GelState, index: int) -> GelSurface:
-    top = state.u[index, :, :, -1] / np.float32(MM)
+def shifted(memory: np.ndarray, array: np.ndarray, shift: int) -> np.ndarray:
+    """Lanes of what stands `shift` numbers further on, for every entry of `array`."""
+    start = (memory.size - array.size) // 2 + shift
+    return memory[start : start + array.size].reshape(-1, LANES)
+
+
+def gel_surface(facts: GelFacts, state: GelState, environment: int, gel: int) -> GelSurface:
+    top = state.u[environment, gel, :, :, -1] / np.float32(MM)
     half = facts.half
     return GelSurface(np.ascontiguousarray(top), facts.spacing / MM, (-half[0] / MM, -half[1] / MM))
 
 
 @ti.func
-def gel_forces(g, u: ti.template(), f: ti.template(), h, mu, lam, health: ti.template()):
-    """Adds the internal forces of gel g: one-point quadrature plus hourglass stiffness (Flanagan-Belytschko modes)."""
-    nx, ny, nz = u.shape[1] - 1, u.shape[2] - 1, u.shape[3] - 1
-    quarter = 0.25 / h
-    area = 0.25 * h * h
-    stiffness = HOURGLASS * 2.0 * mu * h / 8.0
-    smallest = 1e9
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                a = u[g, i, j, k]
-                b = u[g, i, j, k + 1]
-                c = u[g, i, j + 1, k]
-                d = u[g, i, j + 1, k + 1]
-                p = u[g, i + 1, j, k]
-                q = u[g, i + 1, j, k + 1]
-                r = u[g, i + 1, j + 1, k]
-                s = u[g, i + 1, j + 1, k + 1]
-                # columns of F = I + sum u (x) grad N at the cell centre
-                f0 = quarter * (p + q + r + s - a - b - c - d) + vec3(1.0, 0.0, 0.0)
-                f1 = quarter * (c + d + r + s - a - b - p - q) + vec3(0.0, 1.0, 0.0)
-                f2 = quarter * (b + d + q + s - a - c - p - r) + vec3(0.0, 0.0, 1.0)
-                c0, c1, c2 = f1.cross(f2), f2.cross(f0), f0.cross(f1)  # columns of the cofactor matrix
-                jacobian = f0.dot(c0)
-                smallest = ti.min(smallest, jacobian)
-                safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; `health` reports it
-                # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
-                pressure = (lam * log1p(safe - 1.0) - mu) / safe
-                px = area * (mu * f0 + pressure * c0)
-                py = area * (mu * f1 + pressure * c1)
-                pz = area * (mu * f2 + pressure * c2)
-                # hourglass amplitudes: s_x s_y, s_y s_z, s_x s_z, s_x s_y s_z
-                h1 = stiffness * (a + b - c - d - p - q + r + s)
-                h2 = stiffness * (a - b - c + d + p - q - r + s)
-                h3 = stiffness * (a - b + c - d - p + q - r + s)
-                h4 = stiffness * (-a + b + c - d + p - q - r + s)
-                f[g, i, j, k] = f[g, i, j, k] + px + py + pz - h1 - h2 - h3 + h4
-                f[g, i, j, k + 1] = f[g, i, j, k + 1] + px + py - pz - h1 + h2 + h3 - h4
-                f[g, i, j + 1, k] = f[g, i, j + 1, k] + px - py + pz + h1 + h2 - h3 - h4
-                f[g, i, j + 1, k + 1] = f[g, i, j + 1, k + 1] + px - py - pz + h1 - h2 + h3 + h4
-                f[g, i + 1, j, k] = f[g, i + 1, j, k] - px + py + pz + h1 - h2 + h3 - h4
-                f[g, i + 1, j, k + 1] = f[g, i + 1, j, k + 1] - px + py - pz + h1 + h2 - h3 + h4
-                f[g, i + 1, j + 1, k] = f[g, i + 1, j + 1, k] - px - py + pz - h1 + h2 + h3 + h4
-                f[g, i + 1, j + 1, k + 1] = f[g, i + 1, j + 1, k + 1] - px - py - pz - h1 - h2 - h3 - h4
-    health[0] = ti.min(health[0], smallest)
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 @ti.func
-def gel_advance(g, u: ti.template(), v: ti.template(), f: ti.template(), h, density, damping, dt):
-    """Symplectic Euler with lumped masses; damps the old velocity only, so force readings stay exact. Clears f.
+def element_block(
+    env, part, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(),
+    nij: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(), work: ti.template(), never,
+):  # fmt: skip
+    """Forces of LANES elements on their corners. Returns det F.
 
-    Returns the force of the gel on its backing.
+    u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to: where
+    the forces go, `row` the way to the next corner or axis. One-point quadrature and hourglass stiffness (Flanagan &
+    Belytschko 1981, modes of the cube).
     """
-    nx, ny, nz = u.shape[1] - 1, u.shape[2] - 1, u.shape[3] - 1
-    keep = 1.0 - damping * dt
-    backing = vec3(0.0)
-    for i in range(nx + 1):
-        mass_i = density * h * h * h * (0.5 if i == 0 or i == nx else 1.0)
-        for j in range(ny + 1):
-            mass_ij = mass_i * (0.5 if j == 0 or j == ny else 1.0)
-            backing += f[g, i, j, 0]
-            f[g, i, j, 0] = vec3(0.0)
-            for k in range(1, nz + 1):
-                mass = mass_ij * (0.5 if k == nz else 1.0)
-                new = keep * v[g, i, j, k] + (dt / mass) * f[g, i, j, k]
-                v[g, i, j, k] = new
-                u[g, i, j, k] = u[g, i, j, k] + dt * new
-                f[g, i, j, k] = vec3(0.0)
-    return backing
+    h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
+    whole = lattice[block]
+    w = (env * PARTS + part) * SLOTS
+    quarter = 0.25 / h
+    area = (0.25 * h * h) * whole
+    stiffness = (HOURGLASS * 2.0 * mu * h / 8.0) * whole
+    for d in ti.static(range(3)):
+        at = u + d * axis
+        a, b, c, e = n0[at], n0[at + layer], nj[at], nj[at + layer]
+        p, q, r, s = ni[at], ni[at + layer], nij[at], nij[at + layer]
+        # sums and differences along z, then y, then x
+        az, cz, pz, rz = b + a, e + c, q + p, s + r
+        aw, cw, pw, rw = b - a, e - c, q - p, s - r
+        left, right, left_y, right_y = cz + az, rz + pz, cz - az, rz - pz
+        left_z, right_z, left_yz, right_yz = cw + aw, rw + pw, cw - aw, rw - pw
+        anchor(work, w + d, quarter * (right - left) + (1.0 if d == 0 else 0.0), never)
+        anchor(work, w + 3 + d, quarter * (left_y + right_y) + (1.0 if d == 1 else 0.0), never)
+        anchor(work, w + 6 + d, quarter * (left_z + right_z) + (1.0 if d == 2 else 0.0), never)
+        anchor(work, w + 9 + d, stiffness * (right_y - left_y), never)  # s_x s_y
+        anchor(work, w + 12 + d, stiffness * (left_yz + right_yz), never)  # s_y s_z
+        anchor(work, w + 15 + d, stiffness * (right_z - left_z), never)  # s_x s_z
+        anchor(work, w + 18 + d, stiffness * (right_yz - left_yz), never)  # s_x s_y s_z
+    f = [[work[w + 3 * column + d] for d in range(3)] for column in range(3)]  # columns of F
+    x, y, z = cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])  # columns of the cofactor matrix
+    jacobian = f[0][0] * x[0] + f[0][1] * x[1] + f[0][2] * x[2]
+    safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
+    anchor(work, w + 21, safe, never)
+    # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
+    pressure = (lam * lanes_log1p(safe - 1.0) - mu) / safe
+    anchor(work, w + 22, pressure, never)
+    for d in ti.static(range(3)):
+        px = area * (mu * f[0][d] + pressure * x[d])
+        py = area * (mu * f[1][d] + pressure * y[d])
+        pz = area * (mu * f[2][d] + pressure * z[d])
+        # force on corner (s_x, s_y, s_z) = -(s_x p_x + s_y p_y + s_z p_z + s_x s_y h_1 + ...), by halves: first y and z
+        near, far = pz - work[w + 12 + d], pz + work[w + 12 + d]  # s_y = -1, 1
+        left, right = px - work[w + 9 + d], px + work[w + 9 + d]
+        skew_left = work[w + 15 + d] - work[w + 18 + d]
+        skew_right = work[w + 15 + d] + work[w + 18 + d]
+        anchor(work, w + 24 + 8 * d, py + near, never)
+        anchor(work, w + 25 + 8 * d, py - near, never)
+        anchor(work, w + 26 + 8 * d, far - py, never)
+        anchor(work, w + 27 + 8 * d, far + py, never)
+        anchor(work, w + 28 + 8 * d, left - skew_left, never)
+        anchor(work, w + 29 + 8 * d, left + skew_left, never)
+        anchor(work, w + 30 + 8 * d, right - skew_right, never)
+        anchor(work, w + 31 + 8 * d, right + skew_right, never)
+        for yz in ti.static(range(4)):  # 00, 01, 10, 11
+            whole_yz, odd = work[w + 24 + yz + 8 * d], work[w + 28 + yz + 8 * d]
+            r = ti.static(3 * yz) + d
+            if ti.static(yz == 3):
+                whole_yz = -whole_yz
+            low, high = to + r * row, to + (12 + r) * row
+            corners[low] = keep_or(never, corners[low], whole_yz + odd)
+            corners[high] = keep_or(never, corners[high], whole_yz - odd)
+    return ti.select(whole > 0.0, jacobian, 1.0)
+
+
+@ti.func
+def gel_forces(
+    env, part, gels, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(), c0: ti.template(),
+    cj: ti.template(), ci: ti.template(), cij: ti.template(), lattice: ti.template(), facts: ti.template(),
+    counts: ti.template(), work: ti.template(), partial: ti.template(), layers, nx, ny,
+):  # fmt: skip
+    """Internal forces on this part's nodes of its gel. A layer of elements, then the nodes below it, and so on up."""
+    never = counts[env, NEVER]
+    pieces = PARTS // gels
+    g, piece = part // pieces, part % pieces
+    blocks = ((nx + 1) * (ny + 1) + LANES - 1) // LANES
+    first, last = first_of(blocks, piece, pieces), first_of(blocks, piece + 1, pieces)
+    halo = (ny + 1 + LANES) // LANES  # blocks before `first` whose elements reach into it
+    row = (blocks + pieces - 1) // pieces + halo  # of corners
+    axis = (layers + 1) * blocks
+    u, f = (env * gels + g) * 9 * axis, ((env * gels + g) * 9 + 6) * axis
+    smallest = real(1e9)
+    for k in range(layers + 1):
+        here = (2 * (env * PARTS + part) + k % 2) * 24 * row
+        before = (2 * (env * PARTS + part) + (k + 1) % 2) * 24 * row
+        if k < layers:
+            for block in range(ti.max(first - halo, 0), last):
+                jacobian = element_block(
+                    env, part, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj, ni,
+                    nij, c0, lattice, facts, work, never,
+                )  # fmt: skip
+                smallest = ti.min(smallest, jacobian)
+        below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
+        for block in range(first, last):
+            i, j = here + block - first + halo, before + block - first + halo
+            for d in ti.static(range(3)):
+                under = c0[i + d * row] + cj[i + (6 + d) * row] + ci[i + (12 + d) * row] + cij[i + (18 + d) * row]
+                over = c0[j + (3 + d) * row] + cj[j + (9 + d) * row] + ci[j + (15 + d) * row] + cij[j + (21 + d) * row]
+                to = f + d * axis + k * blocks + block
+                n0[to] = keep_or(never, n0[to], below * under + above * over)
+    partial[env, part, SMALLEST_VOLUME] = ti.min(partial[env, part, SMALLEST_VOLUME], smallest.min())
+
+
+@ti.func
+def gel_advance(
+    env, part, gels, nodes: ti.template(), n0: ti.template(), skin: ti.template(), touch: ti.template(),
+    lattice: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
+):  # fmt: skip
+    """Symplectic Euler with lumped masses on this part's nodes of its gel, and their skin.
+
+    Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted.
+    """
+    dt, h = facts[env, STEP], facts[env, GEL_SPACING]
+    pieces = PARTS // gels
+    g, piece = part // pieces, part % pieces
+    row, count = ny + 1, (nx + 1) * (ny + 1)
+    blocks = (count + LANES - 1) // LANES
+    first, last = first_of(blocks, piece, pieces), first_of(blocks, piece + 1, pieces)
+    axis = (layers + 1) * blocks
+    u = (env * gels + g) * 9 * axis
+    keep = 1.0 - facts[env, GEL_DAMPING] * dt
+    rate = dt / (facts[env, GEL_DENSITY] * h * h * h)
+    for d in ti.static(range(3)):
+        held = real(0.0)
+        for block in range(first, last):
+            held += ti.select(lattice[blocks + block] > 0.0, n0[u + (6 + d) * axis + block], 0.0)
+        partial[env, part, BACKING + d] = held.sum()
+    for block in range(first, last):  # contact forces of all parts
+        for d in ti.static(range(3)):
+            total = real(0.0)
+            for other in ti.static(range(PARTS)):
+                total += real([touch[env, other, g, block * LANES + lane][d] for lane in range(LANES)])
+            at = u + (6 + d) * axis + layers * blocks + block
+            n0[at] = n0[at] + total
+    for k in range(1, layers + 1):
+        scale = ti.select(k == layers, 2.0 * rate, rate)
+        for block in range(first, last):
+            share = lattice[blocks + block] * scale
+            for d in ti.static(range(3)):
+                at = u + d * axis + k * blocks + block
+                new = keep * n0[at + 3 * axis] + share * n0[at + 6 * axis]
+                n0[at + 3 * axis] = new
+                n0[at] = n0[at] + dt * new
+    for n in range(first * LANES, ti.min(last * LANES, count)):
+        i, j = n // row, n % row
+        for quantity in ti.static(range(2)):
+            at = vec4(
+                nodes[env, g, quantity, 0, layers, n], nodes[env, g, quantity, 1, layers, n],
+                nodes[env, g, quantity, 2, layers, n], 0.0,
+            )  # fmt: skip
+            for p in range(i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)):
+                for q in range(j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)):
+                    skin[env, g, quantity, p, q] = at
+
+
+@ti.func
+def clear_touch(env, part, gels, touch: ti.template()):
+    """This part's copy of the contact forces, for all gels."""
+    for g in range(gels):
+        for n in range(touch.shape[3]):
+            touch[env, part, g, n] = vec4(0.0)

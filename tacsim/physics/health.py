@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import Pose
-from tacsim.physics import diagnosis
+from tacsim.physics import diagnosis, layout
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Scene
 
@@ -77,7 +77,7 @@ class SimulationDiverged(RuntimeError):
 
 @dataclass(frozen=True)
 class Health:
-    """What the kernels saw in one launch, and the array they write it to."""
+    """What the kernels saw in one launch."""
 
     smallest_volume_ratio: float  # gel elements
     off_grid: int  # particle substeps outside the grid
@@ -87,13 +87,20 @@ class Health:
     overlap: float  # of the last substep [mm]
 
     @staticmethod
-    def array() -> NDArray[np.float32]:
-        return np.array([1e9, 0, 1e9, 0, 0, 0], np.float32)
+    def clear(partial: NDArray[np.float32]) -> None:
+        """Prepares the parts' numbers (..., PARTS, NUMBERS) for a launch; sums that outlive it stay."""
+        partial[..., [layout.SMALLEST_VOLUME, layout.SMALLEST_STEP_VOLUME]] = 1e9
+        partial[..., [layout.OFF_GRID, layout.FASTEST, layout.CAPPED, layout.OVERLAP]] = 0.0
 
     @classmethod
-    def read(cls, a: NDArray[np.float32]) -> Health:
-        counts = [int(a[i]) if math.isfinite(a[i]) else -1 for i in (1, 4)]
-        return cls(float(a[0]), counts[0], float(a[2]), float(a[3]), counts[1], float(a[5]))
+    def read(cls, partial: NDArray[np.float32]) -> Health:
+        """Of all parts of one environment (PARTS, NUMBERS); NaN in any of them stays NaN."""
+        least, most, total = partial.min(axis=0), partial.max(axis=0), partial.sum(axis=0)
+        counts = [int(total[i]) if math.isfinite(total[i]) else -1 for i in (layout.OFF_GRID, layout.CAPPED)]
+        return cls(
+            float(least[layout.SMALLEST_VOLUME]), counts[0], float(least[layout.SMALLEST_STEP_VOLUME]),
+            float(most[layout.FASTEST]), counts[1], float(most[layout.OVERLAP]),
+        )  # fmt: skip
 
     def complaint(self) -> tuple[str, diagnosis.Quantity] | None:
         """What is unphysical, and the quantity that shows where; None when all is well."""
@@ -220,10 +227,3 @@ def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Plac
             f"(limit {LARGEST_GRID:.3g})",
             str(where),
         )
-
-
-def as_float32(arrays: Sequence[NDArray[np.float32]]) -> None:
-    """Kernels read any dtype in silence: refuse what is not contiguous float32."""
-    for a in arrays:
-        if a.dtype != np.float32 or not a.flags.c_contiguous:
-            raise TypeError(f"kernel array must be contiguous float32, got {a.dtype}, shape {a.shape}")

@@ -8,21 +8,44 @@ import numpy as np
 from tacsim.interface import Pose, Truth
 from tacsim.physics.contact import contact_ceiling, particle_contact
 from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
-from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
-from tacsim.physics.health import Health, as_float32, attempt, require_room, retried
-from tacsim.physics.material import vec3, vec4
+from tacsim.physics.gel import (
+    MM,
+    MPA,
+    Corners,
+    GelState,
+    Lattice,
+    NodeLanes,
+    Nodes,
+    Skin,
+    Touch,
+    clear_touch,
+    gel_advance,
+    gel_facts,
+    gel_forces,
+    gel_surface,
+)
+from tacsim.physics.health import Health, attempt, require_room, retried
+from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, first_of, vec3, vec4
+from tacsim.physics.layout import (
+    BACKING, BODY_BULK, BODY_CELL, BODY_DAMPING, BODY_HARDENING, BODY_LIMIT, BODY_MASS, BODY_MU, BODY_VOLUME, CAPACITY, COUNTS,
+    FACTS, FORCE, FRICTION, GEL_DAMPING, GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING, GRAVITY, GRID, HOUSING,
+    LIGHTNESS, MOTION, NUMBERS, ORIGIN, OVERLAP, PARTICLES, STEP, STEPS, STIFFNESS, STRIDE,
+)  # fmt: skip
 from tacsim.physics.plasticine import (
-    Grid,
-    Matrices,
+    BodyState,
+    Masses,
+    Points,
+    Rates,
     Strains,
-    Vectors,
+    Sums,
+    Velocities,
     body_facts,
-    body_state,
-    clear_grid,
-    fit_grid,
+    clear_masses,
     grid_to_particles,
+    node_sum,
     particles_to_grid,
 )
+from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
@@ -30,144 +53,161 @@ from tacsim.scene import GelSurface, Scene
 from tacsim.shapes import extent, particles
 
 COURANT = 0.4  # dt / (smallest spacing / wave speed)
-GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
-BODY_DAMPING = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
+ZETA_GEL = 1.0  # zeta in alpha = zeta c / thickness
+ZETA_BODY = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
-Array1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Array3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
-Array4 = ti.types.ndarray(dtype=ti.f32, ndim=4)
-ContactMemory = ti.types.ndarray(dtype=vec4, ndim=2)
+Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
+ContactMemory = ti.types.ndarray(dtype=vec4, ndim=3)
 
 
 @ti.func
-def row(drive: ti.template(), it, g, r):
-    return vec3(drive[it, g, r, 0], drive[it, g, r, 1], drive[it, g, r, 2])
+def row(drive: ti.template(), env, it, g, r):
+    return vec3(drive[env, it, g, r, 0], drive[env, it, g, r, 1], drive[env, it, g, r, 2])
 
 
 @ti.func
-def rotation(drive: ti.template(), it, g):
-    return ti.Matrix.rows([row(drive, it, g, 0), row(drive, it, g, 1), row(drive, it, g, 2)])
+def rotation(drive: ti.template(), env, it, g):
+    return ti.Matrix.rows([row(drive, env, it, g, 0), row(drive, env, it, g, 1), row(drive, env, it, g, 2)])
 
 
 @ti.func
-def grid_update(grid: ti.template(), origin, cell, drive: ti.template(), it, damping, mean_velocity, boost, dt):
+def part_sum(partial: ti.template(), env, first):
+    """Sum of three numbers over all parts, in their order."""
+    total = vec3(0.0)
+    for part in ti.static(range(PARTS)):
+        total += vec3(partial[env, part, first], partial[env, part, first + 1], partial[env, part, first + 2])
+    return total
+
+
+@ti.func
+def grid_update(
+    env, part, it, drive: ti.template(), masses: ti.template(), velocities: ti.template(), facts: ti.template(),
+    counts: ti.template(), partial: ti.template(),
+):  # fmt: skip
     """Momentum to velocity; damps towards the affine motion that the two sensors impose, not towards rest.
 
-    `boost` is added to every velocity: selective mass scaling of the slowest mode, the rigid translation of a body that
+    A boost is added to every velocity: selective mass scaling of the slowest mode, the rigid translation of a body that
     hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
 
     Across the sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides
     on one sensor must not be dragged back by the other.
     """
-    p0, p1 = row(drive, it, 0, 3), row(drive, it, 1, 3)
-    v0, v1 = row(drive, it, 0, 4), row(drive, it, 1, 4)
-    w0, w1 = row(drive, it, 0, 5), row(drive, it, 1, 5)
+    dt, cell, damping = facts[env, STEP], facts[env, BODY_CELL], facts[env, BODY_DAMPING]
+    origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
+    weight = vec3(facts[env, GRAVITY], facts[env, GRAVITY + 1], facts[env, GRAVITY + 2])
+    push = vec3(0.0)  # total contact force on the body, world axes
+    for g in ti.static(range(2)):
+        push -= rotation(drive, env, it, g) @ part_sum(partial, env, FORCE + 6 * g)
+    mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
+    boost = ((facts[env, LIGHTNESS] - 1.0) * dt / (facts[env, BODY_MASS] * counts[env, PARTICLES])) * push
+    p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
+    v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
+    w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
     axis = p1 - p0
     length2 = axis.norm_sqr() + 1e-12
     driven = v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr() > 0.0
-    mean_across = mean_velocity - axis * (mean_velocity.dot(axis) / length2)
-    for i in range(grid.shape[0]):
-        for j in range(grid.shape[1]):
-            for k in range(grid.shape[2]):
-                q = grid[i, j, k]
+    mean_across = mean - axis * (mean.dot(axis) / length2)
+    nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
+    base = env * counts[env, CAPACITY]
+    for i in range(first_of(nx, part, PARTS), first_of(nx, part + 1, PARTS)):
+        for j in range(ny):
+            for k in range(nz):
+                node = (i * ny + j) * nz + k
+                q = node_sum(env, i, node, masses, counts)
+                velocity = vec3(0.0)
                 if q[3] > 0.0:
-                    velocity = vec3(q[0], q[1], q[2]) / q[3] + boost
+                    velocity = vec3(q[0], q[1], q[2]) / q[3] + boost + dt * weight
                     x = origin + cell * vec3(i, j, k)
                     t = ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
                     reference = (1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1))
                     if driven:
                         reference = axis * (reference.dot(axis) / length2) + mean_across
                     velocity -= damping * dt * (velocity - reference)
-                    grid[i, j, k] = vec4(velocity[0], velocity[1], velocity[2], q[3])
+                velocities[base + node] = vec4(velocity[0], velocity[1], velocity[2], 0.0)
 
 
 @ti.func
-def touch(
-    g, rotate, it, drive: ti.template(), x: ti.template(), v: ti.template(), memory: ti.template(),
-    u: ti.template(), gv: ti.template(), gf: ti.template(), h, mass, radius, k_n, mu, housing, dt,
-    health: ti.template(),
+def touch_gel(
+    env, part, g, it, drive: ti.template(), points: ti.template(), rates: ti.template(), memory: ti.template(),
+    skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
+    layers, nx, ny,
 ):  # fmt: skip
-    """Contact of every particle with gel g. Returns force and moment of the body on the sensor, sensor axes."""
-    origin, velocity, spin = row(drive, it, g, 3), row(drive, it, g, 4), row(drive, it, g, 5)
+    """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes."""
+    rotate = rotation(drive, env, it, g)
+    origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    highest = contact_ceiling(u, g, radius)
+    highest = contact_ceiling(skin, env, g, 0.25 * facts[env, BODY_CELL])
+    rate = facts[env, STEP] / facts[env, BODY_MASS]
     total, moment = vec3(0.0), vec3(0.0)
-    for p in range(x.shape[0]):
-        arm = x[p] - origin
-        kept = vec4(0.0)
+    n, origin_p = counts[env, PARTICLES], env * counts[env, STRIDE]
+    for p in range(first_of(n, part, PARTS), first_of(n, part + 1, PARTS)):
+        at = points[origin_p + p]
+        arm = vec3(at[0], at[1], at[2]) - origin
         if outward.dot(arm) < highest:  # most of the body is far away: one dot product decides
             local = back @ arm
-            relative = back @ (v[p] - velocity - spin.cross(arm))
-            touching, force, kept_now, overlap = particle_contact(
-                g, local, relative, memory[g, p], u, gv, gf, h, radius, k_n, mu, housing, dt, health
+            moving = rates[origin_p + p, 0]
+            relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
+            touching, force, kept = particle_contact(
+                env, part, g, local, relative, memory[env, g, p], at[3], skin, touch, facts, layers, nx, ny, partial
             )
-            kept = kept_now
+            memory[env, g, p] = kept
             if touching:
-                v[p] = v[p] + (dt / mass) * (rotate @ force)
+                push = rate * (rotate @ force)
+                rates[origin_p + p, 0] = moving + vec4(push[0], push[1], push[2], 0.0)
                 total -= force
                 moment -= local.cross(force)
-                health[5] = ti.max(health[5], overlap)
-        memory[g, p] = kept
-    return total, moment
+        else:
+            memory[env, g, p] = vec4(0.0)
+    for d in ti.static(range(3)):
+        partial[env, part, FORCE + 6 * g + d] = total[d]
+        partial[env, part, FORCE + 6 * g + 3 + d] = moment[d]
 
 
 @ti.kernel
 def substeps(
-    n: ti.i32, dt: ti.f32, drive: Array4,
-    u: Nodes, gv: Nodes, gf: Nodes, h: ti.f32, gel_mu: ti.f32, gel_lam: ti.f32, gel_damping: ti.f32,
-    x: Vectors, v: Vectors, c: Matrices, e: Strains, memory: ContactMemory, mean: Array1,
-    grid: Grid, ox: ti.f32, oy: ti.f32, oz: ti.f32, spacing: ti.f32,
-    mu: ti.f32, bulk: ti.f32, limit: ti.f32, body_damping: ti.f32, lightness: ti.f32,
-    k_n: ti.f32, friction_lower: ti.f32, friction_upper: ti.f32, housing: ti.f32,
-    wrench: Array3, backing: ti.types.ndarray(dtype=ti.f32, ndim=2), health: Array1,
+    team: ti.i32, drive: Drive,
+    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
+    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    points: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums, memory: ContactMemory,
+    facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
-    """n explicit substeps of the whole scene in one launch; serial, plain adds, bitwise repeatable."""
-    ti.loop_config(serialize=True)
-    for it in range(n):
-        cell, volume = 2.0 * spacing, spacing * spacing * spacing
-        mass = (bulk + 4.0 / 3.0 * mu) * volume
-        origin = vec3(ox, oy, oz)
-        health[5] = 0.0
-        push = vec3(0.0)  # total contact force on the body, world axes
-        for g in range(2):
-            rotate = rotation(drive, it, g)
-            friction = friction_lower if g == 0 else friction_upper
-            force, moment = touch(
-                g,
-                rotate,
-                it,
-                drive,
-                x,
-                v,
-                memory,
-                u,
-                gv,
-                gf,
-                h,
-                mass,
-                0.5 * spacing,
-                k_n,
-                friction,
-                housing,
-                dt,
-                health,
-            )
-            gel_forces(g, u, gf, h, gel_mu, gel_lam, health)
-            held = rotate @ gel_advance(g, u, gv, gf, h, gel_lam + 2.0 * gel_mu, gel_damping, dt)
-            push -= rotate @ force
-            for d in ti.static(range(3)):
-                wrench[g, 0, d] = force[d]
-                wrench[g, 1, d] = moment[d]
-                backing[g, d] = held[d]
-        clear_grid(grid)
-        particles_to_grid(x, v, c, e, grid, origin, cell, mass, volume, mu, bulk, limit, dt, health)
-        boost = ((lightness - 1.0) * dt / (mass * x.shape[0])) * push
-        grid_update(grid, origin, cell, drive, it, body_damping, vec3(mean[0], mean[1], mean[2]), boost, dt)
-        total = grid_to_particles(x, v, c, e, grid, origin, cell, dt, health)
-        for d in ti.static(range(3)):
-            mean[d] = total[d] / x.shape[0]
+    """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
+
+    Two meetings a substep: what is scattered must be whole before it is summed, and summed before it is gathered.
+    """
+    for task in range(drive.shape[0] * team * CHUNK):
+        for _ in range(first_in_chunk(task)):
+            env, member = task // CHUNK // team, task // CHUNK % team
+            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            for it in range(counts[env, STEPS]):
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    partial[env, part, OVERLAP] = 0.0
+                    clear_touch(env, part, 2, touch)
+                    for g in range(2):
+                        touch_gel(
+                            env, part, g, it, drive, points, rates, memory, skin, touch, facts, counts, partial,
+                            layers, nx, ny,
+                        )  # fmt: skip
+                    clear_masses(env, part, masses, counts)
+                    particles_to_grid(env, part, points, rates, strains, masses, facts, counts, partial)
+                    gel_forces(
+                        env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
+                        layers, nx, ny,
+                    )  # fmt: skip
+                meet(sync, env, team, 2 * it + 1)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    gel_advance(
+                        env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny
+                    )
+                    grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
+                meet(sync, env, team, 2 * it + 2)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    grid_to_particles(env, part, points, rates, strains, velocities, sums, facts, counts, partial)
 
 
 class HybridWorld:
@@ -181,14 +221,15 @@ class HybridWorld:
         self.scene = scene
         self._gel = gel_facts(scene.gel, scene.element)
         self._body = body_facts(scene.body.material, scene.spacing)
-        self._gels = gel_state(self._gel, 2)
+        self._gels = GelState(self._gel, 1, 2)
         height = float(extent(scene.body.geometry)[2])
         points = (particles(scene.body.geometry, scene.spacing) + [0.0, 0.0, height / 2 + CLEARANCE]) * MM
-        self._particles = body_state(points)
-        self._memory = np.zeros((2, len(points), 4), np.float32)  # of the contact law, sensor frames [mm]
-        self._mean = np.zeros(3, np.float32)  # the body's mean velocity
-        self._wrench = np.zeros((2, 2, 3), np.float32)
-        self._backing = np.zeros((2, 3), np.float32)
+        self._particles = BodyState([points], [0.5 * self._body.spacing])
+        self._memory = np.zeros((1, 2, len(points), 4), np.float32)  # of the contact law [mm]
+        self._facts = np.zeros((1, FACTS), np.float32)
+        self._counts = np.zeros((1, COUNTS), np.int32)
+        self._work = np.zeros((PARTS * SLOTS, LANES), np.float32)
+        self._partial = np.zeros((1, PARTS, NUMBERS), np.float32)
         self._poses = {
             "lower": Pose(),
             "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
@@ -197,23 +238,30 @@ class HybridWorld:
         # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
         share = self._gel.density * self._gel.spacing * self._body.spacing**2 / 2
         reduced = 1.0 / (1.0 / self._body.particle_mass + 1.0 / share)
-        self._stiffness = reduced / self._dt**2
-        # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were lighter by
-        # the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below the step limit.
-        self._lightness = max(1.0, height * MM / self._body.spacing)
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
-        self._grid = np.zeros((1, 1, 1, 4), np.float32)
         self._speed = scene.settling.mach  # fastest particle seen in the last launch
-        as_float32(list(self._arrays().values()))
+        housing = scene.gel.housing
+        facts = {
+            **self._gel.facts(), **self._body.facts(),
+            GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
+            # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were lighter
+            # by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below the step
+            # limit.
+            LIGHTNESS: max(1.0, height * MM / self._body.spacing),
+            STIFFNESS: reduced / self._dt**2,
+            FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
+            HOUSING: -1.0 if housing is None else housing * MM,
+        }  # fmt: skip
+        self._facts[0, list(facts)] = list(facts.values())
 
     # ------------------------------------------------------------------ state
 
     def _arrays(self) -> dict[str, np.ndarray]:
         b = self._particles
         return {
-            "gel_displacement": self._gels.u, "gel_velocity": self._gels.v, "gel_force": self._gels.f,
-            "position": b.x, "velocity": b.v, "affine": b.c, "strain": b.e, "contact": self._memory,
-            "mean_velocity": self._mean, "wrench": self._wrench, "backing": self._backing,
+            "gel_displacement": self._gels.u[0], "gel_velocity": self._gels.v[0],
+            "position": b.x(), "velocity": b.v(), "affine": b.c(), "strain": b.e(), "flow": b.flow(),
+            "contact": self._memory[0], "sums": self._partial[0],
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -229,14 +277,16 @@ class HybridWorld:
         return self._poses[name]
 
     def wrench(self, name: str) -> np.ndarray:
-        force, moment = self._wrench[self.sensors.index(name)].astype(np.float64)
-        return np.concatenate([force, moment / MM])
+        first = FORCE + 6 * self.sensors.index(name)
+        wrench = self._partial[0, :, first : first + 6].astype(np.float64).sum(axis=0)
+        wrench[3:] /= MM
+        return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._gels, self.sensors.index(name))
+        return gel_surface(self._gel, self._gels, 0, self.sensors.index(name))
 
     def truth(self) -> Truth:
-        x = self._particles.x
+        x = self._particles.x()
         z = x[:, 2]
         height = (float(z.max()) - float(z.min()) + self._body.spacing) / MM
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
@@ -260,34 +310,27 @@ class HybridWorld:
         span = (last - first) * self._dt
         margin = 2 * self._body.cell + 2 * span * max(self._speed, self.scene.settling.mach)
         where = path.place(self._poses, first, last)
-        x = self._particles.x
+        x = self._particles.x()
         require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
-        origin, shape = fit_grid(x, self._body.cell, margin)
-        if self._grid.shape[:3] != shape:
-            self._grid = np.zeros((*shape, 4), np.float32)
+        self._particles.fit(0, self._body.cell, margin, self._facts, self._counts)
 
         def launch() -> Health:
-            health = Health.array()
-            self._launch(path.drive(first, last), path.step, origin, health)
-            return Health.read(health)
+            drive = path.drive(first, last)
+            self._facts[0, STEP], self._counts[0, STEPS] = path.step, len(drive)
+            Health.clear(self._partial)
+            self._gels.refresh()
+            run_team(
+                substeps, drive[None], self._gels.arguments(), self._particles.arguments(), self._memory, self._facts,
+                self._counts, self._work, self._partial,
+            )  # fmt: skip
+            return Health.read(self._partial[0])
 
         health = attempt(self._arrays(), launch, where)
         self._speed = health.fastest
         rotations = path.drive(last - 1, last)[-1, :, :3]
-        contact = np.einsum("gij,gj->gi", rotations, self._wrench[:, 0]).astype(np.float64)
-        moment = self._wrench[:, 1].astype(np.float64) / max(self._gel.half)
-        return Reading(contact, self._backing.astype(np.float64), self._floor, health.overlap, health.capped, moment)
-
-    def _launch(self, drive: np.ndarray, dt: float, origin: np.ndarray, health: np.ndarray) -> None:
-        g, b, gel, body = self._gels, self._particles, self._gel, self._body
-        housing = self.scene.gel.housing
-        substeps(
-            len(drive), dt, drive,
-            g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
-            b.x, b.v, b.c, b.e, self._memory, self._mean,
-            self._grid, *(float(o) for o in origin), body.spacing, body.mu, body.bulk, body.limit,
-            BODY_DAMPING / gel.thickness, self._lightness,
-            self._stiffness, self.scene.friction["lower"], self.scene.friction["upper"],
-            -1.0 if housing is None else housing * MM,
-            self._wrench, self._backing, health,
-        )  # fmt: skip
+        sums = self._partial[0].astype(np.float64)
+        force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
+        backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)
+        contact = np.einsum("gij,gj->gi", rotations, force)
+        backing = np.einsum("gij,gj->gi", rotations, backing)
+        return Reading(contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))

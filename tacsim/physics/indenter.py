@@ -5,13 +5,26 @@ Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penal
 Everything is in the sensor frame [mm, MPa].
 """
 
-from tacsim.physics.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, spline, top_node
-from tacsim.physics.material import vec3
+from tacsim.physics.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, spline, surface_node
+from tacsim.physics.lanes import PARTS, first_of, vec3, vec4
+from tacsim.physics.layout import (
+    FORCE,
+    FRICTION,
+    GEL_SPACING,
+    KIND,
+    OVERLAP,
+    SHAPE,
+    SHAPE_ORIGIN,
+    SHAPE_SPACING,
+    STEP,
+    STIFFNESS,
+)
 from tacsim.runtime import ti
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
 FAR = 1e9
+FAR_CELL = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
 MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
 
 
@@ -82,53 +95,79 @@ def signed_distance(kind, size, y, values: ti.template(), origin, spacing):
 
 @ti.func
 def indent(
-    u: ti.template(), gv: ti.template(), gf: ti.template(), h, slip: ti.template(), pressure: ti.template(),
-    kind, size, values: ti.template(), grid_origin, grid_spacing, rotate, centre, velocity, spin,
-    k_n, mu, dt, health: ti.template(),
+    env, part, it, drive: ti.template(), skin: ti.template(), touch: ti.template(), slip: ti.template(),
+    pressure: ti.template(), values: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
+    nx, ny,
 ):  # fmt: skip
-    """Contact of the indenter with gel 0. Returns force and moment of the indenter on the sensor, sensor axes.
+    """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
 
-    k_n: penalty [MPa/mm]; slip, pressure: memory of each quadrature point.
+    drive: pose and velocity of the indenter in the sensor frame; slip, pressure: memory of each quadrature point.
     """
-    nx, ny = u.shape[1] - 1, u.shape[2] - 1
+    h, k_n, mu, dt = facts[env, GEL_SPACING], facts[env, STIFFNESS], facts[env, FRICTION], facts[env, STEP]
+    kind, size = counts[env, KIND], vec3(facts[env, SHAPE], facts[env, SHAPE + 1], facts[env, SHAPE + 2])
+    grid_origin = vec3(facts[env, SHAPE_ORIGIN], facts[env, SHAPE_ORIGIN + 1], facts[env, SHAPE_ORIGIN + 2])
+    grid_spacing = facts[env, SHAPE_SPACING]
+    rotate = ti.Matrix.rows([vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(3)])
+    centre = vec3(drive[env, it, 0, 3, 0], drive[env, it, 0, 3, 1], drive[env, it, 0, 3, 2])
+    velocity = vec3(drive[env, it, 0, 4, 0], drive[env, it, 0, 4, 1], drive[env, it, 0, 4, 2])
+    spin = vec3(drive[env, it, 0, 5, 0], drive[env, it, 0, 5, 1], drive[env, it, 0, 5, 2])
     area = h * h / (POINTS * POINTS)
     c_n = CONTACT_DAMPING * k_n * dt
     back = rotate.transpose()
     total, moment = vec3(0.0), vec3(0.0)
-    for i in range(nx * POINTS):
-        a = (i + 0.5) / POINTS
-        first_i, wx, _dx = spline(a)
-        for j in range(ny * POINTS):
-            b = (j + 0.5) / POINTS
-            first_j, wy, _dy = spline(b)
-            us, vs = vec3(0.0), vec3(0.0)
-            for p, q in ti.static(ti.ndrange(3, 3)):
-                node = top_node(u, 0, first_i + p, first_j + q)
-                us += (wx[p] * wy[q]) * u[node]
-                vs += (wx[p] * wy[q]) * gv[node]
-            x = vec3((a - 0.5 * nx) * h, (b - 0.5 * ny) * h, 0.0) + us
-            phi, n_local = signed_distance(kind, size, back @ (x - centre), values, grid_origin, grid_spacing)
-            touching = False
-            if phi < 0.5 * h:
-                n = rotate @ n_local  # out of the indenter: pushes the gel
-                moving = velocity + spin.cross(x - centre) - vs  # indenter relative to gel
-                closing = moving.dot(n)
-                normal = pressure[i, j] - k_n * phi + c_n * closing
-                if normal > 0.0:
-                    touching = True
-                    ft, memory = friction(
-                        slip[i, j], n, moving - closing * n, normal, TANGENT_STIFFNESS * k_n, c_n, mu, dt
-                    )
-                    slip[i, j] = memory
-                    pressure[i, j] = ti.max(pressure[i, j] - MULTIPLIER_RATE * k_n * phi, 0.0)
-                    force = area * (normal * n - ft)
-                    total += force
-                    moment += x.cross(force)
-                    health[5] = ti.max(health[5], -phi)
+    deepest = 0.0
+    for cell_i in range(first_of(nx, part, PARTS), first_of(nx, part + 1, PARTS)):
+        for cell_j in range(ny):
+            # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides. A distance
+            # grows no faster than the way, and no point of the cell is farther from its middle than two elements.
+            middle = 0.25 * (
+                skin[env, 0, 0, cell_i + 1, cell_j + 1] + skin[env, 0, 0, cell_i + 2, cell_j + 1]
+                + skin[env, 0, 0, cell_i + 1, cell_j + 2] + skin[env, 0, 0, cell_i + 2, cell_j + 2]
+            )  # fmt: skip
+            at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
+            at += vec3(middle[0], middle[1], middle[2])
+            far, _ = signed_distance(kind, size, back @ (at - centre), values, grid_origin, grid_spacing)
+            if far > FAR_CELL * h:
+                for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
+                    slip[env, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
+                    pressure[env, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
+            else:
+                for point in range(POINTS * POINTS):
+                    i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
+                    a, b = (i + 0.5) / POINTS, (j + 0.5) / POINTS
+                    first_i, wx, _dx = spline(a)
+                    first_j, wy, _dy = spline(b)
+                    us, vs = vec4(0.0), vec4(0.0)
                     for p, q in ti.static(ti.ndrange(3, 3)):
-                        node = top_node(u, 0, first_i + p, first_j + q)
-                        gf[node] = gf[node] + (wx[p] * wy[q]) * force
-            if not touching:
-                slip[i, j] = vec3(0.0)
-                pressure[i, j] = 0.0
-    return total, moment
+                        us += (wx[p] * wy[q]) * skin[env, 0, 0, first_i + p + 1, first_j + q + 1]
+                        vs += (wx[p] * wy[q]) * skin[env, 0, 1, first_i + p + 1, first_j + q + 1]
+                    x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
+                    phi, n_local = signed_distance(kind, size, back @ (x - centre), values, grid_origin, grid_spacing)
+                    touching = False
+                    if phi < 0.5 * h:
+                        n = rotate @ n_local  # out of the indenter: pushes the gel
+                        moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
+                        closing = moving.dot(n)
+                        normal = pressure[env, i, j] - k_n * phi + c_n * closing
+                        if normal > 0.0:
+                            touching = True
+                            ft, memory = friction(
+                                slip[env, i, j], n, moving - closing * n, normal, TANGENT_STIFFNESS * k_n, c_n, mu, dt
+                            )
+                            slip[env, i, j] = memory
+                            pressure[env, i, j] = ti.max(pressure[env, i, j] - MULTIPLIER_RATE * k_n * phi, 0.0)
+                            force = area * (normal * n - ft)
+                            total += force
+                            moment += x.cross(force)
+                            deepest = ti.max(deepest, -phi)
+                            push = vec4(force[0], force[1], force[2], 0.0)
+                            for p, q in ti.static(ti.ndrange(3, 3)):
+                                node = surface_node(first_i + p, first_j + q, nx, ny)
+                                touch[env, part, 0, node] = touch[env, part, 0, node] + (wx[p] * wy[q]) * push
+                    if not touching:
+                        slip[env, i, j] = vec3(0.0)
+                        pressure[env, i, j] = 0.0
+    partial[env, part, OVERLAP] = deepest
+    for d in ti.static(range(3)):
+        partial[env, part, FORCE + d] = total[d]
+        partial[env, part, FORCE + 3 + d] = moment[d]

@@ -7,10 +7,10 @@ The same laws in float64 NumPy: tacsim/physics/reference.py.
 
 from tacsim.runtime import ti
 
-vec3 = ti.types.vector(3, ti.f32)
-vec4 = ti.types.vector(4, ti.f32)
 vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
+
+ROOT = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the flow
 
 
 @ti.func
@@ -76,6 +76,17 @@ def log1p(x):
 
 
 @ti.func
+def lanes_log1p(x):
+    """The same for lanes, without a branch: far from 0 by the fourth root."""
+    t = ti.sqrt(ti.sqrt(1.0 + x)) - 1.0
+    far = ti.abs(x) > 0.4
+    z = ti.select(far, t / (2.0 + t), x / (2.0 + x))
+    q = z * z
+    series = 1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q * (1.0 / 9.0 + q * (1.0 / 11.0)))))
+    return ti.select(far, 8.0, 2.0) * z * series
+
+
+@ti.func
 def log_pade(a):
     """log(I + a) by the [3/3] Padé approximant; relative error below 1.4e-5 for |a| up to 0.5."""
     a2 = product(a, a)
@@ -113,11 +124,13 @@ def exponential_minus_identity(x):
 
 
 @ti.func
-def hencky_return(e, mu, bulk, limit):
+def hencky_return(e, flow, mu, bulk, limit, hardening):
     """Hencky elasticity with von Mises return mapping (seed paper, eq. 1 and 2), on e = b_e - I.
 
-    e: trial elastic left Cauchy-Green strain minus identity; limit: k = sigma_y / (2 mu), Frobenius norm.
-    Returns the elastic e after the return, and the Kirchhoff stress tau = 2 mu dev(eps) + K ln(J) I.
+    e: trial elastic left Cauchy-Green strain minus identity; flow: equivalent plastic strain so far; limit: k =
+    sigma_y / (2 mu), Frobenius norm, which grows by hardening * flow (linear isotropic hardening, Simo & Hughes 1998,
+    box 3.1). Returns the elastic e after the return, the new flow, and the Kirchhoff stress
+    tau = 2 mu dev(eps) + K ln(J) I.
     """
     log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
     shrink = ti.exp(-2.0 / 3.0 * log_j)
@@ -125,13 +138,17 @@ def hencky_return(e, mu, bulk, limit):
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
     norm = frobenius(strain)
     elastic = e
-    if norm > limit:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
-        strain *= limit / norm
+    now = limit + hardening * flow
+    new_flow = flow
+    if norm > now:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
+        gamma = (norm - now) / (1.0 + ROOT * hardening)
+        new_flow = flow + ROOT * gamma
+        strain *= (norm - gamma) / norm
         growth = exponential_minus_identity(2.0 * strain)
         excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
         volume = (1.0 - excess / 3.0) / shrink
         elastic = plus_identity(growth * volume, volume - 1.0)
-    return elastic, plus_identity(2.0 * mu * strain, bulk * log_j)
+    return elastic, new_flow, plus_identity(2.0 * mu * strain, bulk * log_j)
 
 
 @ti.func

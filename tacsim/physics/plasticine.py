@@ -4,19 +4,47 @@ Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC). Inside: mm, N, MPa; density 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tacsim.physics.gel import MM, MPA
-from tacsim.physics.material import convect, full, hencky_return, mat3, vec3, vec4, vec6
+from tacsim.physics.lanes import PARTS, first_of, keep_or, vec3, vec4
+from tacsim.physics.layout import (
+    BODY_BULK,
+    BODY_CELL,
+    BODY_HARDENING,
+    BODY_LIMIT,
+    BODY_MASS,
+    BODY_MU,
+    BODY_VOLUME,
+    CAPACITY,
+    FASTEST,
+    GRID,
+    MOTION,
+    NEVER,
+    OFF_GRID,
+    ORIGIN,
+    PARTICLES,
+    SLAB,
+    SMALLEST_STEP_VOLUME,
+    STEP,
+    STRIDE,
+)
+from tacsim.physics.material import convect, hencky_return, mat3, vec6
 from tacsim.runtime import ti
 from tacsim.scene import BodyMaterial, lame
 
-Vectors = ti.types.ndarray(dtype=vec3, ndim=1)
-Matrices = ti.types.ndarray(dtype=mat3, ndim=1)
-Strains = ti.types.ndarray(dtype=vec6, ndim=1)
-Grid = ti.types.ndarray(dtype=vec4, ndim=3)
+# One axis each, environments one after the other: kernels find their way with one number that they have worked out
+# beforehand, which is much faster than several indices into arrays of several axes.
+Points = ti.types.ndarray(dtype=vec4, ndim=1)
+Rates = ti.types.ndarray(dtype=vec4, ndim=2)
+Strains = ti.types.ndarray(dtype=vec4, ndim=1)
+Masses = ti.types.ndarray(dtype=vec4, ndim=1)
+Velocities = ti.types.ndarray(dtype=vec4, ndim=1)
+Sums = ti.types.ndarray(dtype=vec4, ndim=1)
+SUMS = 64  # of `sums` for each part: 16 slots, far enough apart that the compiler does not merge two of them
 
 ELASTIC = 1e9  # strain limit that is never reached
 
@@ -29,6 +57,7 @@ class BodyFacts:
     mu: float  # [MPa]
     bulk: float  # [MPa]
     limit: float  # k = sigma_y / (2 mu) [-]
+    hardening: float = 0.0  # growth of the limit by equivalent plastic strain [-]
 
     @property
     def density(self) -> float:
@@ -44,49 +73,110 @@ class BodyFacts:
         return self.density * self.spacing**3
 
 
+    def facts(self) -> dict[int, float]:
+        """Entries of the array `facts` (tacsim.physics.layout)."""
+        return {
+            BODY_CELL: self.cell, BODY_MU: self.mu, BODY_BULK: self.bulk, BODY_LIMIT: self.limit,
+            BODY_HARDENING: self.hardening, BODY_MASS: self.particle_mass, BODY_VOLUME: self.spacing**3,
+        }  # fmt: skip
+
+
 def body_facts(material: BodyMaterial, spacing: float) -> BodyFacts:
     mu, lam = lame(material)
     limit = material.elastic_limit
     return BodyFacts(spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC)
 
 
-@dataclass
 class BodyState:
-    """Position, velocity, affine velocity and elastic strain of n particles, and the grid they share."""
+    """Particles of all environments, in the order that kernels like; views for everybody else.
 
-    x: np.ndarray  # (n, 3)
-    v: np.ndarray  # (n, 3)
-    c: np.ndarray  # (n, 3, 3)
-    e: np.ndarray  # (n, 6)
+    points: (E, N, 4) position, and contact radius [mm].
+    rates: (E, N, 4, 4) velocity; and the columns of the affine velocity, its derivatives by x, y, z.
+    strains: (E, N, 8) e = b_e - I (xx, yy, zz, xy, xz, yz), equivalent plastic strain, nothing.
+    masses: (E, PARTS, nodes, 4) momentum and mass, one copy a part; velocities: (E, nodes, 4).
+    """
 
+    def __init__(self, points: Sequence[np.ndarray], radius: Sequence[float | np.ndarray]) -> None:
+        """points: of each environment, (n, 3) [mm]; radius: of contact [mm], one or (n,) an environment."""
+        self.counts = [len(p) for p in points]
+        n, e = max(self.counts), len(points)
+        self.points = np.zeros((e, n, 4), np.float32)
+        for index, (p, r) in enumerate(zip(points, radius, strict=True)):
+            self.points[index, : len(p), :3] = p
+            self.points[index, : len(p), 3] = r
+        self.rates = np.zeros((e, n, 4, 4), np.float32)
+        self.strains = np.zeros((e, n, 8), np.float32)
+        self.masses = np.zeros((e, PARTS, 1, 4), np.float32)
+        self.velocities = np.zeros((e, 1, 4), np.float32)
+        self._sums = np.zeros((e * PARTS * SUMS, 4), np.float32)
 
-def body_state(points: np.ndarray) -> BodyState:
-    n = len(points)
-    return BodyState(
-        np.ascontiguousarray(points, np.float32),
-        np.zeros((n, 3), np.float32),
-        np.zeros((n, 3, 3), np.float32),
-        np.zeros((n, 6), np.float32),
-    )
+    def x(self, environment: int = 0) -> np.ndarray:
+        """Positions [mm], (n, 3), a view."""
+        return self.points[environment, : self.counts[environment], :3]
+
+    def v(self, environment: int = 0) -> np.ndarray:
+        """Velocities, (n, 3), a view."""
+        return self.rates[environment, : self.counts[environment], 0, :3]
+
+    def c(self, environment: int = 0) -> np.ndarray:
+        """Affine velocities, (n, 3, 3), a view."""
+        return self.rates[environment, : self.counts[environment], 1:, :3].transpose(0, 2, 1)
+
+    def e(self, environment: int = 0) -> np.ndarray:
+        """Elastic strains b_e - I, (n, 6), a view."""
+        return self.strains[environment, : self.counts[environment], :6]
+
+    def flow(self, environment: int = 0) -> np.ndarray:
+        """Equivalent plastic strains, (n,), a view."""
+        return self.strains[environment, : self.counts[environment], 6]
+
+    def fit(self, environment: int, cell: float, margin: float, facts: np.ndarray, counts: np.ndarray) -> None:
+        """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
+
+        margin [mm]: what they may move during the launch. Writes origin, node counts and the parts' slabs of node
+        planes into `facts` and `counts` (tacsim.physics.layout).
+        """
+        x = self.x(environment)
+        origin, shape = fit_grid(x, cell, margin)
+        facts[environment, ORIGIN : ORIGIN + 3] = origin
+        counts[environment, GRID : GRID + 3] = shape
+        counts[environment, PARTICLES] = len(x)
+        for part in range(PARTS):
+            own = x[len(x) * part // PARTS : len(x) * (part + 1) // PARTS, 0]
+            low, high = 0, 0
+            if own.size:
+                low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
+                high = min(math.ceil((float(own.max()) + margin - float(origin[0])) / cell) + 3, shape[0])
+            counts[environment, SLAB + 2 * part : SLAB + 2 * part + 2] = low, high
+        nodes = math.prod(shape)
+        if self.masses.shape[2] < nodes:
+            nodes = nodes * 5 // 4  # a body that spreads asks for more again and again
+            self.masses = np.zeros((*self.masses.shape[:2], nodes, 4), np.float32)
+            self.velocities = np.zeros((len(self.masses), nodes, 4), np.float32)
+        counts[:, STRIDE], counts[:, CAPACITY] = self.points.shape[1], self.masses.shape[2]
+
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """What every kernel with a body takes, in this order."""
+        flat = (a.reshape(-1, 4) for a in (self.strains, self.masses, self.velocities, self._sums))
+        return (self.points.reshape(-1, 4), self.rates.reshape(-1, 4, 4), *flat)
 
 
 def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """Origin and node counts of a grid round the particles: the grid follows the body, so no index is ever clamped."""
+    """Origin and node counts of a grid round the particles (n, 3) [mm]."""
     low = np.floor((x.min(axis=0) - margin) / cell) * cell
     counts = np.ceil((x.max(axis=0) + margin - low) / cell).astype(int) + 3
     return low.astype(np.float32), (int(counts[0]), int(counts[1]), int(counts[2]))
 
 
 @ti.func
-def stencil(x, origin, cell, shape):
-    """First node of the 3x3x3 stencil, offset from it, weights by axis; `inside` is False off the grid (or NaN)."""
-    s = (x - origin) / cell
-    inside = True
-    for d in ti.static(range(3)):
-        inside = inside and s[d] >= 0.5 and s[d] < shape[d] - 2.0
-    base = ti.Vector([0, 0, 0])
-    if inside:
-        base = ti.floor(s - 0.5).cast(ti.i32)
+def stencil(x, origin, cell, low, high, ny, nz):
+    """First node of the 3x3x3 stencil, offset from it, weights by axis; `inside` is False off the slab (or NaN)."""
+    s = (vec3(x[0], x[1], x[2]) - origin) / cell
+    inside = s[0] >= low + 0.5 and s[1] >= 0.5 and s[2] >= 0.5
+    inside = inside and s[0] < high - 2.0 and s[1] < ny - 2.0 and s[2] < nz - 2.0
+    base = ti.floor(s - 0.5).cast(ti.i32)
+    most = ti.Vector([high - 3, ny - 3, nz - 3])
+    base = ti.max(ti.Vector([low, 0, 0]), ti.min(base, most))  # so that no index is wild; who may be off must ask
     fx = s - base.cast(ti.f32)
     w0 = 0.5 * (1.5 - fx) ** 2
     w1 = 0.75 - (fx - 1.0) ** 2
@@ -95,78 +185,129 @@ def stencil(x, origin, cell, shape):
 
 
 @ti.func
-def clear_grid(grid: ti.template()):
-    for i in range(grid.shape[0]):
-        for j in range(grid.shape[1]):
-            for k in range(grid.shape[2]):
-                grid[i, j, k] = vec4(0.0)
+def clear_masses(env, part, masses: ti.template(), counts: ti.template()):
+    """This part's copy of the grid, where it may write."""
+    plane = counts[env, GRID + 1] * counts[env, GRID + 2]
+    base = (env * PARTS + part) * counts[env, CAPACITY]
+    for node in range(counts[env, SLAB + 2 * part] * plane, counts[env, SLAB + 2 * part + 1] * plane):
+        masses[base + node] = vec4(0.0)
+
+
+@ti.func
+def strain_of(strains: ti.template(), at):
+    a, b = strains[2 * at], strains[2 * at + 1]
+    return vec6(a[0], a[1], a[2], a[3], b[0], b[1]), b[2]
+
+
+@ti.func
+def store_strain(strains: ti.template(), at, e, flow):
+    strains[2 * at] = vec4(e[0], e[1], e[2], e[3])
+    strains[2 * at + 1] = vec4(e[4], e[5], flow, 0.0)
 
 
 @ti.func
 def particles_to_grid(
-    x: ti.template(), v: ti.template(), c: ti.template(), e: ti.template(), grid: ti.template(),
-    origin, cell, mass, volume, mu, bulk, limit, dt, health: ti.template(),
+    env, part, points: ti.template(), rates: ti.template(), strains: ti.template(), masses: ti.template(),
+    facts: ti.template(), counts: ti.template(), partial: ti.template(),
 ):  # fmt: skip
-    """Return mapping, then momentum and mass of each particle onto its 27 nodes."""
-    shape = vec3(grid.shape[0], grid.shape[1], grid.shape[2])
-    for p in range(x.shape[0]):
-        inside, base, fx, w0, w1, w2 = stencil(x[p], origin, cell, shape)
+    """Return mapping; momentum and mass of this part's particles onto their 27 nodes each, in its copy of the grid."""
+    cell, mass, dt = facts[env, BODY_CELL], facts[env, BODY_MASS], facts[env, STEP]
+    mu, bulk, limit, hardening = (
+        facts[env, BODY_MU], facts[env, BODY_BULK], facts[env, BODY_LIMIT], facts[env, BODY_HARDENING]
+    )  # fmt: skip
+    impulse = -dt * facts[env, BODY_VOLUME] * 4.0 / cell
+    origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
+    ny, nz = counts[env, GRID + 1], counts[env, GRID + 2]
+    low, high = counts[env, SLAB + 2 * part], counts[env, SLAB + 2 * part + 1]
+    n, stride = counts[env, PARTICLES], counts[env, STRIDE]
+    base = (env * PARTS + part) * counts[env, CAPACITY]
+    for p in range(env * stride + first_of(n, part, PARTS), env * stride + first_of(n, part + 1, PARTS)):
+        inside, node, fx, w0, w1, w2 = stencil(points[p], origin, cell, low, high, ny, nz)
         if not inside:
-            health[1] += 1.0
+            partial[env, part, OFF_GRID] += 1.0
         else:
-            elastic, tau = hencky_return(e[p], mu, bulk, limit)
-            e[p] = elastic
-            affine = (-dt * volume * 4.0 / cell) * full(tau) + (mass * cell) * c[p]
-            momentum = mass * v[p] - affine @ fx
-            q = vec4(momentum[0], momentum[1], momentum[2], mass)
-            ax = vec4(affine[0, 0], affine[1, 0], affine[2, 0], 0.0)
-            ay = vec4(affine[0, 1], affine[1, 1], affine[2, 1], 0.0)
-            az = vec4(affine[0, 2], affine[1, 2], affine[2, 2], 0.0)
-            w = ti.Matrix.cols([w0, w1, w2])
-            for i, j in ti.static(ti.ndrange(3, 3)):
-                qij = q + ax * float(i) + ay * float(j)
-                wij = w[0, i] * w[1, j]
-                for k in ti.static(range(3)):
-                    node = base + ti.Vector([i, j, k])
-                    grid[node] = grid[node] + (wij * w[2, k]) * (qij + az * float(k))
+            e, flow = strain_of(strains, p)
+            elastic, new_flow, tau = hencky_return(e, flow, mu, bulk, limit, hardening)
+            store_strain(strains, p, elastic, new_flow)
+            inertia = mass * cell
+            ax = impulse * vec4(tau[0], tau[3], tau[4], 0.0) + inertia * rates[p, 1]
+            ay = impulse * vec4(tau[3], tau[1], tau[5], 0.0) + inertia * rates[p, 2]
+            az = impulse * vec4(tau[4], tau[5], tau[2], 0.0) + inertia * rates[p, 3]
+            velocity = rates[p, 0]
+            q = mass * vec4(velocity[0], velocity[1], velocity[2], 1.0) - fx[0] * ax - fx[1] * ay - fx[2] * az
+            wx, wy, wz = vec3(w0[0], w1[0], w2[0]), vec3(w0[1], w1[1], w2[1]), vec3(w0[2], w1[2], w2[2])
+            first = base + (node[0] * ny + node[1]) * nz + node[2]
+            for i in ti.static(range(3)):
+                qi, yi, zi = wx[i] * (q + float(i) * ax), wx[i] * ay, wx[i] * az
+                for j in ti.static(range(3)):
+                    qj, zj = wy[j] * (qi + float(j) * yi), wy[j] * zi
+                    line = first + (i * ny + j) * nz
+                    for k in ti.static(range(3)):
+                        masses[line + k] = masses[line + k] + wz[k] * (qj + float(k) * zj)
+
+
+@ti.func
+def node_sum(env, i, node, masses: ti.template(), counts: ti.template()):
+    """Momentum and mass of a node in plane i: the copies of all parts, in their order."""
+    q = vec4(0.0)
+    for part in ti.static(range(PARTS)):
+        if i >= counts[env, SLAB + 2 * part] and i < counts[env, SLAB + 2 * part + 1]:
+            q += masses[(env * PARTS + part) * counts[env, CAPACITY] + node]
+    return q
 
 
 @ti.func
 def grid_to_particles(
-    x: ti.template(), v: ti.template(), c: ti.template(), e: ti.template(), grid: ti.template(),
-    origin, cell, dt, health: ti.template(),
+    env, part, points: ti.template(), rates: ti.template(), strains: ti.template(), velocities: ti.template(),
+    sums: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
 ):  # fmt: skip
-    """Velocity and affine velocity back to the particles; strain and position follow. Returns the sum of velocities."""
-    shape = vec3(grid.shape[0], grid.shape[1], grid.shape[2])
-    total = vec3(0.0)
-    for p in range(x.shape[0]):
-        inside, base, fx, w0, w1, w2 = stencil(x[p], origin, cell, shape)
-        if inside:
-            w = ti.Matrix.cols([w0, w1, w2])
-            velocity, cx, cy, cz = vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0)
-            for i in ti.static(range(3)):
-                vi, yi, zi = vec3(0.0), vec3(0.0), vec3(0.0)
-                for j in ti.static(range(3)):
-                    vj, zj = vec3(0.0), vec3(0.0)
-                    for k in ti.static(range(3)):
-                        q = grid[base + ti.Vector([i, j, k])]
-                        gv = vec3(q[0], q[1], q[2]) * w[2, k]
-                        vj += gv
-                        zj += gv * float(k)
-                    vi += w[1, j] * vj
-                    yi += (w[1, j] * float(j)) * vj
-                    zi += w[1, j] * zj
-                velocity += w[0, i] * vi
-                cx += (w[0, i] * float(i)) * vi
-                cy += w[0, i] * yi
-                cz += w[0, i] * zi
-            affine = (4.0 / cell) * (ti.Matrix.cols([cx, cy, cz]) - velocity.outer_product(fx))
-            step = dt * affine
-            health[2] = ti.min(health[2], (mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) + step).determinant())
-            health[3] = ti.max(health[3], ti.max(ti.abs(velocity[0]), ti.abs(velocity[1]), ti.abs(velocity[2])))
-            e[p] = convect(e[p], step)
-            v[p] = velocity
-            c[p] = affine
-            x[p] = x[p] + dt * velocity
-            total += velocity
-    return total
+    """Velocity and affine velocity back to this part's particles; strain and position follow.
+
+    No branch for particles off the grid, which would keep the compiler from merging lanes: they read some node of it,
+    and the launch is taken back anyway, since particles_to_grid has counted them.
+    """
+    never, dt, cell = counts[env, NEVER], facts[env, STEP], facts[env, BODY_CELL]
+    origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
+    ny, nz = counts[env, GRID + 1], counts[env, GRID + 2]
+    low, high = counts[env, SLAB + 2 * part], counts[env, SLAB + 2 * part + 1]
+    n, stride = counts[env, PARTICLES], counts[env, STRIDE]
+    base, drop = env * counts[env, CAPACITY], (env * PARTS + part) * SUMS
+    total, fastest, smallest = vec4(0.0), 0.0, 1e9
+    for p in range(env * stride + first_of(n, part, PARTS), env * stride + first_of(n, part + 1, PARTS)):
+        _, node, fx, w0, w1, w2 = stencil(points[p], origin, cell, low, high, ny, nz)
+        wx, wy, wz = vec3(w0[0], w1[0], w2[0]), vec3(w0[1], w1[1], w2[1]), vec3(w0[2], w1[2], w2[2])
+        first = base + (node[0] * ny + node[1]) * nz + node[2]
+        # Sums by line, then by plane, dropped in `sums` on their way: this is where vectors of four are recognised.
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                line = first + (i * ny + j) * nz
+                middle, end = velocities[line + 1], velocities[line + 2]
+                sums[drop + 4 * (j)] = wz[0] * velocities[line] + wz[1] * middle + wz[2] * end
+                sums[drop + 4 * (12 + j)] = wz[1] * middle + (2.0 * wz[2]) * end
+            new = wy[0] * sums[drop] + wy[1] * sums[drop + 4] + wy[2] * sums[drop + 8]
+            sums[drop + 4 * (3 + i)] = keep_or(never, sums[drop + 4 * (3 + i)], new)
+            new = wy[1] * sums[drop + 4] + (2.0 * wy[2]) * sums[drop + 8]
+            sums[drop + 4 * (6 + i)] = keep_or(never, sums[drop + 4 * (6 + i)], new)
+            new = wy[0] * sums[drop + 48] + wy[1] * sums[drop + 52] + wy[2] * sums[drop + 56]
+            sums[drop + 4 * (9 + i)] = keep_or(never, sums[drop + 4 * (9 + i)], new)
+        velocity = wx[0] * sums[drop + 12] + wx[1] * sums[drop + 16] + wx[2] * sums[drop + 20]
+        x = wx[1] * sums[drop + 16] + (2.0 * wx[2]) * sums[drop + 20]
+        y = wx[0] * sums[drop + 24] + wx[1] * sums[drop + 28] + wx[2] * sums[drop + 32]
+        z = wx[0] * sums[drop + 36] + wx[1] * sums[drop + 40] + wx[2] * sums[drop + 44]
+        scale = 4.0 / cell
+        x, y, z = scale * (x - fx[0] * velocity), scale * (y - fx[1] * velocity), scale * (z - fx[2] * velocity)
+        rates[p, 0] = keep_or(never, rates[p, 0], velocity)
+        rates[p, 1] = keep_or(never, rates[p, 1], x)
+        rates[p, 2] = keep_or(never, rates[p, 2], y)
+        rates[p, 3] = keep_or(never, rates[p, 3], z)
+        points[p] = points[p] + dt * velocity
+        step = dt * mat3([[x[i], y[i], z[i]] for i in range(3)])
+        smallest = ti.min(smallest, (mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) + step).determinant())
+        e, flow = strain_of(strains, p)
+        store_strain(strains, p, convect(e, step), flow)
+        fastest = ti.max(fastest, ti.abs(velocity[0]), ti.abs(velocity[1]), ti.abs(velocity[2]))
+        total += velocity
+    partial[env, part, SMALLEST_STEP_VOLUME] = ti.min(partial[env, part, SMALLEST_STEP_VOLUME], smallest)
+    partial[env, part, FASTEST] = ti.max(partial[env, part, FASTEST], fastest)
+    for d in ti.static(range(3)):
+        partial[env, part, MOTION + d] = total[d]

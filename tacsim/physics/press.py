@@ -7,11 +7,31 @@ import numpy as np
 
 from tacsim.interface import Pose
 from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
-from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
-from tacsim.physics.health import Health, as_float32, attempt, retried
-from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
+from tacsim.physics.gel import (
+    MM,
+    MPA,
+    Corners,
+    GelState,
+    Lattice,
+    NodeLanes,
+    Nodes,
+    Skin,
+    Touch,
+    clear_touch,
+    gel_advance,
+    gel_facts,
+    gel_forces,
+    gel_surface,
+)
+from tacsim.physics.health import Health, attempt, retried
+from tacsim.physics.hybrid import COURANT, ZETA_GEL, Drive
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
-from tacsim.physics.material import vec3
+from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3
+from tacsim.physics.layout import (
+    BACKING, COUNTS, FACTS, FORCE, FRICTION, GEL_DAMPING, KIND, NUMBERS, SHAPE, SHAPE_ORIGIN, SHAPE_SPACING, STEP,
+    STEPS, STIFFNESS,
+)  # fmt: skip
+from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
@@ -21,34 +41,42 @@ CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 REACH = 3e-3  # of a mesh's distance grid, up from its tip [m]
 
-Array2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
-Array4 = ti.types.ndarray(dtype=ti.f32, ndim=4)
-Slip = ti.types.ndarray(dtype=vec3, ndim=2)
+Slip = ti.types.ndarray(dtype=vec3, ndim=3)
+Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
+Values = ti.types.ndarray(dtype=ti.f32, ndim=3)
 
 
 @ti.kernel
 def press_substeps(
-    n: ti.i32, dt: ti.f32, drive: Array4,
-    u: Nodes, gv: Nodes, gf: Nodes, h: ti.f32, mu: ti.f32, lam: ti.f32, damping: ti.f32,
-    slip: Slip, pressure: Array2, kind: ti.i32, sx: ti.f32, sy: ti.f32, sz: ti.f32,
-    values: Array3, ox: ti.f32, oy: ti.f32, oz: ti.f32, spacing: ti.f32, k_n: ti.f32, friction: ti.f32,
-    wrench: Array3, backing: Array2, health: Array1,
+    team: ti.i32, drive: Drive,
+    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
+    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    slip: Slip, pressure: Pressure, values: Values,
+    facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
-    """n explicit substeps in one launch; drive: pose and velocity of the indenter in the sensor frame."""
-    ti.loop_config(serialize=True)
-    for it in range(n):
-        health[5] = 0.0
-        rotate = ti.Matrix.rows([row(drive, it, 0, 0), row(drive, it, 0, 1), row(drive, it, 0, 2)])
-        force, moment = indent(
-            u, gv, gf, h, slip, pressure, kind, vec3(sx, sy, sz), values, vec3(ox, oy, oz), spacing,
-            rotate, row(drive, it, 0, 3), row(drive, it, 0, 4), row(drive, it, 0, 5), k_n, friction, dt, health,
-        )  # fmt: skip
-        gel_forces(0, u, gf, h, mu, lam, health)
-        held = gel_advance(0, u, gv, gf, h, lam + 2.0 * mu, damping, dt)
-        for d in ti.static(range(3)):
-            wrench[0, 0, d] = force[d]
-            wrench[0, 1, d] = moment[d]
-            backing[0, d] = held[d]
+    """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter in the sensor frame."""
+    for task in range(drive.shape[0] * team * CHUNK):
+        for _ in range(first_in_chunk(task)):
+            env, member = task // CHUNK // team, task // CHUNK % team
+            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            for it in range(counts[env, STEPS]):
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    clear_touch(env, part, 1, touch)
+                    indent(
+                        env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny
+                    )
+                    gel_forces(
+                        env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
+                        layers, nx, ny,
+                    )  # fmt: skip
+                meet(sync, env, team, 2 * it + 1)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    gel_advance(
+                        env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny
+                    )
+                meet(sync, env, team, 2 * it + 2)
 
 
 def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
@@ -74,25 +102,32 @@ class PressWorld:
         start()
         self.scene = scene
         self._gel = gel_facts(scene.gel, scene.element)
-        self._gels = gel_state(self._gel, 1)
+        self._gels = GelState(self._gel, 1, 1)
         nx, ny, _ = self._gel.elements
-        self._slip = np.zeros((nx * POINTS, ny * POINTS, 3), np.float32)
-        self._pressure = np.zeros((nx * POINTS, ny * POINTS), np.float32)  # multiplier of the normal contact [MPa]
-        self._wrench = np.zeros((1, 2, 3), np.float32)
-        self._backing = np.zeros((1, 3), np.float32)
+        self._slip = np.zeros((1, nx * POINTS, ny * POINTS, 3), np.float32)
+        self._pressure = np.zeros((1, nx * POINTS, ny * POINTS), np.float32)  # multiplier of the normal contact [MPa]
+        self._counts = np.zeros((1, COUNTS), np.int32)
+        self._work = np.zeros((PARTS * SLOTS, LANES), np.float32)
+        self._partial = np.zeros((1, PARTS, NUMBERS), np.float32)
         self._dt = COURANT * self._gel.spacing
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
-        self._stiffness = self._gel.density * self._gel.spacing / (2 * self._dt**2)
-        self._kind, self._size, self._values, self._origin, self._spacing = _distance_facts(scene)
+        self._counts[0, KIND], size, self._values, origin, spacing = _distance_facts(scene)
+        facts = {
+            **self._gel.facts(), GEL_DAMPING: ZETA_GEL / self._gel.thickness,
+            STIFFNESS: self._gel.density * self._gel.spacing / (2 * self._dt**2), FRICTION: scene.indenter.friction,
+            **{SHAPE + d: size[d] for d in range(3)}, **{SHAPE_ORIGIN + d: origin[d] for d in range(3)},
+            SHAPE_SPACING: spacing,
+        }  # fmt: skip
+        self._facts = np.zeros((1, FACTS), np.float32)
+        self._facts[0, list(facts)] = list(facts.values())
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
-        as_float32(list(self._arrays().values()))
 
     def _arrays(self) -> dict[str, np.ndarray]:
         return {
-            "gel_displacement": self._gels.u, "gel_velocity": self._gels.v, "gel_force": self._gels.f,
-            "slip": self._slip, "pressure": self._pressure, "wrench": self._wrench, "backing": self._backing,
+            "gel_displacement": self._gels.u[0], "gel_velocity": self._gels.v[0], "slip": self._slip[0],
+            "pressure": self._pressure[0], "sums": self._partial[0],
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -105,11 +140,13 @@ class PressWorld:
         return self._poses[name]
 
     def wrench(self, name: str) -> np.ndarray:
-        force, moment = self._wrench[self.sensors.index(name)].astype(np.float64)
-        return np.concatenate([force, moment / MM])
+        first = FORCE + 6 * self.sensors.index(name)
+        wrench = self._partial[0, :, first : first + 6].astype(np.float64).sum(axis=0)
+        wrench[3:] /= MM
+        return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._gels, self.sensors.index(name))
+        return gel_surface(self._gel, self._gels, 0, self.sensors.index(name))
 
     def truth(self) -> None:
         return None
@@ -129,31 +166,23 @@ class PressWorld:
         return stats
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
-        assert self.scene.indenter is not None
-        friction = self.scene.indenter.friction
-
         def launch() -> Health:
             both = path.drive(first, last)
             drive = relative_drive(both[:, 0], both[:, 1])
-            g, gel, health = self._gels, self._gel, Health.array()
-            press_substeps(
-                len(drive), path.step, drive,
-                g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
-                self._slip, self._pressure, self._kind, *self._size,
-                self._values, *self._origin, self._spacing, self._stiffness, friction,
-                self._wrench, self._backing, health,
+            self._facts[0, STEP], self._counts[0, STEPS] = path.step, len(drive)
+            Health.clear(self._partial)
+            self._gels.refresh()
+            run_team(
+                press_substeps, drive[None], self._gels.arguments(), self._slip, self._pressure, self._values,
+                self._facts, self._counts, self._work, self._partial,
             )  # fmt: skip
-            return Health.read(health)
+            return Health.read(self._partial[0])
 
         health = attempt(self._arrays(), launch, path.place(self._poses, first, last))
-        return Reading(
-            self._wrench[:, 0].astype(np.float64),
-            self._backing.astype(np.float64),
-            self._floor,
-            health.overlap,
-            health.capped,
-            self._wrench[:, 1].astype(np.float64) / max(self._gel.half),
-        )
+        sums = self._partial[0].astype(np.float64).sum(axis=0)
+        force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
+        backing = sums[None, BACKING : BACKING + 3]
+        return Reading(force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))
 
 
 def _distance_facts(scene: Scene) -> tuple[int, tuple[float, ...], np.ndarray, tuple[float, ...], float]:

@@ -1,0 +1,99 @@
+"""Threads of one environment: how a launch is spread over them and where they meet.
+
+A launch runs many substeps, since starting one costs as much as a draft substep. Its threads meet twice a substep by
+turning in place; so two launches at once, each with as many threads as there are cores, would mostly wait for threads
+that do not run. What comes out is the same bits with any team, hence its size is free: `run_team` takes the one that
+was faster lately.
+"""
+
+import os
+import time
+from typing import Any
+
+import numpy as np
+
+from tacsim.physics.lanes import PARTS
+from tacsim.runtime import ti
+
+CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
+PROBE = 50  # launches between two tries of the team size that was slower
+SMOOTH = 0.3  # weight of the newest time
+
+Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
+
+
+@ti.func
+def meet(sync: ti.template(), env, team, meeting):
+    """Nobody goes on before all members are here; meeting counts from 1."""
+    if team > 1:
+        ti.atomic_add(sync[env, 0], 1)
+        here = 0
+        while here < team * meeting:
+            here = ti.atomic_add(sync[env, 0], 0)
+
+
+# Loops that run once or not at all, in place of branches: inside a branch the compiler does not merge lanes.
+
+
+@ti.func
+def first_in_chunk(task):
+    """How often the work of `task` is done: once for the first of each chunk, else never."""
+    return 1 - ti.min(task % CHUNK, 1)
+
+
+@ti.func
+def shares(member, team):
+    """How many parts a member does: member, member + team, ..."""
+    return (PARTS - member + team - 1) // team
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class _Pace:
+    """Seconds per unit of work of each team size, of late."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[int, float] = {}
+        self.launches = 0
+
+    def choose(self, sizes: tuple[int, ...]) -> int:
+        self.launches += 1
+        untried = [size for size in sizes if size not in self.seconds]
+        if untried:
+            return untried[0]
+        if self.launches % PROBE == 0:
+            return sizes[self.launches // PROBE % len(sizes)]
+        return min(sizes, key=lambda size: self.seconds[size])
+
+    def note(self, size: int, seconds: float) -> None:
+        old = self.seconds.get(size, seconds)
+        self.seconds[size] = (1 - SMOOTH) * old + SMOOTH * seconds
+
+
+_paces: dict[Any, _Pace] = {}
+
+
+def team_sizes(environments: int) -> tuple[int, ...]:
+    """Sizes worth trying: with many environments each keeps to one thread. TACSIM_THREADS bounds the threads in all."""
+    most = min(int(os.environ.get("TACSIM_THREADS", cores())), cores())
+    largest = max(1, min(most // environments, PARTS))
+    return tuple(size for size in (1, 2, 4) if size <= largest)
+
+
+def run_team(kernel: Any, drive: np.ndarray, *arguments: Any) -> None:
+    """Launches `kernel(team, drive, ..., sync)` with the team that is fastest of late; tuples of arguments are spread.
+
+    drive: (environments, substeps, ...).
+    """
+    flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
+    sync = np.zeros((drive.shape[0], 16), np.int32)
+    sizes = team_sizes(drive.shape[0])
+    pace = _paces.setdefault((kernel.__name__, drive.shape[0]), _Pace())
+    team = pace.choose(sizes)
+    work = drive.shape[1] * sum(a.size for a in flat if isinstance(a, np.ndarray))
+    begin = time.perf_counter()
+    kernel(team, drive, *flat, sync)
+    pace.note(team, (time.perf_counter() - begin) / work)

@@ -71,24 +71,38 @@ def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
 
 
 @ti.func
-def contact_ceiling(u: ti.template(), g, radius):
-    """A particle higher than this above the rest surface touches nothing: a spline stays below its highest node."""
+def support_radius(plane, spacing):
+    """Distance of a particle from the body's surface: 1 / |plane|; half a spacing where it knows none (plane = 0).
+
+    plane: the nearest surface's tangent plane, outward normal over distance [1/mm], see body_surface.py.
+    """
+    size = plane.norm()
+    radius = 0.5 * spacing
+    if size > 0.0:
+        radius = 1.0 / size
+    return radius
+
+
+@ti.func
+def contact_ceiling(u: ti.template(), g):
+    """Height of the highest surface node [mm], at least 0: the spline stays below it, and what is above touches not."""
     highest = 0.0
     for i in range(u.shape[1]):
         for j in range(u.shape[2]):
             highest = ti.max(highest, u[g, i, j, u.shape[3] - 1][2])
-    return highest + 2.0 * radius  # one radius to touch, one for what the contact's memory still bridges
+    return highest
 
 
 @ti.func
 def particle_contact(
-    g, x, v, memory, u: ti.template(), gv: ti.template(), gf: ti.template(), h, radius, k_n, mu, housing, dt,
+    g, x, v, memory, u: ti.template(), gv: ti.template(), gf: ti.template(), h, radius, deepest, k_n, mu, housing, dt,
     health: ti.template(),
 ):  # fmt: skip
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
     x, v: position, and velocity relative to the moving sensor. memory: elastic slip, and the multiplier as the overlap
-    whose penalty it equals [mm]. Returns touching, force, new memory, overlap.
+    whose penalty it equals [mm]. deepest: largest overlap answered in full [mm]. Returns touching, force, new memory,
+    overlap.
     """
     nx, ny = float(u.shape[1] - 1), float(u.shape[2] - 1)
     touching = False
@@ -103,8 +117,8 @@ def particle_contact(
         a, us = material_point(u, g, x, h)
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
-            depth = us[2] + radius - x[2]
-            if depth + taken > 0.0:
+            below = us[2] - x[2]  # along z; foreshortened on a slope, the radius is not
+            if below + radius + taken > 0.0:
                 i, wx, dx = spline(a[0])
                 j, wy, dy = spline(a[1])
                 t1, t2, vs = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0)
@@ -114,9 +128,9 @@ def particle_contact(
                     t2 += (wx[p] * dy[q] / h) * u[node]
                     vs += (wx[p] * wy[q]) * gv[node]
                 n = t1.cross(t2).normalized()
-                gap = depth * n[2]  # overlap; negative where they have parted
-                if gap > 4.0 * radius:  # an overlap found late must not explode; counted
-                    gap = 4.0 * radius
+                gap = below * n[2] + radius  # overlap; negative where they have parted
+                if gap > deepest:  # an overlap found late must not explode; counted
+                    gap = deepest
                     health[4] += 1.0
                 vr = v - vs
                 vn = vr.dot(n)
@@ -132,8 +146,8 @@ def particle_contact(
         elif housing >= 0.0:
             gap = radius - housing - x[2]
             if gap + taken > 0.0:
-                if gap > 4.0 * radius:
-                    gap = 4.0 * radius
+                if gap > deepest:
+                    gap = deepest
                     health[4] += 1.0
                 n = vec3(0.0, 0.0, 1.0)
                 fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)

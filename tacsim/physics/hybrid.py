@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.contact import contact_ceiling, particle_contact
+from tacsim.physics.body_surface import surface_points, tangent_planes
+from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
 from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
 from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
 from tacsim.physics.health import Health, as_float32, attempt, require_room, retried
@@ -19,6 +20,7 @@ from tacsim.physics.plasticine import (
     body_facts,
     body_state,
     clear_grid,
+    convect_planes,
     fit_grid,
     grid_to_particles,
     particles_to_grid,
@@ -27,7 +29,8 @@ from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
 from tacsim.scene import GelSurface, Scene
-from tacsim.shapes import extent, particles
+from tacsim.sampling import body_points
+from tacsim.shapes import extent, volume
 
 COURANT = 0.4  # dt / (smallest spacing / wave speed)
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
@@ -85,23 +88,39 @@ def grid_update(grid: ti.template(), origin, cell, drive: ti.template(), it, dam
 @ti.func
 def touch(
     g, rotate, it, drive: ti.template(), x: ti.template(), v: ti.template(), memory: ti.template(),
-    u: ti.template(), gv: ti.template(), gf: ti.template(), h, mass, radius, k_n, mu, housing, dt,
+    u: ti.template(), gv: ti.template(), gf: ti.template(), planes: ti.template(), h, mass, spacing, k_n, mu, housing, dt,
     health: ti.template(),
 ):  # fmt: skip
     """Contact of every particle with gel g. Returns force and moment of the body on the sensor, sensor axes."""
     origin, velocity, spin = row(drive, it, g, 3), row(drive, it, g, 4), row(drive, it, g, 5)
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    highest = contact_ceiling(u, g, radius)
+    highest = contact_ceiling(u, g)
     total, moment = vec3(0.0), vec3(0.0)
     for p in range(x.shape[0]):
         arm = x[p] - origin
         kept = vec4(0.0)
-        if outward.dot(arm) < highest:  # most of the body is far away: one dot product decides
+        radius = support_radius(planes[p], spacing)
+        # one radius to touch, half a spacing for what the contact's memory still bridges
+        if outward.dot(arm) < highest + radius + 0.5 * spacing:  # most of the body is far away: one dot product decides
             local = back @ arm
             relative = back @ (v[p] - velocity - spin.cross(arm))
             touching, force, kept_now, overlap = particle_contact(
-                g, local, relative, memory[g, p], u, gv, gf, h, radius, k_n, mu, housing, dt, health
+                g,
+                local,
+                relative,
+                memory[g, p],
+                u,
+                gv,
+                gf,
+                h,
+                radius,
+                2.0 * spacing,
+                k_n,
+                mu,
+                housing,
+                dt,
+                health,
             )
             kept = kept_now
             if touching:
@@ -117,8 +136,8 @@ def touch(
 def substeps(
     n: ti.i32, dt: ti.f32, drive: Array4,
     u: Nodes, gv: Nodes, gf: Nodes, h: ti.f32, gel_mu: ti.f32, gel_lam: ti.f32, gel_damping: ti.f32,
-    x: Vectors, v: Vectors, c: Matrices, e: Strains, memory: ContactMemory, mean: Array1,
-    grid: Grid, ox: ti.f32, oy: ti.f32, oz: ti.f32, spacing: ti.f32,
+    x: Vectors, v: Vectors, c: Matrices, e: Strains, planes: Vectors, memory: ContactMemory, mean: Array1,
+    grid: Grid, ox: ti.f32, oy: ti.f32, oz: ti.f32, spacing: ti.f32, volume: ti.f32,
     mu: ti.f32, bulk: ti.f32, limit: ti.f32, body_damping: ti.f32, lightness: ti.f32,
     k_n: ti.f32, friction_lower: ti.f32, friction_upper: ti.f32, housing: ti.f32,
     wrench: Array3, backing: ti.types.ndarray(dtype=ti.f32, ndim=2), health: Array1,
@@ -126,7 +145,7 @@ def substeps(
     """n explicit substeps of the whole scene in one launch; serial, plain adds, bitwise repeatable."""
     ti.loop_config(serialize=True)
     for it in range(n):
-        cell, volume = 2.0 * spacing, spacing * spacing * spacing
+        cell = 2.0 * spacing
         mass = (bulk + 4.0 / 3.0 * mu) * volume
         origin = vec3(ox, oy, oz)
         health[5] = 0.0
@@ -145,9 +164,10 @@ def substeps(
                 u,
                 gv,
                 gf,
+                planes,
                 h,
                 mass,
-                0.5 * spacing,
+                spacing,
                 k_n,
                 friction,
                 housing,
@@ -166,6 +186,7 @@ def substeps(
         boost = ((lightness - 1.0) * dt / (mass * x.shape[0])) * push
         grid_update(grid, origin, cell, drive, it, body_damping, vec3(mean[0], mean[1], mean[2]), boost, dt)
         total = grid_to_particles(x, v, c, e, grid, origin, cell, dt, health)
+        convect_planes(planes, c, dt)
         for d in ti.static(range(3)):
             mean[d] = total[d] / x.shape[0]
 
@@ -180,11 +201,12 @@ class HybridWorld:
         start()
         self.scene = scene
         self._gel = gel_facts(scene.gel, scene.element)
-        self._body = body_facts(scene.body.material, scene.spacing)
         self._gels = gel_state(self._gel, 2)
         height = float(extent(scene.body.geometry)[2])
-        points = (particles(scene.body.geometry, scene.spacing) + [0.0, 0.0, height / 2 + CLEARANCE]) * MM
-        self._particles = body_state(points)
+        points = body_points(scene.body, scene.spacing)
+        self._body = body_facts(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
+        self._particles = body_state((points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM)
+        self._planes = (tangent_planes(scene.body.geometry, points, scene.spacing) / MM).astype(np.float32)  # [1/mm]
         self._memory = np.zeros((2, len(points), 4), np.float32)  # of the contact law, sensor frames [mm]
         self._mean = np.zeros(3, np.float32)  # the body's mean velocity
         self._wrench = np.zeros((2, 2, 3), np.float32)
@@ -212,8 +234,8 @@ class HybridWorld:
         b = self._particles
         return {
             "gel_displacement": self._gels.u, "gel_velocity": self._gels.v, "gel_force": self._gels.f,
-            "position": b.x, "velocity": b.v, "affine": b.c, "strain": b.e, "contact": self._memory,
-            "mean_velocity": self._mean, "wrench": self._wrench, "backing": self._backing,
+            "position": b.x, "velocity": b.v, "affine": b.c, "strain": b.e, "planes": self._planes,
+            "contact": self._memory, "mean_velocity": self._mean, "wrench": self._wrench, "backing": self._backing,
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -237,8 +259,7 @@ class HybridWorld:
 
     def truth(self) -> Truth:
         x = self._particles.x
-        z = x[:, 2]
-        height = (float(z.max()) - float(z.min()) + self._body.spacing) / MM
+        height = float(np.ptp(surface_points(x, self._planes)[:, 2])) / MM
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
     # ----------------------------------------------------------------- motion
@@ -284,8 +305,8 @@ class HybridWorld:
         substeps(
             len(drive), dt, drive,
             g.u, g.v, g.f, gel.spacing, gel.mu, gel.lam, GEL_DAMPING / gel.thickness,
-            b.x, b.v, b.c, b.e, self._memory, self._mean,
-            self._grid, *(float(o) for o in origin), body.spacing, body.mu, body.bulk, body.limit,
+            b.x, b.v, b.c, b.e, self._planes, self._memory, self._mean,
+            self._grid, *(float(o) for o in origin), body.spacing, body.volume, body.mu, body.bulk, body.limit,
             BODY_DAMPING / gel.thickness, self._lightness,
             self._stiffness, self.scene.friction["lower"], self.scene.friction["upper"],
             -1.0 if housing is None else housing * MM,

@@ -29,6 +29,7 @@ class BodyFacts:
     mu: float  # [MPa]
     bulk: float  # [MPa]
     limit: float  # k = sigma_y / (2 mu) [-]
+    volume: float  # of one particle [mm^3]; about h_p^3
 
     @property
     def density(self) -> float:
@@ -41,13 +42,20 @@ class BodyFacts:
 
     @property
     def particle_mass(self) -> float:
-        return self.density * self.spacing**3
+        return self.density * self.volume
 
 
-def body_facts(material: BodyMaterial, spacing: float) -> BodyFacts:
+def body_facts(material: BodyMaterial, spacing: float, volume: float | None = None) -> BodyFacts:
+    """`spacing` [m]; `volume` of one particle [m^3], without it spacing^3."""
     mu, lam = lame(material)
     limit = material.elastic_limit
-    return BodyFacts(spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC)
+    return BodyFacts(
+        spacing * MM,
+        mu * MPA,
+        (lam + 2 * mu / 3) * MPA,
+        limit if math.isfinite(limit) else ELASTIC,
+        (spacing**3 if volume is None else volume) * MM**3,
+    )
 
 
 @dataclass
@@ -170,3 +178,10 @@ def grid_to_particles(
             x[p] = x[p] + dt * velocity
             total += velocity
     return total
+
+
+@ti.func
+def convect_planes(planes: ti.template(), c: ti.template(), dt):
+    """Tangent planes of the body's surface go with the material, as F^-T does: m' = -C^T m. m = 0 stays 0."""
+    for p in range(planes.shape[0]):
+        planes[p] = planes[p] - dt * (c[p].transpose() @ planes[p])

@@ -21,7 +21,7 @@ from tacsim.physics.health import Health, Place, SimulationDiverged, as_float32,
 from tacsim.physics.world import MoveStats, put_back
 from tacsim.runtime import start
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
-from tacsim.shapes import particles
+from tacsim.sampling import body_points
 
 Float32 = NDArray[np.float32]
 
@@ -91,7 +91,7 @@ class SeedWorld:
         self._body = solid(scene.body.material, h**3)
         # force that rounding in F can pretend: one particle's area at the gel's modulus
         self._floor = scene.gel.material.youngs_modulus * MPA * h * h
-        self._initialise(particles(scene.body.geometry, scene.spacing) * MM)
+        self._initialise(body_points(scene.body, scene.spacing) * MM)
 
     def _initialise(self, body: NDArray[np.float64]) -> None:
         """Stage 1 of the scheme: undeformed particles at rest, a clear gap between body and gels."""

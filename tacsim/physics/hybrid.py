@@ -28,8 +28,8 @@ from tacsim.physics.plasticine import (
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
-from tacsim.scene import GelSurface, Scene
 from tacsim.sampling import body_points
+from tacsim.scene import GelSurface, Scene
 from tacsim.shapes import extent, volume
 
 COURANT = 0.4  # dt / (smallest spacing / wave speed)
@@ -88,8 +88,8 @@ def grid_update(grid: ti.template(), origin, cell, drive: ti.template(), it, dam
 @ti.func
 def touch(
     g, rotate, it, drive: ti.template(), x: ti.template(), v: ti.template(), memory: ti.template(),
-    u: ti.template(), gv: ti.template(), gf: ti.template(), planes: ti.template(), h, mass, spacing, k_n, mu, housing, dt,
-    health: ti.template(),
+    u: ti.template(), gv: ti.template(), gf: ti.template(), planes: ti.template(), h, mass, spacing, k_n, mu,
+    housing, dt, health: ti.template(),
 ):  # fmt: skip
     """Contact of every particle with gel g. Returns force and moment of the body on the sensor, sensor axes."""
     origin, velocity, spin = row(drive, it, g, 3), row(drive, it, g, 4), row(drive, it, g, 5)

@@ -20,8 +20,8 @@ from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle
 from tacsim.physics.health import Health, Place, SimulationDiverged, as_float32, attempt, require_room, retried
 from tacsim.physics.world import MoveStats, put_back
 from tacsim.runtime import start
-from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 from tacsim.sampling import body_points
+from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 
 Float32 = NDArray[np.float32]
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tacsim.interface import FloatArray
 
 HALF = 2  # nodes from the middle of the window to its edge
-SHARE = 0.4  # the print is where the surface lies deeper than this share of its typical depth
+SHARE = 0.5  # the print is where the surface lies deeper than this share of its typical depth
 
 
 def filter_weights() -> FloatArray:
@@ -40,7 +40,7 @@ def inside_print(depth: FloatArray) -> np.ndarray:
 
     touched = depth > 0.2 * depth.max()
     typical = np.percentile(depth[touched], 75)
-    square = np.ones((3, 3))
+    square = np.ones((3, 3), dtype=bool)
     # closing must not meet the border of the array
     closed = binary_closing(np.pad(depth > SHARE * typical, 3), square)
     filled = binary_fill_holes(closed)[3:-3, 3:-3]

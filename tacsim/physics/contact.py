@@ -79,7 +79,7 @@ def support_radius(plane, spacing):
     size = plane.norm()
     radius = 0.5 * spacing
     if size > 0.0:
-        radius = 1.0 / size
+        radius = ti.min(1.0 / size, spacing)  # a plane torn further away is no longer this particle's to speak for
     return radius
 
 

@@ -117,8 +117,8 @@ def particle_contact(
         a, us = material_point(u, g, x, h)
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
-            below = us[2] - x[2]  # along z; foreshortened on a slope, the radius is not
-            if below + radius + taken > 0.0:
+            depth = us[2] + radius - x[2]
+            if depth + taken > 0.0:
                 i, wx, dx = spline(a[0])
                 j, wy, dy = spline(a[1])
                 t1, t2, vs = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0)
@@ -128,7 +128,7 @@ def particle_contact(
                     t2 += (wx[p] * dy[q] / h) * u[node]
                     vs += (wx[p] * wy[q]) * gv[node]
                 n = t1.cross(t2).normalized()
-                gap = below * n[2] + radius  # overlap; negative where they have parted
+                gap = depth * n[2]  # overlap; negative where they have parted
                 if gap > deepest:  # an overlap found late must not explode; counted
                     gap = deepest
                     health[4] += 1.0

@@ -268,6 +268,12 @@ def node_sum(env, i, node, masses: ti.template(), counts: ti.template()):
 
 
 @ti.func
+def moved_plane(plane, x, y, z, dt):
+    """A tangent plane of the body's surface goes with the material, as F^-T does: m' = -C^T m; x, y, z: columns of C."""
+    return plane - dt * vec4(x.dot(plane), y.dot(plane), z.dot(plane), 0.0)
+
+
+@ti.func
 def grid_to_particles(
     env, part, points: ti.template(), planes: ti.template(), rates: ti.template(), strains: ti.template(),
     velocities: ti.template(), sums: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
@@ -312,8 +318,7 @@ def grid_to_particles(
         rates[p, 2] = keep_or(never, rates[p, 2], y)
         rates[p, 3] = keep_or(never, rates[p, 3], z)
         points[p] = points[p] + dt * velocity
-        plane = planes[p]  # goes with the material, as F^-T does: m' = -C^T m
-        planes[p] = plane - dt * vec4(x.dot(plane), y.dot(plane), z.dot(plane), 0.0)
+        planes[p] = moved_plane(planes[p], x, y, z, dt)
         step = dt * mat3([[x[i], y[i], z[i]] for i in range(3)])
         smallest = ti.min(smallest, (mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) + step).determinant())
         e, flow = strain_of(strains, p)

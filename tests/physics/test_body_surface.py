@@ -10,7 +10,7 @@ from robot.bench.roughness import print_roughness
 from tacsim.interface import Pose
 from tacsim.physics.body_surface import surface_points, tangent_planes
 from tacsim.physics.hybrid import CLEARANCE, HybridWorld
-from tacsim.physics.plasticine import Matrices, Vectors, convect_planes
+from tacsim.physics.plasticine import Points, moved_plane
 from tacsim.runtime import start, ti
 from tacsim.sampling import body_points
 from tacsim.scene import Body, BodyMaterial, Box, Mesh, Scene, Sphere
@@ -48,10 +48,12 @@ def test_a_mesh_knows_its_surface_like_the_shape_it_describes(tmp_path: Path) ->
 
 
 @ti.kernel
-def flow(n: ti.i32, planes: Vectors, c: Matrices, dt: ti.f32):
+def flow(n: ti.i32, planes: Points, columns: Points, dt: ti.f32):
+    """columns: of C, its derivatives by x, y, z."""
     ti.loop_config(serialize=True)
     for _ in range(n):
-        convect_planes(planes, c, dt)
+        for p in range(planes.shape[0]):
+            planes[p] = moved_plane(planes[p], columns[0], columns[1], columns[2], dt)
 
 
 def test_planes_go_with_the_material() -> None:
@@ -62,8 +64,10 @@ def test_planes_go_with_the_material() -> None:
     steps = 2000
     planes = rng.normal(size=(20, 3)).astype(np.float32)
     planes[7] = 0.0
-    moved = planes.copy()
-    flow(steps, moved, np.tile(rate, (20, 1, 1)).astype(np.float32), 1.0 / steps)
+    four, columns = np.zeros((20, 4), np.float32), np.zeros((3, 4), np.float32)
+    four[:, :3], columns[:, :3] = planes, rate.T
+    flow(steps, four, columns, 1.0 / steps)
+    moved = four[:, :3]
     f = np.linalg.matrix_power(np.eye(3) + rate / steps, steps)
     assert moved == pytest.approx(planes @ np.linalg.inv(f), abs=2e-3)
     assert not moved[7].any()
@@ -96,7 +100,7 @@ def test_random_and_lattice_bodies_press_alike_and_weigh_the_same() -> None:
     for sampling in ("lattice", "random"):
         world = squeezed(CUBE, sampling, 1e-3)
         forces.append(world.wrench("lower")[2])
-        assert len(world._particles.x) * world._body.volume == pytest.approx(volume(CUBE) * 1e9, rel=1e-9)
+        assert len(world._particles.x()) * world._body.volume == pytest.approx(volume(CUBE) * 1e9, rel=1e-9)
     assert forces[1] == pytest.approx(forces[0], rel=0.03)
 
 

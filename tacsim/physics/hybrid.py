@@ -118,7 +118,7 @@ def grid_update(
                 node = (i * ny + j) * nz + k
                 q = node_sum(env, i, node, masses, counts)
                 velocity = vec3(0.0)
-                if q[3] > 0.0:
+                if q[3] != 0.0:  # a mass that is not a number must show
                     velocity = vec3(q[0], q[1], q[2]) / q[3] + boost + dt * weight
                     x = origin + cell * vec3(i, j, k)
                     t = ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
@@ -276,6 +276,7 @@ class HybridWorld:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self._poses = put_back(self._arrays(), self.sensors, state)
+        self._particles.refresh()
         self._speed = float(state["speed"])
 
     def pose(self, name: str) -> Pose:

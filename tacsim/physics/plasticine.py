@@ -141,6 +141,11 @@ class BodyState:
         """Equivalent plastic strains, (n,), a view."""
         return self.strains[environment, : self.counts[environment], 6]
 
+    def refresh(self) -> None:
+        """Zeros in the fourth numbers, which take part in sums: after somebody has written the others."""
+        for array in (self.points, self.planes, self.rates):
+            array[..., 3] = 0.0
+
     def fit(self, environment: int, cell: float, margin: float, facts: np.ndarray, counts: np.ndarray) -> None:
         """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
 

@@ -1,7 +1,8 @@
 """The quasi-static controller: ramped motion of driven frames, then a hold until the measured residual is small.
 
 Materials are rate-independent, so only the path counts. What writes false plastic strain into the body is the jerk at
-start and stop, not the speed; hence every motion starts and ends with zero velocity and zero acceleration.
+start and stop, not the speed; hence every motion starts and ends with zero velocity and zero acceleration, and its
+acceleration is limited as well as its speed.
 """
 
 from __future__ import annotations
@@ -20,21 +21,28 @@ from tacsim.physics.world import MoveStats
 from tacsim.scene import Settling
 
 MM = 1e3
-PEAK = 1.875  # peak slope of the quintic ramp over its mean
-CHECK = 20  # substeps between two looks at the residual
+CHECK = 8  # substeps between two looks at the residual
+RISE = 8.0  # a motion takes the time of a wave through so many gel thicknesses to reach its speed, and to stop
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
-def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quintic 0 -> 1 with zero first and second derivative at both ends (minimum jerk, Flash & Hogan 1985)."""
-    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
+    """0 -> 1 over t = 0..1, at constant speed 1 / (1 - rise) but for smooth starts and stops of length `rise` each.
+
+    Velocity and acceleration are zero at both ends and continuous: in a start the velocity is a cubic smoothstep.
+    """
+    early, late = np.minimum(t, 1.0 - t), t > 0.5
+    s = np.minimum(early / rise, 1.0)
+    half = (rise * s**3 * (1.0 - 0.5 * s) + np.maximum(early - rise, 0.0)) / (1.0 - rise)
+    return np.where(late, 1.0 - half, half)
 
 
 @dataclass(frozen=True)
 class Path:
     """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
 
-    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal.
+    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. `rise` is the share of the
+    time that the start takes, and the stop.
     """
 
     start: Sequence[Pose]
@@ -42,6 +50,7 @@ class Path:
     substeps: int
     dt: float
     refine: int = 1
+    rise: float = 0.5
 
     @property
     def step(self) -> float:
@@ -54,7 +63,7 @@ class Path:
         Rows: the rotation matrix, position [mm], velocity, angular velocity; all in world.
         """
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
-        s = ramp(np.clip(knots, 0.0, 1.0))
+        s = ramp(np.clip(knots, 0.0, 1.0), self.rise)
         out = np.empty((len(s) - 1, len(self.start), 6, 3))
         step = self.step
         for index, (a, b) in enumerate(zip(self.start, self.end, strict=True)):
@@ -82,14 +91,26 @@ class Path:
         return Place(f"in {part}", poses)
 
 
-def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float) -> Path:
-    """A path whose fastest point moves at peak Mach `mach`; `lever` [mm] turns rotation into speed at the gel's rim."""
+def plan(
+    start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float
+) -> Path:
+    """A path whose fastest point moves at peak Mach `mach` and takes RISE wave times of a gel to get there, and to stop.
+
+    lever [mm] turns rotation into speed at the gel's rim; thickness [mm] of the gel. A move too short for the peak speed
+    keeps to the acceleration instead, so its time goes with the root of its length.
+    """
     length = 0.0
     for a, b in zip(start, end, strict=True):
         turn = float((Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).magnitude())
         length = max(length, float(np.linalg.norm(b.position - a.position)) * MM + turn * lever)
-    substeps = math.ceil(PEAK * length / (mach * dt)) if length > 0 else 0
-    return Path(start, end, substeps, dt)
+    if length == 0.0:
+        return Path(start, end, 0, dt)
+    cruise, starting = length / mach, RISE * thickness
+    if cruise > starting:
+        span, rise = cruise + starting, starting / (cruise + starting)
+    else:
+        span, rise = 2.0 * math.sqrt(cruise * starting), 0.5
+    return Path(start, end, math.ceil(span / dt), dt, rise=rise)
 
 
 def force_floor(modulus: float, thickness: float) -> float:

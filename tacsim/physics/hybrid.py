@@ -29,7 +29,7 @@ from tacsim.runtime import start, ti
 from tacsim.scene import GelSurface, Scene
 from tacsim.shapes import extent, particles
 
-COURANT = 0.4  # dt / (smallest spacing / wave speed)
+COURANT = 0.5  # dt / (smallest spacing / wave speed)
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
 BODY_DAMPING = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
@@ -245,8 +245,8 @@ class HybridWorld:
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         end = merged(self._poses, targets)
-        lever = max(self._gel.half)
-        path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
+        start, gel = list(self._poses.values()), self._gel
+        path = plan(start, list(end.values()), self.scene.settling.mach, self._dt, max(gel.half), gel.thickness)
 
         def motion(refine: int) -> MoveStats:
             finer = replace(path, refine=refine)

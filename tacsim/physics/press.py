@@ -116,9 +116,8 @@ class PressWorld:
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         end = merged(self._poses, targets)
-        path = plan(
-            list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, max(self._gel.half)
-        )
+        start, gel = list(self._poses.values()), self._gel
+        path = plan(start, list(end.values()), self.scene.settling.mach, self._dt, max(gel.half), gel.thickness)
 
         def motion(refine: int) -> MoveStats:
             finer = replace(path, refine=refine)

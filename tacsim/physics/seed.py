@@ -178,7 +178,8 @@ class SeedWorld:
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
         self._check_room(end)
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
-        path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
+        start, thickness = list(self._poses.values()), self.scene.gel.size[2] * MM
+        path = plan(start, list(end.values()), self.scene.settling.mach, self._dt, lever, thickness)
         if 0 < path.substeps < GENTLE:
             path = replace(path, substeps=GENTLE)
 

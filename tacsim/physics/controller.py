@@ -8,7 +8,7 @@ acceleration is limited as well as its speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.health import Place
+from tacsim.physics.health import Place, SimulationDiverged
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Settling
 
 MM = 1e3
-CHECK = 8  # substeps between two looks at the residual
+CHECK = 10  # substeps between two looks at the residual
+LOOKS = 2  # looks back that the change of force is measured over: a shorter time would take a slow creep for rest
 RISE = 8.0  # a motion takes the time of a wave through so many gel thicknesses to reach its speed, and to stop
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
@@ -91,13 +92,11 @@ class Path:
         return Place(f"in {part}", poses)
 
 
-def plan(
-    start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float
-) -> Path:
-    """A path whose fastest point moves at peak Mach `mach` and takes RISE wave times of a gel to get there, and to stop.
+def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float) -> Path:
+    """A path whose fastest point moves at peak Mach `mach`; it takes RISE wave times of a gel to get there, and to stop.
 
-    lever [mm] turns rotation into speed at the gel's rim; thickness [mm] of the gel. A move too short for the peak speed
-    keeps to the acceleration instead, so its time goes with the root of its length.
+    lever [mm] turns rotation into speed at the gel's rim; thickness [mm] of the gel. A move too short for that speed
+    keeps to the acceleration instead: its time goes with the root of its length.
     """
     length = 0.0
     for a, b in zip(start, end, strict=True):
@@ -134,7 +133,7 @@ class Reading:
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
-    """Largest force imbalance, or change of force or moment since the last look, relative to the largest force [-].
+    """Largest force imbalance, or change of force or moment since `before`, relative to the largest force [-].
 
     `balanced`: the contact forces of all gels must add up to zero (a free body between them).
     """
@@ -147,27 +146,56 @@ def residual(now: Reading, before: Reading, balanced: bool) -> float:
     return float(max(parts)) / scale
 
 
-def move_and_settle(
-    path: Path, settling: Settling, advance: Callable[[Path, int, int], Reading], *, balanced: bool
-) -> MoveStats:
-    """Runs `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
-    reading: Reading | None = None
-    hits = 0
+@dataclass(frozen=True)
+class Launch:
+    """What a motion wants next: substeps first..last of a path, then a Reading."""
+
+    path: Path
+    first: int
+    last: int
+
+
+# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the Reading at its end, or
+# thrown the SimulationDiverged that the launch ended in. So whoever advances many worlds in one launch of kernels holds
+# one motion for each, all at their own phases; `run` is that for a single world.
+Motion = Generator[Launch, Reading, MoveStats]
+
+
+def run(motion: Motion, advance: Callable[[Path, int, int], Reading]) -> MoveStats:
+    """Runs one world's motion to its end. A motion cut short (an interruption, say) is closed, so it rolls back."""
+    try:
+        wanted = next(motion)
+        while True:
+            try:
+                reading = advance(wanted.path, wanted.first, wanted.last)
+            except SimulationDiverged as failure:
+                wanted = motion.throw(failure)
+            else:
+                wanted = motion.send(reading)
+    except StopIteration as end:
+        stats: MoveStats = end.value
+        return stats
+    finally:
+        motion.close()
+
+
+def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
+    seen: list[Reading] = []
     for first in range(0, path.substeps, CHECK):
-        reading = advance(path, first, min(first + CHECK, path.substeps))
-        hits += reading.guard_hits
+        seen.append((yield Launch(path, first, min(first + CHECK, path.substeps))))
     rest = replace(path, start=path.end, substeps=0)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
         count = min(CHECK, settling.max_substeps - held)
-        before, reading = reading, advance(rest, 0, count)
+        seen.append((yield Launch(rest, 0, count)))
         held += count
-        hits += reading.guard_hits
-        if before is not None:
-            worst = residual(reading, before, balanced)
+        if len(seen) > LOOKS:
+            worst = residual(seen[-1], seen[-1 - LOOKS], balanced)
             if worst <= settling.tolerance:
                 break
-    overlap = 0.0 if reading is None else reading.overlap / MM
+    overlap = seen[-1].overlap / MM if seen else 0.0
+    hits = sum(reading.guard_hits for reading in seen)
     return MoveStats(path.substeps + held, held, worst, worst <= settling.tolerance, overlap, hits)
 
 

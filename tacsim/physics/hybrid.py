@@ -7,7 +7,7 @@ import numpy as np
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.contact import contact_ceiling, particle_contact
-from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
+from tacsim.physics.controller import Motion, Path, Reading, force_floor, merged, move_and_settle, plan, run
 from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
 from tacsim.physics.health import Health, as_float32, attempt, require_room, retried
 from tacsim.physics.material import vec3, vec4
@@ -29,7 +29,7 @@ from tacsim.runtime import start, ti
 from tacsim.scene import GelSurface, Scene
 from tacsim.shapes import extent, particles
 
-COURANT = 0.5  # dt / (smallest spacing / wave speed)
+COURANT = 0.4  # dt / (smallest spacing / wave speed)
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
 BODY_DAMPING = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
@@ -244,15 +244,18 @@ class HybridWorld:
     # ----------------------------------------------------------------- motion
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+        return run(self.motion(targets), self._advance)
+
+    def motion(self, targets: Mapping[str, Pose]) -> Motion:
+        """`move`, a launch at a time."""
         end = merged(self._poses, targets)
         start, gel = list(self._poses.values()), self._gel
         path = plan(start, list(end.values()), self.scene.settling.mach, self._dt, max(gel.half), gel.thickness)
 
-        def motion(refine: int) -> MoveStats:
-            finer = replace(path, refine=refine)
-            return move_and_settle(finer, self.scene.settling, self._advance, balanced=True)
+        def tried(refine: int) -> Motion:
+            return move_and_settle(replace(path, refine=refine), self.scene.settling, balanced=True)
 
-        stats = retried(self, targets, motion)
+        stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
+from tacsim.physics.controller import Motion, Path, Reading, force_floor, merged, move_and_settle, plan, run
 from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_forces, gel_state, gel_surface
 from tacsim.physics.health import Health, as_float32, attempt, retried
 from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
@@ -115,15 +115,18 @@ class PressWorld:
         return None
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+        return run(self.motion(targets), self._advance)
+
+    def motion(self, targets: Mapping[str, Pose]) -> Motion:
+        """`move`, a launch at a time."""
         end = merged(self._poses, targets)
         start, gel = list(self._poses.values()), self._gel
         path = plan(start, list(end.values()), self.scene.settling.mach, self._dt, max(gel.half), gel.thickness)
 
-        def motion(refine: int) -> MoveStats:
-            finer = replace(path, refine=refine)
-            return move_and_settle(finer, self.scene.settling, self._advance, balanced=False)
+        def tried(refine: int) -> Motion:
+            return move_and_settle(replace(path, refine=refine), self.scene.settling, balanced=False)
 
-        stats = retried(self, targets, motion)
+        stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
 

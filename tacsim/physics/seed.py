@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle, plan
+from tacsim.physics.controller import MM, Motion, Path, Reading, merged, move_and_settle, plan, run
 from tacsim.physics.health import Health, Place, SimulationDiverged, as_float32, attempt, require_room, retried
 from tacsim.physics.world import MoveStats, put_back
 from tacsim.runtime import start
@@ -175,6 +175,10 @@ class SeedWorld:
 
     def move(self, targets: Mapping[str, Pose]) -> MoveStats:
         """See World. Raises ValueError for a tilted target, or one that would crush the gels."""
+        return run(self.motion(targets), self._advance)
+
+    def motion(self, targets: Mapping[str, Pose]) -> Motion:
+        """`move`, a launch at a time."""
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
         self._check_room(end)
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
@@ -183,11 +187,10 @@ class SeedWorld:
         if 0 < path.substeps < GENTLE:
             path = replace(path, substeps=GENTLE)
 
-        def motion(refine: int) -> MoveStats:
-            finer = replace(path, refine=refine)
-            return move_and_settle(finer, self.scene.settling, self._advance, balanced=True)
+        def tried(refine: int) -> Motion:
+            return move_and_settle(replace(path, refine=refine), self.scene.settling, balanced=True)
 
-        stats = retried(self, targets, motion)
+        stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
 

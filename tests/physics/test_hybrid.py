@@ -47,7 +47,8 @@ def test_forces_balance_and_point_into_the_gels(squeezed: HybridWorld) -> None:
 
 def test_the_body_yields_and_keeps_its_volume(squeezed: HybridWorld) -> None:
     truth = squeezed.truth()
-    assert 4.0e-3 < truth.height < 4.5e-3  # 1.4 mm less, minus what the gels give
+    # 1.4 mm less, minus what the gels give: 4.53 mm at Mach 0.003, which the default comes within 1 % of
+    assert truth.height == pytest.approx(4.528e-3, rel=1e-2)
     j = np.sqrt(np.linalg.det(full(squeezed.snapshot()["strain"]) + np.eye(3)))
     assert 0.97 < j.mean() < 1.0
     width = np.ptp(truth.points[:, 0]) + 0.5e-3
@@ -93,7 +94,8 @@ def test_an_off_centre_body_shows_where_it_is_in_both_frames() -> None:
 
 
 def test_shear_is_held_by_friction_and_ends_at_the_coulomb_limit() -> None:
-    w = world(friction={"lower": 0.2, "upper": 1.0}, settling={"tolerance": 1e-2})
+    # the shear is a hundredth of the normal force, which the tolerance is relative to
+    w = world(friction={"lower": 0.2, "upper": 1.0}, settling={"tolerance": 2e-4})
     squeeze(w, 0.6e-3)
     w.move(shift(w, "upper", (0.05e-3, 0, 0)))
     stuck = w.wrench("upper")[0]

@@ -93,7 +93,7 @@ class Path:
 
 
 def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float) -> Path:
-    """A path whose fastest point moves at peak Mach `mach`; it takes RISE wave times of a gel to get there, and to stop.
+    """A path whose fastest point moves at peak Mach `mach`, after a start and before a stop of RISE gel wave times.
 
     lever [mm] turns rotation into speed at the gel's rim; thickness [mm] of the gel. A move too short for that speed
     keeps to the acceleration instead: its time goes with the root of its length.

@@ -1,6 +1,6 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from tacsim.physics.gel import MM, MPA, Nodes, gel_advance, gel_facts, gel_force
 from tacsim.physics.health import Health, as_float32, attempt, retried
 from tacsim.physics.hybrid import COURANT, GEL_DAMPING, Array1, Array3, row
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
+from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.material import vec3
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
@@ -114,21 +115,29 @@ class PressWorld:
     def truth(self) -> None:
         return None
 
-    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
-        return run(self.motion(targets), self._advance)
+    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
+        return run(self.motion(targets, loads), self._advance)
 
-    def motion(self, targets: Mapping[str, Pose]) -> Motion:
+    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
         """`move`, a launch at a time."""
         end = merged(self._poses, targets)
-        start, gel = list(self._poses.values()), self._gel
-        path = plan(start, list(end.values()), self.scene.settling.mach, self._dt, max(gel.half), gel.thickness)
+        require_loads(loads or {}, self.sensors)
+        begin, goals = dict(self._poses), dict(end)
 
         def tried(refine: int) -> Motion:
-            return move_and_settle(replace(path, refine=refine), self.scene.settling, balanced=False)
+            if loads:
+                end.update(goals)
+                return keep_loads(self, begin, end, loads, refine, balanced=False)
+            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            return move_and_settle(path, self.scene.settling, balanced=False)
 
         stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of all driven frames, at the scene's speed."""
+        return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half), self._gel.thickness)
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         assert self.scene.indenter is not None

@@ -43,7 +43,8 @@ def still(f: Facts) -> bool:
 # What must come out, by case and physics: a judgement of the facts of a finite end, or a text of the error.
 EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
     "elastic, nu 0.45, to half": {"hybrid": keeps(0.7, 1.1), "seed": keeps(0.4, 1.1)},
-    "elastic, nu 0.49, to half": {"hybrid": keeps(0.85, 1.1), "seed": keeps(0.6, 1.2)},
+    # slow limit (Mach 0.004, tolerance 1e-3): 0.844 to 1.160
+    "elastic, nu 0.49, to half": {"hybrid": keeps(0.83, 1.18), "seed": keeps(0.6, 1.2)},
     "elastic, nu 0.499, to half": {"hybrid": keeps(0.95, 1.05), "seed": keeps(0.8, 1.1)},
     "plasticine, k 0.01, to a tenth": {"hybrid": keeps(0.3, 1.4), "seed": keeps(0.2, 1.2)},
     "plasticine, k 0.05, to a fifth": {"hybrid": keeps(0.5, 1.3), "seed": keeps(0.3, 1.2)},
@@ -70,8 +71,9 @@ EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
         "hybrid": lambda f: f["force"] == pytest.approx(0.41e-4, rel=0.15),
         "seed": lambda f: balanced(f) and f["force"] == pytest.approx(0.528e-4, rel=0.02),
     },
+    # The slow limit of hybrid is 0.530e4 N (Mach 0.004, tolerance 1e-3).
     "scene of 1 m": {
-        "hybrid": lambda f: balanced(f) and f["retries"] == 0 and f["force"] == pytest.approx(0.437e4, rel=0.1),
+        "hybrid": lambda f: balanced(f) and f["retries"] == 0 and f["force"] == pytest.approx(0.530e4, rel=0.1),
         "seed": lambda f: balanced(f) and f["retries"] == 0 and f["force"] == pytest.approx(0.528e4, rel=0.02),
     },
     "sharp cone": {"press": lambda f: f["settled"] == 1 and 0.05 < f["force"] < 0.3 and f["overlap"] < 10e-6},

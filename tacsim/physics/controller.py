@@ -7,7 +7,7 @@ start and stop, not the speed; hence every motion starts and ends with zero velo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.health import Place
+from tacsim.physics.health import Place, SimulationDiverged
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Settling
 
@@ -113,7 +113,7 @@ class Reading:
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
-    """Largest force imbalance, or change of force or moment since the last look, relative to the largest force [-].
+    """Largest force imbalance, or change of force or moment since `before`, relative to the largest force [-].
 
     `balanced`: the contact forces of all gels must add up to zero (a free body between them).
     """
@@ -126,27 +126,56 @@ def residual(now: Reading, before: Reading, balanced: bool) -> float:
     return float(max(parts)) / scale
 
 
-def move_and_settle(
-    path: Path, settling: Settling, advance: Callable[[Path, int, int], Reading], *, balanced: bool
-) -> MoveStats:
-    """Runs `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
-    reading: Reading | None = None
-    hits = 0
+@dataclass(frozen=True)
+class Launch:
+    """What a motion wants next: substeps first..last of a path, then a Reading."""
+
+    path: Path
+    first: int
+    last: int
+
+
+# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the Reading at its end, or
+# thrown the SimulationDiverged that the launch ended in. So whoever advances many worlds in one launch of kernels holds
+# one motion for each, all at their own phases; `run` is that for a single world.
+Motion = Generator[Launch, Reading, MoveStats]
+
+
+def run(motion: Motion, advance: Callable[[Path, int, int], Reading]) -> MoveStats:
+    """Runs one world's motion to its end. A motion cut short (an interruption, say) is closed, so it rolls back."""
+    try:
+        wanted = next(motion)
+        while True:
+            try:
+                reading = advance(wanted.path, wanted.first, wanted.last)
+            except SimulationDiverged as failure:
+                wanted = motion.throw(failure)
+            else:
+                wanted = motion.send(reading)
+    except StopIteration as end:
+        stats: MoveStats = end.value
+        return stats
+    finally:
+        motion.close()
+
+
+def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
+    seen: list[Reading] = []
     for first in range(0, path.substeps, CHECK):
-        reading = advance(path, first, min(first + CHECK, path.substeps))
-        hits += reading.guard_hits
+        seen.append((yield Launch(path, first, min(first + CHECK, path.substeps))))
     rest = replace(path, start=path.end, substeps=0)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
         count = min(CHECK, settling.max_substeps - held)
-        before, reading = reading, advance(rest, 0, count)
+        seen.append((yield Launch(rest, 0, count)))
         held += count
-        hits += reading.guard_hits
-        if before is not None:
-            worst = residual(reading, before, balanced)
+        if len(seen) > 1:
+            worst = residual(seen[-1], seen[-2], balanced)
             if worst <= settling.tolerance:
                 break
-    overlap = 0.0 if reading is None else reading.overlap / MM
+    overlap = seen[-1].overlap / MM if seen else 0.0
+    hits = sum(reading.guard_hits for reading in seen)
     return MoveStats(path.substeps + held, held, worst, worst <= settling.tolerance, overlap, hits)
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,11 +156,19 @@ class Driven(Protocol):
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
 
 
-def retried(world: Driven, targets: Mapping[str, Pose], motion: Callable[[int], MoveStats]) -> MoveStats:
-    """Runs `motion(refine)`, which drives `world` to `targets` with 1/refine of its time step; refine = 1, 2, 4.
+Wanted = TypeVar("Wanted")
+Seen = TypeVar("Seen")
 
-    After every failure, an interruption included, the world is as it was before. Raises SimulationDiverged when no step
-    does, or when the state was broken already; writes a dump then if one is asked for (tacsim.physics.dump).
+
+def retried(
+    world: Driven, targets: Mapping[str, Pose], motion: Callable[[int], Generator[Wanted, Seen, MoveStats]]
+) -> Generator[Wanted, Seen, MoveStats]:
+    """The motion `motion(refine)`, which drives `world` to `targets` with 1/refine of its step; refine = 1, 2, 4.
+
+    Whoever runs it throws in the SimulationDiverged of a launch; the world then rolls back by itself and yields the
+    first launch of the next try. After every failure, an interruption included, the world is as it was before. Raises
+    SimulationDiverged when no step does, or when the state was broken already; writes a dump then if one is asked for
+    (tacsim.physics.dump).
     """
     before = world.snapshot()
     broken = diagnosis.not_finite(before)
@@ -170,7 +178,7 @@ def retried(world: Driven, targets: Mapping[str, Pose], motion: Callable[[int], 
     else:
         for retry in range(RETRIES + 1):
             try:
-                stats = motion(2**retry)
+                stats = yield from motion(2**retry)
                 _require_upright(world, targets)
                 return replace(stats, retries=retry)
             except SimulationDiverged as diverged:

@@ -1,6 +1,6 @@
 """Two gels (FEM in their sensor frames) round a plasticine body (MLS-MPM), coupled by contact with friction memory."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from tacsim.interface import Pose, Truth
 from tacsim.physics.body_surface import surface_points, tangent_planes
 from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
-from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
+from tacsim.physics.controller import Motion, Path, Reading, force_floor, merged, move_and_settle, plan, run
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -47,6 +47,7 @@ from tacsim.physics.plasticine import (
     particles_to_grid,
 )
 from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
@@ -298,18 +299,29 @@ class HybridWorld:
 
     # ----------------------------------------------------------------- motion
 
-    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
+        return run(self.motion(targets, loads), self._advance)
+
+    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
+        """`move`, a launch at a time."""
         end = merged(self._poses, targets)
-        lever = max(self._gel.half)
-        path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
+        require_loads(loads or {}, self.sensors)
+        begin, goals = dict(self._poses), dict(end)
 
-        def motion(refine: int) -> MoveStats:
-            finer = replace(path, refine=refine)
-            return move_and_settle(finer, self.scene.settling, self._advance, balanced=True)
+        def tried(refine: int) -> Motion:
+            if loads:
+                end.update(goals)
+                return keep_loads(self, begin, end, loads, refine, balanced=True)
+            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = retried(self, targets, motion)
+        stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of all driven frames, at the scene's speed."""
+        return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half))
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         span = (last - first) * self._dt

@@ -1,12 +1,12 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
+from tacsim.physics.controller import Motion, Path, Reading, force_floor, merged, move_and_settle, plan, run
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -32,6 +32,7 @@ from tacsim.physics.layout import (
     STEPS, STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
@@ -151,19 +152,29 @@ class PressWorld:
     def truth(self) -> None:
         return None
 
-    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
+        return run(self.motion(targets, loads), self._advance)
+
+    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
+        """`move`, a launch at a time."""
         end = merged(self._poses, targets)
-        path = plan(
-            list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, max(self._gel.half)
-        )
+        require_loads(loads or {}, self.sensors)
+        begin, goals = dict(self._poses), dict(end)
 
-        def motion(refine: int) -> MoveStats:
-            finer = replace(path, refine=refine)
-            return move_and_settle(finer, self.scene.settling, self._advance, balanced=False)
+        def tried(refine: int) -> Motion:
+            if loads:
+                end.update(goals)
+                return keep_loads(self, begin, end, loads, refine, balanced=False)
+            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            return move_and_settle(path, self.scene.settling, balanced=False)
 
-        stats = retried(self, targets, motion)
+        stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of all driven frames, at the scene's speed."""
+        return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half))
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         def launch() -> Health:

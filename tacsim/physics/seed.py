@@ -7,7 +7,7 @@ to the scheme itself: bodies stick to each other (no friction coefficient), begi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle, plan
+from tacsim.physics.controller import MM, Motion, Path, Reading, merged, move_and_settle, plan, run
 from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, require_room, retried
 from tacsim.physics.layout import NUMBERS
+from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.world import MoveStats, put_back
 from tacsim.runtime import start
 from tacsim.sampling import body_points
@@ -173,22 +174,33 @@ class SeedWorld:
 
     # ----------------------------------------------------------------- motion
 
-    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
         """See World. Raises ValueError for a tilted target, or one that would crush the gels."""
+        return run(self.motion(targets, loads), self._advance)
+
+    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
+        """`move`, a launch at a time."""
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
         self._check_room(end)
-        lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
-        path = plan(list(self._poses.values()), list(end.values()), self.scene.settling.mach, self._dt, lever)
-        if 0 < path.substeps < GENTLE:
-            path = replace(path, substeps=GENTLE)
+        require_loads(loads or {}, self.sensors)
+        begin, goals = dict(self._poses), dict(end)
 
-        def motion(refine: int) -> MoveStats:
-            finer = replace(path, refine=refine)
-            return move_and_settle(finer, self.scene.settling, self._advance, balanced=True)
+        def tried(refine: int) -> Motion:
+            if loads:
+                end.update(goals)
+                return keep_loads(self, begin, end, loads, refine, balanced=True)
+            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = retried(self, targets, motion)
+        stats = yield from retried(self, targets, tried)
         self._poses = end
         return stats
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of all driven frames, at the scene's speed."""
+        lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
+        path = plan(start, end, self.scene.settling.mach, self._dt, lever)
+        return replace(path, substeps=GENTLE) if 0 < path.substeps < GENTLE else path
 
     def _upright(self, name: str, pose: Pose) -> Pose:
         """`pose` without a tilt of up to TILT, which the scheme can't follow."""

@@ -24,6 +24,7 @@ class MoveStats:
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
     guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped)
     retries: int = 0  # times the motion was begun anew with half the time step
+    load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
 
 
 class World(Protocol):
@@ -39,8 +40,12 @@ class World(Protocol):
         """world_from_sensor (or world_from_indenter for "indenter")."""
         ...
 
-    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
         """Drives the named frames to their targets along a ramped straight path, then holds until settled.
+
+        loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis; across it,
+        and in orientation, they follow their target (or stay). Afterwards `pose` says where they came to. Raises
+        LoadNotReached (tacsim.physics.load), with the world as it was, for a load out of reach.
 
         Raises SimulationDiverged (tacsim.physics.health) when no step size gives a finite state.
         """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,23 @@ import pytest
 
 from tacsim.interface import Pose
 from tacsim.physics import diagnosis, press
-from tacsim.physics.controller import Path
+from tacsim.physics.controller import Launch, Motion, Path, Reading, run
 from tacsim.physics.health import RETRIES, Health, Place, SimulationDiverged, attempt, require_room, retried
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Gel, Indenter, Scene, Sphere
 
+STILL = Path([Pose()], [Pose()], substeps=0, dt=0.4)
+REST = Reading(np.zeros((1, 3)), np.zeros((1, 3)), 1.0, 0.0, 0)
 STATS = MoveStats(10, 5, 0.001, True, 0.0, 0)
 HERE = Place("in substeps 0 to 20 of 40 of the motion", {"lower": Pose(np.array([0, 0, 1e-3]))})
 WELL = Health(1.0, 0, 1.0, 0.01, 0, 0.0)
+
+
+def one_launch(refine: int) -> Motion:
+    """A motion of a single launch, whose path tells `refine`."""
+    yield Launch(replace(STILL, refine=refine), 0, 1)
+    return STATS
 
 
 class Particles:
@@ -96,13 +105,13 @@ def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
 def test_a_motion_starts_again_from_the_state_before_it() -> None:
     world, seen = Particles(), []
 
-    def motion(refine: int) -> MoveStats:
-        seen.append((refine, float(world.arrays["position"][0, 0])))
+    def advance(path: Path, first: int, last: int) -> Reading:
+        seen.append((path.refine, float(world.arrays["position"][0, 0])))
         world.arrays["position"] += 1.0
-        world.launch(set_to("velocity", (0, 0), 0.0 if refine == 2 else np.nan))
-        return STATS
+        world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
+        return REST
 
-    stats = retried(world, {}, motion)
+    stats = run(retried(world, {}, one_launch), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
     assert stats.retries == 1 and world.arrays["position"][0, 0] == 2.0
 
@@ -111,14 +120,14 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
     world, steps = Particles(), []
     before = world.snapshot()
 
-    def motion(refine: int) -> MoveStats:
-        steps.append(refine)
+    def advance(path: Path, first: int, last: int) -> Reading:
+        steps.append(path.refine)
         world.launch(nothing)
         world.launch(lambda a: (a["position"].__iadd__(2.0), a["velocity"].__setitem__((1, 0), np.inf)))
-        return STATS
+        return REST
 
     with pytest.raises(SimulationDiverged) as caught:
-        retried(world, {}, motion)
+        run(retried(world, {}, one_launch), advance)
     assert steps == [2**retry for retry in range(RETRIES + 1)]
     assert all(world.arrays[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
@@ -127,16 +136,31 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
     assert caught.value.good["position"][0, 0] == 1.0 and caught.value.failed["position"][0, 0] == 3.0
 
 
+def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
+    """As whoever advances many worlds at once does: a failure is thrown into its own motion only."""
+    good, bad = Particles(), Particles()
+    motions = [retried(good, {}, one_launch), retried(bad, {}, one_launch)]
+    launches = [next(motion) for motion in motions]
+    good.arrays["position"] += 1.0
+    bad.arrays["position"] += 1.0
+    with pytest.raises(StopIteration) as ended:
+        motions[0].send(REST)
+    again = motions[1].throw(SimulationDiverged("too fast", "here"))
+    assert ended.value.value == STATS
+    assert (launches[1].path.refine, again.path.refine) == (1, 2)
+    assert good.arrays["position"].max() == 2.0 and bad.arrays["position"].max() == 1.0
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
 def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None:
     world = Particles()
 
-    def motion(refine: int) -> MoveStats:
+    def advance(path: Path, first: int, last: int) -> Reading:
         world.arrays["position"] += 1.0
         raise error
 
     with pytest.raises(error):
-        retried(world, {}, motion)
+        run(retried(world, {}, one_launch), advance)
     assert world.arrays["position"].max() == 1.0
 
 
@@ -146,7 +170,7 @@ def test_a_broken_state_is_told_before_anything_moves() -> None:
     with pytest.raises(
         SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
     ):
-        retried(world, {}, lambda refine: pytest.fail("it moved"))
+        run(retried(world, {}, one_launch), lambda path, first, last: pytest.fail("it moved"))
 
 
 def test_a_grid_without_end_is_refused() -> None:

@@ -126,6 +126,30 @@ def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
     assert np.abs(a.surface("lower").displacement - b.surface("lower").displacement).max() < 10e-6
 
 
+def test_a_motion_driven_launch_by_launch_is_the_move() -> None:
+    """Two worlds advanced in turns, each at its own phase, end as by `move`, to the bit."""
+    alone = [world(Sphere(radius=4e-3)) for _ in range(2)]
+    together = [world(Sphere(radius=4e-3)) for _ in range(2)]
+    targets = [{"indenter": Pose(np.array([0, 0, 3.9e-3 - deep]))} for deep in (0.2e-3, 0.5e-3)]
+    stats = [w.move(target) for w, target in zip(alone, targets, strict=True)]
+    motions = [w.motion(target) for w, target in zip(together, targets, strict=True)]
+    ends = {}
+    wanted = {index: next(motion) for index, motion in enumerate(motions)}
+    while wanted:
+        for index, launch in list(wanted.items()):
+            reading = together[index]._advance(launch.path, launch.first, launch.last)
+            try:
+                wanted[index] = motions[index].send(reading)
+            except StopIteration as end:
+                ends[index] = end.value
+                del wanted[index]
+    assert [ends[index] for index in range(2)] == stats
+    assert stats[0].substeps != stats[1].substeps
+    for a, b in zip(alone, together, strict=True):
+        left, right = a.snapshot(), b.snapshot()
+        assert all(left[name].tobytes() == right[name].tobytes() for name in left)
+
+
 def test_a_press_allocates_no_particles_or_grid() -> None:
     w = world(Sphere(radius=4e-3))
     assert w.truth() is None

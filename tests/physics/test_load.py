@@ -1,0 +1,65 @@
+"""Motion at a constant normal load."""
+
+import numpy as np
+import pytest
+
+from tacsim.interface import Pose
+from tacsim.physics.load import LoadNotReached
+from tacsim.physics.press import PressWorld
+from tacsim.physics.world import World, make_world
+from tacsim.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere
+
+
+def press() -> PressWorld:
+    return PressWorld(Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3))))
+
+
+def by(world: World, name: str, shift: tuple[float, float, float]) -> dict[str, Pose]:
+    pose = world.pose(name)
+    return {name: Pose(pose.position + shift, pose.quaternion)}
+
+
+def load(world: World, name: str) -> float:
+    return -float(world.wrench(name)[2])
+
+
+def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
+    world = press()
+    stats = world.move({}, loads={"lower": 0.3})
+    assert stats.settled
+    assert load(world, "lower") == pytest.approx(0.3, rel=0.01)
+    assert stats.load_error == pytest.approx(abs(load(world, "lower") - 0.3), abs=1e-9)
+    pressed = world.pose("lower").position
+    assert pressed[2] > 0.2e-3 and np.abs(pressed[:2]).max() == 0  # came up to the indenter, and only that
+    world.move({}, loads={"lower": 0.0})
+    assert load(world, "lower") == 0.0
+    assert world.pose("lower").position[2] < pressed[2]
+
+
+@pytest.mark.parametrize("physics", ["hybrid", "seed"])
+def test_the_load_stays_through_a_shear(physics: str) -> None:
+    body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=BodyMaterial(yield_stress=30e3))
+    world = make_world(Scene(body=body, physics=physics))  # type: ignore[arg-type]
+    world.move({}, loads={"upper": 0.5})
+    pose = world.pose("upper")
+    stats = world.move(by(world, "upper", (0.6e-3, 0, 0)), loads={"upper": 0.5})
+    assert stats.settled and load(world, "upper") == pytest.approx(0.5, rel=0.02)
+    assert world.pose("upper").position[0] == pytest.approx(pose.position[0] + 0.6e-3, abs=1e-9)
+
+
+def test_a_load_out_of_reach_is_an_error_and_nothing_has_moved() -> None:
+    world = press()
+    world.move(by(world, "indenter", (0, 0, 3e-3)))
+    before = world.snapshot()
+    with pytest.raises(LoadNotReached, match=r"'lower' does not reach a load of 0\.3 N: 0 N after \+2\.5 mm"):
+        world.move({}, loads={"lower": 0.3})
+    after = world.snapshot()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+
+
+def test_loads_that_make_no_sense_are_refused() -> None:
+    world = press()
+    with pytest.raises(KeyError, match="no sensor 'indenter' to hold a load"):
+        world.move({}, loads={"indenter": 0.3})
+    with pytest.raises(ValueError, match="load of 'lower' is -1 N"):
+        world.move({}, loads={"lower": -1.0})

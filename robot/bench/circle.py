@@ -4,6 +4,9 @@ One definition for real and rendered images: the radius of the elastic dent that
 has a ball inside the circle and Hertz's free surface outside (Johnson, Contact Mechanics, 1985, eq. 3.42a), scaled to
 meet the ball's slope at the circle. How slope becomes colour is not assumed: in each channel a quadratic polynomial of
 both slopes, solved anew for each image by least squares. So no light is calibrated, and nothing is set for a sensor.
+
+On a layer 1.7 contact radii thick the surface outside drops faster than Hertz's, and the radius comes out 4 % small; on
+a thicker one by less. So compare radii found in the same way.
 """
 
 from __future__ import annotations
@@ -114,6 +117,7 @@ def _unexplained(seen: Float64, dx: Float64, dy: Float64, contact: float, ball: 
     slopes = _blurred(np.stack([steepness * dx[None, :], steepness * dy[:, None]], axis=-1)).reshape(-1, 2)
     powers = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
     features = np.stack([slopes[:, 0] ** i * slopes[:, 1] ** j for i, j in powers], axis=1)
-    weights, *_ = np.linalg.lstsq(features, seen, rcond=None)
+    # normal equations: few well-scaled columns, and a hundred solutions an image
+    weights, *_ = np.linalg.lstsq(features.T @ features, features.T @ seen, rcond=None)
     rest = seen - features @ weights
     return float((rest**2).sum() / ((seen - seen.mean(axis=0)) ** 2).sum())

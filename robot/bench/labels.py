@@ -45,7 +45,8 @@ class Press(Facts):
 class Presses(Facts):
     """Presses on one sensor."""
 
-    source: str
+    name: str
+    source: str = ""
     pixel_pitch: Positive  # [m]
     gel_size: tuple[Positive, Positive]  # x, y [m]
     gel_thickness: Annotated[tuple[Positive, ...], Field(min_length=1)]  # the likeliest first [m]
@@ -77,10 +78,10 @@ def find_frames(folder: Path, labels: Presses) -> dict[Press, Path]:
     """
     found = {press: path for press in labels.presses if (path := _find(folder, press.frames)) is not None}
     if not found:
-        wanted = ", ".join(name for press in labels.presses for name in press.frames) or "(the labels name no frame)"
+        wanted = ", ".join(press.frames[0] for press in labels.presses if press.frames) or "(the labels name no frame)"
         raise BadData(
-            f"{folder} and the folders below it hold none of the frames of the labels: {wanted}. "
-            f"Name the folder of the set '{labels.source}', or put a {OWN} for your own frames into it"
+            f"{folder} and the folders below it hold no frame of '{labels.name}': {wanted}. "
+            f"Name the folder that holds them, or describe your own frames in {folder / OWN}"
         )
     useless = [press.name for press in labels.presses if press not in found and press.radius_px is None]
     if useless:

@@ -18,7 +18,7 @@ from robot.bench.measure import Measurement, timed
 from robot.bench.press import layer, press
 from robot.bench.runner import Case
 from tacsim.interface import Pose
-from tacsim.physics.world import MoveStats, World
+from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.scene import Gel, GelMaterial, Indenter, Scene, Settling, Sphere
 
 Float64 = NDArray[np.float64]
@@ -28,13 +28,13 @@ LAYER_PIXELS = 512
 CASE = "contact_radius"
 
 
-def contact_radius(folder: Path, ball: float, thickness: float, repeat: int) -> list[Measurement]:
+def contact_radius(folder: Path, ball: float, thickness: float, element: float, repeat: int) -> list[Measurement]:
     """Balls pressed to the depths of real presses: radius of the contact, ours against the real one."""
     labels = read_labels(folder)
     background, frames = read_frames(folder, labels)
-    scene = ball_scene(labels, ball, thickness)
-    press(ball_scene(labels, ball, 4 * ELEMENT), 0.1e-3)  # compiles
-    world, _ = press(scene, 0.0)
+    scene = ball_scene(labels, ball, thickness, element)
+    press(ball_scene(labels, ball, 2e-3, 1e-3), 0.05e-3)  # compiles
+    world = make_world(scene)
     camera = Camera(labels, background)
     before = camera.see(world)
     rows = []
@@ -70,13 +70,13 @@ def contact_radius(folder: Path, ball: float, thickness: float, repeat: int) -> 
     return rows
 
 
-def ball_scene(labels: Presses, ball: float, thickness: float) -> Scene:
+def ball_scene(labels: Presses, ball: float, thickness: float, element: float) -> Scene:
     """The default gel in the size of the labels, under a ball."""
     return Scene(
         body=None,
         indenter=Indenter(geometry=Sphere(radius=ball)),
         gel=Gel(size=(*labels.gel_size, thickness)),
-        element_size=ELEMENT,
+        element_size=element,
         settling=Settling(mach=0.05),
     )
 
@@ -155,7 +155,7 @@ def cases(folder: Path) -> tuple[Case, ...]:
     return tuple(
         Case(
             "real", CASE, "tacsim", f"ball R {ball * 1e3:g} mm, gel {thickness * 1e3:g} mm, h {ELEMENT * 1e3:g} mm",
-            partial(contact_radius, folder, ball, thickness), long=thickness != labels.gel_thickness[0],
+            partial(contact_radius, folder, ball, thickness, ELEMENT), long=thickness != labels.gel_thickness[0],
         )
         for thickness in labels.gel_thickness
         for ball in labels.balls

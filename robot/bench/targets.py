@@ -25,7 +25,8 @@ class Target:
     aim: float | None
     value: Find  # of the rows; None when they do not have it
     at_least: bool = False  # larger is better
-    remark: str = ""  # what to know where it is not measured
+    remark: str = ""  # what to know where it is missed
+    elsewhere: str = ""  # why no row can have it
 
     def judge(self, rows: Sequence[Row]) -> tuple[float | None, Verdict]:
         """The value in these rows, and what it means. The limit itself is within it."""
@@ -138,7 +139,7 @@ TARGETS: tuple[Target, ...] = (
     Target("squeeze by 80 %, force against slab theory", "%", 25, 10, pick("error", "slab", "80 %"),
            remark="beyond the limit it must be explained: docs/physics.md, How to choose"),
     Target("sliding force against Coulomb's law", "%", 1, 0.3, pick("error", "sliding_force")),
-    Target("stick limit on an incline", "%", 1, 0.3, pick("error", "incline"), remark="the worlds have no gravity"),
+    Target("stick limit on an incline", "%", 1, 0.3, pick("error", "incline"), elsewhere="the worlds have no gravity"),
     Target("momentum, drift over 5,000 steps", "relative", 1e-5, 1e-6, pick("momentum", "momentum")),
     Target("angular momentum, drift over 5,000 steps", "relative", 1e-5, 1e-6, pick("angular_momentum", "momentum")),
     Target("sheared rest, drift over 100,000 substeps", "µm", 2, 0.5, pick("error", "sheared_rest")),
@@ -148,7 +149,7 @@ TARGETS: tuple[Target, ...] = (
     Target("contact radius, our contact against labels", "px", 2, None, from_depth(0.5, "error", ": pressure"),
            remark="0.05 mm of depth, the uncertainty of the set, are 1 px"),
     Target("hard cases that end their process", "", 0, 0, lambda rows: None,
-           remark="tests/stability: test_no_case_ended_the_process"),
+           elsewhere="tests/stability: test_no_case_ended_the_process"),
 )  # fmt: skip
 
 HEADER = ("figure", "measured", "must", "aim", "verdict")
@@ -161,8 +162,8 @@ def lines(rows: Sequence[Row], targets: Iterable[Target] = TARGETS) -> list[list
         value, verdict = target.judge(rows)
         shown = "" if value is None else f"{value:.3g} {target.unit}".strip()
         words = f"**{verdict}**" if verdict == "missed" else verdict
-        if target.remark and verdict in ("missed", "not measured"):
-            words += f": {target.remark}"
+        why = {"missed": target.remark, "not measured": target.elsewhere}.get(verdict)
+        words += f": {why}" if why else ""
         found.append([target.name, shown, _limit(target, target.must), _limit(target, target.aim), words])
     return found
 

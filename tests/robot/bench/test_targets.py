@@ -84,6 +84,9 @@ def test_the_table_says_it_in_words() -> None:
     shown = {cells[0]: cells[1:] for cells in lines([row(seconds=0.5)])}
     assert shown["press of a ball R 4 mm, 1 mm deep, h 0.5 mm"] == ["0.5 s", "≤ 0.3", "≤ 0.05", "**missed**"]
     assert shown["... faster than at Tacchi's settings"] == ["", "≥ 100", "≥ 500", "not measured"]
+    assert shown["squeeze by 80 %, force against slab theory"][-1] == "not measured"
+    slab = lines([row(case="slab", variant="80 % of its height", error=40.0)], TARGETS)
+    assert "**missed**: beyond the limit it must be explained: docs/physics.md, How to choose" in {c[-1] for c in slab}
     assert "test_no_case_ended_the_process" in shown["hard cases that end their process"][-1]
 
 

@@ -1,27 +1,46 @@
-"""docs/benchmarks.md and speed_vs_error.png, from a report."""
+"""docs/benchmarks.md and its pictures, from a report."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from robot.bench import targets
 from robot.bench.cases import description
+from robot.bench.picture import PICTURE, RADII, draw, draw_radii
 from robot.bench.schema import Report, Row
 
 GROUP_WORDS = {
     "press": "Press: a rigid indenter on one gel",
     "squeeze": "Squeeze: plasticine between two gels",
     "materials": "Materials: laws, elements, transfers, and what a substep costs",
+    "scenes": "Scenes: cost by what is in them",
+    "real": "Real: contact radius of balls on a real sensor",
 }
 COLUMNS = ("case", "method", "resolution", "seconds", "CPU s", "error", "MB", "substeps")
-# what is drawn: case, variant ("" for any), title, unit of the error
-PANELS = (
-    ("sphere_press", "", "Ball R 4 mm, 1 mm deep", "error of the surface [µm rms]"),
-    ("squeeze", "settled to 1 %", "3 mm squeeze, settled", "error of the force [%]"),
-    ("plasticine_step", "", "Yield of a 10 mm cube", "error of the stress [%]"),
+
+FIGURES = (
+    "What the project must reach and aims for, from the rows below: worst row of its kind, ratios within this run. "
+    "*missed* is beyond *must*; *not measured* means that this run has no such row."
 )
-PICTURE = "speed_vs_error.png"
+READING = (
+    "- **A row** is one thing by one method at one resolution. `tacsim` is ours; `seed`, `textbook`, `tacchi-settings` "
+    "and `layer` are what it is compared with. The error belongs to the same run as the seconds: a fast row with a "
+    "large error is not fast.\n"
+    "- **Time.** Compare seconds within this page only. On a busy machine compare CPU s, or ratios; rows of one case "
+    "ran one after the other.\n"
+    "- **Error** is against what stands under each table: a closed form, a limit of fine meshes, a symmetry, or the "
+    "same mesh driven so slowly that speed plays no part.\n"
+    "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`, under a minute. Other methods need "
+    "`--baselines`, our own long rows (fine meshes, `standard` squeezes, 100,000 substeps of rest) `--long`; both take "
+    "many minutes. This page: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then `tacsim "
+    "bench --from benchmarks/reference.json --docs docs`.\n"
+    "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
+    "`robot/bench/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
+    "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
+    "the circle in the real frame with that in our picture, found by the same fit; rows ending in `pressure` compare "
+    "our contact itself with the radius in the labels."
+)
 
 
 def cells(row: Row) -> list[str]:
@@ -47,13 +66,16 @@ def costs(row: Row) -> list[str]:
 
 
 def write_page(report: Report, folder: Path) -> list[Path]:
-    """Writes benchmarks.md and images/speed_vs_error.png below `folder`; returns both paths. Raises OSError."""
-    picture = folder / "images" / PICTURE
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    draw(report.results, picture)
+    """Writes benchmarks.md, and its pictures into images/, below `folder`; returns their paths. Raises OSError."""
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    draw(report.results, images / PICTURE)
+    pictures = [images / PICTURE]
+    if draw_radii(report.results, images / RADII):
+        pictures.append(images / RADII)
     page = folder / "benchmarks.md"
     page.write_text(markdown(report), encoding="utf-8")
-    return [page, picture]
+    return [page, *pictures]
 
 
 def markdown(report: Report) -> str:
@@ -66,16 +88,24 @@ def markdown(report: Report) -> str:
         "threads.",
         _setting(report),
         f"![Time against error, by method](images/{PICTURE})",
+        "## Figures",
+        FIGURES,
+        _table(targets.HEADER, targets.lines(report.results)),
+        "## How to read and rerun",
+        READING,
     ]
     for group, words in GROUP_WORDS.items():
         rows = [row for row in report.results if row.group == group]
         if rows:
             parts += [f"## {words}", _table(COLUMNS, map(cells, rows)), *_remarks(rows)]
+        if group == "real" and rows:
+            parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
     if report.failures:
         parts += ["## Failed", *(f"- {f.case}, {f.method}, {f.resolution}: {f.cause}" for f in report.failures)]
     parts += [
         "## Not measured",
-        "`incline`: the worlds have no gravity; sliding friction is measured by `sliding_force` instead.",
+        "`incline`: the worlds have no gravity; sliding friction is measured by `sliding_force` instead. Whether hard "
+        "cases end their process is counted by a test, `test_no_case_ended_the_process` in `tests/stability`.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -114,42 +144,3 @@ def _remarks(rows: Sequence[Row]) -> list[str]:
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
-
-
-def draw(rows: Sequence[Row], path: Path) -> None:
-    """Time against error on logarithmic axes, a panel a case, a colour a method; lower left is better.
-
-    Raises OSError.
-    """
-    from tacsim.figure import canvas, plain, save
-
-    panels = [(panel, _points(rows, *panel[:2])) for panel in PANELS]
-    shown = [(panel, points) for panel, points in panels if points] or [(PANELS[0], [])]
-    methods = list(dict.fromkeys(row.method for _, points in shown for row in points))
-    figure = canvas(4.6 * len(shown), 3.8)
-    figure.set_layout_engine("constrained")
-    for index, ((_, _, title, unit), points) in enumerate(shown):
-        axes = plain(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
-        axes.set(xscale="log", yscale="log")
-        for row in points:
-            colour = f"C{methods.index(row.method)}"
-            axes.plot(row.seconds, row.error, "o", color=colour)
-            words = f"{row.method}\n{row.resolution.partition(',')[0]}"
-            axes.annotate(words, (row.seconds, row.error), (5, 4), textcoords="offset points", fontsize=7, color=colour)
-        if points:
-            axes.set_xlim(*_decades([row.seconds for row in points]))
-            axes.set_ylim(*_decades([row.error for row in points]))
-    save(figure, path)
-
-
-def _decades(values: Sequence[float]) -> tuple[float, float]:
-    """Whole powers of ten round `values`, so that each axis has at least two numbers on it."""
-    return 10.0 ** math.floor(math.log10(min(values) / 1.2)), 10.0 ** math.ceil(math.log10(max(values) * 1.2))
-
-
-def _points(rows: Iterable[Row], case: str, variant: str) -> list[Row]:
-    """A logarithmic axis shows no zero: such a row is left to the table."""
-    return [
-        row for row in rows
-        if row.case == case and (not variant or row.variant == variant) and row.error > 0 and row.seconds > 0
-    ]  # fmt: skip

@@ -36,7 +36,8 @@ class Case:
     method: str
     resolution: str
     measure: Callable[[int], list[Measurement]]  # repetitions -> rows
-    baseline: bool = False  # only with --baselines: long, or a method that is not ours
+    baseline: bool = False  # only with --baselines: a method that is not ours
+    long: bool = False  # only with --long: ours, but more than some seconds
 
 
 class Stopped(RuntimeError):
@@ -44,7 +45,7 @@ class Stopped(RuntimeError):
 
 
 def run_cases(
-    cases: Sequence[Case], repeat: int, *, baselines: bool,
+    cases: Sequence[Case], repeat: int, *, baselines: bool, long: bool = False,
     on_start: Callable[[Case], None] = lambda case: None, stop: Callable[[], bool] = lambda: False,
 ) -> Report:  # fmt: skip
     """Runs `cases` in turn. A case that raises or dies becomes a failure of the report. Raises Stopped."""
@@ -72,6 +73,7 @@ def run_cases(
             machine=_machine(load),
             groups=groups,
             baselines=baselines,
+            long=long,
             repeat=repeat,
             seconds=time.perf_counter() - began,
         ),

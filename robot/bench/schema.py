@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-Group = Literal["press", "squeeze", "materials"]
-GROUPS: tuple[Group, ...] = get_args(Group)
+Group = Literal["press", "squeeze", "materials", "scenes", "real"]
+GROUPS: tuple[Group, ...] = get_args(Group)  # real needs frames that are not shipped
 
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
@@ -68,6 +68,7 @@ class Metadata(_Frozen):
     machine: Machine
     groups: list[Group]
     baselines: bool
+    long: bool = False  # long rows of ours were measured too
     repeat: Annotated[int, Field(ge=1)]
     seconds: NotNegative  # the whole run
 

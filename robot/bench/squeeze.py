@@ -186,12 +186,14 @@ def _cases(physics: str, method: str) -> tuple[Case, ...]:
             PRESETS[preset] if physics == "hybrid" else SEED_DRAFT,
             partial(run, preset, physics),
             baseline,
+            long=preset == "standard",
         )
         for preset, run, baseline in (
             ("draft", squeeze, method != "tacsim"),
             ("draft", control_step, method != "tacsim"),
             ("draft", reposition, method != "tacsim"),
-            ("standard", squeeze, True),
+            ("standard", squeeze, False),
+            ("standard", reposition, False),
         )
         if method == "tacsim" or preset == "draft"  # the seed's scheme at `standard` takes many minutes
     )

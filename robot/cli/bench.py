@@ -23,6 +23,8 @@ class Groups(StrEnum):
     press = "press"
     squeeze = "squeeze"
     materials = "materials"
+    scenes = "scenes"
+    real = "real"
 
 
 def bench(
@@ -31,9 +33,15 @@ def bench(
         Path | None,
         typer.Option("--json", metavar="FILE", help="Write the report here, and speed_vs_error.png beside it."),
     ] = None,
-    baselines: Annotated[
-        bool, typer.Option("--baselines", help="Also other methods and fine meshes: many minutes.")
+    baselines: Annotated[bool, typer.Option("--baselines", help="Also other methods: many minutes.")] = False,
+    long: Annotated[
+        bool,
+        typer.Option("--long", help="Also our long rows (fine meshes, 100,000 substeps of rest): many minutes."),
     ] = False,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="DIR", help="Real frames, for the group real (or all): see docs/benchmarks.md."),
+    ] = None,
     repeat: Annotated[int, typer.Option(min=1, max=1000, help="Timed repetitions; a case stops at 1 s of them.")] = 5,
     docs: Annotated[
         Path | None, typer.Option("--docs", metavar="DIR", help="Write benchmarks.md and its picture here.")
@@ -49,6 +57,8 @@ def bench(
 
     Each case runs in a process of its own; compiling is not timed. Exit code 1 if a case failed.
 
+    Group `real` needs --data; `all` leaves it out without.
+
     Example: tacsim bench press --json press.json
     """
     if from_ is not None:
@@ -59,12 +69,12 @@ def bench(
 
             with busy("computing the limit of fine meshes"):
                 compute(notes.print)
-        report = _measure(group, repeat, baselines)
+        report = _measure(group, repeat, baselines=baselines, long=long, data=data)
     _show(report)
     written: list[Path] = []
     with busy("writing") if json_ or docs else progress():
         if json_ is not None:
-            from robot.bench.page import PICTURE, draw
+            from robot.bench.picture import PICTURE, draw
 
             json_.parent.mkdir(parents=True, exist_ok=True)
             json_.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -93,14 +103,22 @@ def _read(path: Path) -> Report:
         raise typer.BadParameter(words, param_hint="--from") from None
 
 
-def _measure(group: Groups, repeat: int, baselines: bool) -> Report:
+def _measure(group: Groups, repeat: int, *, baselines: bool, long: bool, data: Path | None) -> Report:
     with busy("loading"):
         from robot.bench.cases import chosen
+        from robot.bench.labels import BadData
         from robot.bench.runner import Case, Stopped, run_cases
         from robot.bench.schema import GROUPS
 
+    if group is Groups.real and data is None:
+        raise typer.BadParameter("the group real needs frames of a real sensor: --data DIR", param_hint="--data")
+    if group not in (Groups.real, Groups.all) and data is not None:
+        raise typer.BadParameter(f"the group {group.value} looks at no real frames", param_hint="--data")
     wanted = [name for name in GROUPS if group in (Groups.all, name)]
-    cases = chosen(wanted, baselines=baselines)
+    try:
+        cases = chosen(wanted, baselines=baselines, long=long, data=data)
+    except BadData as error:
+        raise typer.BadParameter(str(error), param_hint="--data") from None
     with Interrupt() as interrupt, progress() as bar:
         row = bar.add_task("starting", total=len(cases))
         begun = 0
@@ -114,7 +132,7 @@ def _measure(group: Groups, repeat: int, baselines: bool) -> Report:
             begun += 1
 
         try:
-            return run_cases(cases, repeat, baselines=baselines, on_start=say, stop=interrupt)
+            return run_cases(cases, repeat, baselines=baselines, long=long, on_start=say, stop=interrupt)
         except Stopped:
             complain("stopped by a signal; nothing is written")
             raise typer.Exit(interrupt.exit_code) from None

@@ -32,7 +32,7 @@ def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
     pressed = world.pose("lower").position
     assert pressed[2] > 0.2e-3 and np.abs(pressed[:2]).max() == 0  # came up to the indenter, and only that
     world.move({}, loads={"lower": 0.0})
-    assert load(world, "lower") == 0.0
+    assert load(world, "lower") == pytest.approx(0.0, abs=1e-2 * LEAST * 0.145 * 4.0**2)  # of what counts as none
     assert world.pose("lower").position[2] < pressed[2]
 
 

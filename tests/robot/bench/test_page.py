@@ -11,7 +11,8 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner, Result
 
-from robot.bench.page import PICTURE, cells, costs, draw, markdown
+from robot.bench.page import cells, costs, markdown
+from robot.bench.picture import PICTURE, RADII, draw, draw_radii
 from robot.bench.schema import Report
 from robot.cli import app
 
@@ -63,8 +64,8 @@ def test_a_report_is_shown_and_written_again_without_measuring(tmp_path: Path, r
     )
     assert result.exit_code == 0, result.output
     assert "sphere_press" in result.stdout and "tacchi-settings" in result.stdout
-    again = json.loads((tmp_path / "new" / "again.json").read_text(encoding="utf-8"))
-    assert again == json.loads(REFERENCE.read_text(encoding="utf-8"))
+    again = Report.model_validate_json((tmp_path / "new" / "again.json").read_bytes())
+    assert again == report
     assert imread(tmp_path / "new" / PICTURE).std() > 0.01
     assert (tmp_path / "docs" / "benchmarks.md").is_file() and (tmp_path / "docs" / "images" / PICTURE).is_file()
 
@@ -91,6 +92,27 @@ def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
     assert tacsim("bench", "--from", tmp_path / "none.json").exit_code != 0
     assert tacsim("bench", "nothing").exit_code == 2
     assert tacsim("bench", "--repeat", "0").exit_code == 2
+
+
+def test_the_page_shows_figures_and_a_missed_one(report: Report) -> None:
+    page = markdown(report)
+    assert "| figure | measured | must | aim | verdict |" in page and "## How to read and rerun" in page
+    slow = [row.model_copy(update={"seconds": 99.0}) for row in report.results if row.case == "control_step"]
+    missed = markdown(report.model_copy(update={"results": slow}))
+    assert "| control step, draft, two images | 9.9e+04 ms | ≤ 30 | ≤ 10 | **missed** |" in missed
+
+
+def test_real_rows_bring_their_picture(tmp_path: Path, report: Report) -> None:
+    figures = {"depth_mm": 0.5, "ball_radius_mm": 3.0, "thickness_mm": 10.0, "real_px": 20.0, "pressure_px": 21.0}
+    changes = {"group": "real", "case": "contact_radius", "variant": "R 3 mm: image", "figures": figures}
+    row = report.results[0].model_copy(update=changes)
+    more = report.model_copy(update={"results": [*report.results, row]})
+    assert f"](images/{RADII})" in markdown(more) and f"](images/{RADII})" not in markdown(report)
+    assert not draw_radii(report.results, tmp_path / RADII) and not (tmp_path / RADII).exists()
+    (tmp_path / "real.json").write_text(more.model_dump_json(), encoding="utf-8")
+    result = tacsim("bench", "--from", tmp_path / "real.json", "--docs", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert imread(tmp_path / "images" / RADII).std() > 0.01
 
 
 def test_help_and_schema() -> None:

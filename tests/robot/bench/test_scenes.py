@@ -1,0 +1,58 @@
+"""Cost by scene, a second world, slab theory, rest, sliding."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from robot.bench import deep, press, scenes
+from robot.bench.squeeze import close, squeeze_scene, touching
+from tacsim.interface import Pose
+
+
+def test_slab_theory() -> None:
+    """Hill: a slab as wide as it is high bears 1 + 1 / (3 sqrt 3) of its yield stress; of ten times the width, 2.92."""
+    assert deep.slab_force(30e3, 1e-6, 1e-2) == pytest.approx(3.0 * (1 + 1 / (3 * math.sqrt(3))))
+    assert deep.slab_force(30e3, 1e-6, 1e-2 / 100 ** (1 / 3)) / (3.0 * 100 ** (1 / 3)) == pytest.approx(
+        2.9245, abs=1e-4
+    )
+
+
+def test_a_second_world_is_the_first_once_more() -> None:
+    (row,) = scenes.second_world("draft", 1)
+    assert row.error == 0.0
+    assert row.figures["second_ms"] > 0 and row.figures["first_ms"] > 0
+
+
+@pytest.mark.parametrize("shape", [scenes._ball, scenes._cylinder, scenes._box], ids=["ball", "cylinder", "box"])
+def test_an_indenter_costs_and_presses(shape: object) -> None:
+    (row,) = scenes.rigid(shape, 1)  # type: ignore[arg-type]
+    assert row.substeps and row.substeps > 0
+    assert row.figures["force_n"] > 0.1 and row.figures["ready_ms"] > 0
+    assert row.error <= 1.0  # settled to 1 %
+
+
+def test_a_sheared_body_rests_where_it_is() -> None:
+    world = touching(squeeze_scene("draft"))
+    close(world, 0.3e-3)
+    pose = world.pose("upper")
+    world.move({"upper": Pose(pose.position + [0.2e-3, 0, 0], pose.quaternion)})
+    before = world.truth()
+    stats = deep._rest(world, "draft", 60)
+    after = world.truth()
+    assert stats.substeps == 60 and not stats.settled
+    assert before is not None and after is not None
+    assert 0 < abs(after.position - before.position).max() < 5e-6
+
+
+def test_the_plate_slides_until_friction_is_built_up() -> None:
+    (row,) = press.sliding_force(1e-3, 1)
+    assert row.figures["way_mm"] >= 3
+    assert row.error < 1.0 and row.note == ""
+
+
+def test_a_plate_that_has_not_slid_far_enough_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(press, "SLIDES", 1)
+    (row,) = press.sliding_force(1e-3, 1)
+    assert "still changes after 0.5 mm" in row.note and row.error > 20

@@ -84,7 +84,8 @@ class BodyFacts:
 def body_facts(material: BodyMaterial, spacing: float) -> BodyFacts:
     mu, lam = lame(material)
     limit = material.elastic_limit
-    return BodyFacts(spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC)
+    bulk = (lam + 2 * mu / 3) * MPA
+    return BodyFacts(spacing * MM, mu * MPA, bulk, limit if math.isfinite(limit) else ELASTIC, material.hardening)
 
 
 class BodyState:

@@ -205,7 +205,7 @@ def test_uniaxial_yield_stress_grows_with_the_plastic_strain() -> None:
     rate, count = 2e-3, 100
     there = np.diag([np.expm1(rate), np.expm1(-rate / 2), np.expm1(-rate / 2)])
     back = np.diag([np.expm1(-rate), np.expm1(rate / 2), np.expm1(rate / 2)])
-    tau, flow = drive(facts, np.array([there] * count + [back] * count))
+    tau, flow = drive(facts, np.array([there] * count + [back] * 2 * count))
     stress = tau[:, 0, 0] - tau[:, 1, 1]
     yield_stress, modulus = 30e-3, 200e-3  # [MPa]
     strain = rate * np.arange(1, count + 1)

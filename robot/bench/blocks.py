@@ -18,7 +18,17 @@ from tacsim.physics.gel import (
 )
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3, vec4
 from tacsim.physics.layout import (
-    BACKING, COUNTS, FACTS, GEL_DAMPING, GRID, NUMBERS, OFF_GRID, SMALLEST_STEP_VOLUME, SMALLEST_VOLUME, STEP, STEPS,
+    BACKING,
+    COUNTS,
+    FACTS,
+    GEL_DAMPING,
+    GRID,
+    NUMBERS,
+    OFF_GRID,
+    SMALLEST_STEP_VOLUME,
+    SMALLEST_VOLUME,
+    STEP,
+    STEPS,
 )  # fmt: skip
 from tacsim.physics.material import convect, hencky_return, mat3, vec6
 from tacsim.physics.plasticine import (
@@ -87,9 +97,8 @@ def gel_substeps(
                 for n in range((nx + 1) * (ny + 1)):
                     before = nodes[0, 0, 1, d, k, n]
                     after = keep[d] * before
-                    if ti.static(d == 2):
-                        if driven == 1 and k == layers:
-                            after = speed
+                    if driven == 1 and k == layers and d == 2:
+                        after = speed
                     nodes[0, 0, 1, d, k, n] = after
                     nodes[0, 0, 0, d, k, n] = nodes[0, 0, 0, d, k, n] + dt * (after - before)
 
@@ -152,7 +161,7 @@ class GelBlock(Block):
         self._arguments = (*self.state.arguments(), self.facts, self.counts, self._work, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:
-        """keep: as for a body; speed: of the top along z, if it is driven. Raises RuntimeError if an element inverts."""
+        """keep: as for a body; speed: of the top along z, if driven. Raises RuntimeError if an element inverts."""
         self.counts[0, STEPS] = substeps
         gel_substeps(*self._arguments, *keep, int(speed is not None), speed or 0.0)
         smallest = float(self.partial[0, :, SMALLEST_VOLUME].min())

@@ -163,9 +163,7 @@ def simple_shear(repeat: int) -> list[Measurement]:
     f = np.eye(3)
     f[0, 1] = increment
     for _ in range(steps):
-        b, flow, exact = reference.hencky_return(
-            f @ b @ f.T, flow, facts.mu, facts.bulk, facts.limit, facts.hardening
-        )
+        b, flow, exact = reference.hencky_return(f @ b @ f.T, flow, facts.mu, facts.bulk, facts.limit, facts.hardening)
     radius = 2 * facts.mu * facts.limit  # sigma_y
     closed = radius / math.sqrt(2)
     off = float(np.abs(full(tau.astype(np.float64)) - exact).max()) / radius * 100

@@ -13,8 +13,8 @@ def hencky_return(
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Von Mises return mapping on the Hencky strain of b (..., 3, 3), by eigenvalues; linear isotropic hardening.
 
-    flow: (...) equivalent plastic strain so far, by which |dev strain| <= limit + hardening * flow grows (Simo & Hughes
-    1998, box 3.1). Returns the elastic left Cauchy-Green tensor after the return (..., 3, 3), the new flow (...) and the
+    flow: (...) equivalent plastic strain so far: |dev strain| stays below limit + hardening * flow (Simo & Hughes 1998,
+    box 3.1). Returns the elastic left Cauchy-Green tensor after the return (..., 3, 3), the new flow (...), and the
     Kirchhoff stress (..., 3, 3).
     """
     values, axes = np.linalg.eigh(b)

@@ -199,8 +199,8 @@ def test_hardening_matches_the_reference(hardening: float) -> None:
 
 
 def test_uniaxial_yield_stress_grows_with_the_plastic_strain() -> None:
-    """Isochoric tension by eps, then back: sigma = sigma_y + H p, and p from 3 mu (eps - p) = sigma (Simo & Hughes 1998,
-    section 1.2); isotropic hardening resists the way back as much."""
+    """Isochoric tension by eps, then back: sigma = sigma_y + H p, with p from 3 mu (eps - p) = sigma (Simo & Hughes
+    1998, section 1.2); isotropic hardening resists the way back as much."""
     facts = body_facts(HARD, 1e-3)
     rate, count = 2e-3, 100
     there = np.diag([np.expm1(rate), np.expm1(-rate / 2), np.expm1(-rate / 2)])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.figure import COLOURS, INK, canvas, plain, save
 from tacsim.interface import Pose
-from tacsim.physics import diagnosis
+from tacsim.physics import diagnosis, layout
 from tacsim.physics.dump import MOMENTS, Dump, DumpError, no_dumps
 from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.world import MoveStats, World, make_world
@@ -122,11 +122,19 @@ def _facts_of(state: State, scene: Scene) -> list[tuple[str, str]]:
     for name, words in (("gel_velocity", "gel nodes"), ("velocity", "particles")):
         if name in state:
             facts.append((f"fastest of {words} [wave speed]", _least(-np.abs(state[name]), -1.0)))
-    for name, words in (("wrench", "contact force"), ("backing", "force at backing")):
-        if name in state:
-            vectors = state[name].reshape(len(scene.sensors), -1)[:, :3]
-            facts.append((f"{words} [N]", "  ".join(diagnosis.millimetres(v) for v in vectors)))
+    for words, vectors in _forces_of(state, len(scene.sensors)):
+        facts.append((f"{words} [N]", "  ".join(diagnosis.millimetres(v) for v in vectors)))
     return facts
+
+
+def _forces_of(state: State, gels: int) -> list[tuple[str, NDArray[Any]]]:
+    """What pressed on each gel and on its backing, (gels, 3)."""
+    if "sums" in state:  # of the kernels' parts
+        contact = state["sums"][:, layout.FORCE : layout.FORCE + 6 * gels].sum(axis=0).reshape(gels, 6)[:, :3]
+        backing = state["sums"][:, layout.BACKING : layout.BACKING + 3].reshape(gels, -1, 3).sum(axis=1)
+        return [("contact force", contact), ("force at backing", backing)]
+    found = (("contact force", "wrench"), ("force at backing", "backing"))
+    return [(words, state[name].reshape(gels, -1)[:, :3]) for words, name in found if name in state]
 
 
 def _least(values: NDArray[Any], sign: float = 1.0) -> str:

@@ -207,6 +207,19 @@ def signed_distance(surface: Surface, points: FloatArray) -> FloatArray:
     return _nearest(surface, points / surface.unit)[0] * surface.unit
 
 
+def away_from_surface(surface: Surface, points: FloatArray) -> FloatArray:
+    """Unit gradient (n, 3) [-] of the signed distance at `points` (n, 3) [m]: the outward direction of the nearest
+    point of the surface; a point on the surface itself gets the normal there."""
+    at = points / surface.unit
+    value, triangle = _nearest(surface, at)
+    closest = _to_triangles(surface, at, triangle)[1]
+    on = np.abs(value) < 1e-6
+    gradient = np.where(
+        on[:, None], _pseudonormals(surface, closest, triangle), (at - closest) * np.sign(value)[:, None]
+    )
+    return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+
+
 def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatArray:
     """Signed distance (nx, ny, nz) [m] at the nodes of a regular grid of cubic cells, coordinates `axes` [m].
 

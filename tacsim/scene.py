@@ -125,6 +125,8 @@ class Body(Facts):
 
     geometry: Shape = Box()
     material: BodyMaterial = BodyMaterial()
+    sampling: Literal["lattice", "random"] = "lattice"  # how particles fill it; random: blue noise, no direction
+    seed: Annotated[int, Field(ge=0)] = 0  # of random sampling
 
 
 class Indenter(Facts):

@@ -5,6 +5,7 @@ Everything here is in the shape's own frame: axes as in the scene, origin at the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -54,7 +55,7 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     """Body particles (n, 3) [m] on a cubic lattice of `spacing` [m]; each stands for spacing^3 of material.
 
     Along each axis the lattice has the whole number of layers nearest to the shape's size and is centred; the first
-    layer lies half a spacing inside the face. Never random: scattered depth would print an orange peel on the gel.
+    layer lies half a spacing inside the face. For particles without a lattice see :mod:`tacsim.sampling`.
 
     Raises ValueError when the lattice misses the shape's size (or a mesh's volume) by more than 10 %, holds no
     particle, or more than 5,000,000; and what :func:`tacsim.mesh.load_mesh` raises.
@@ -129,6 +130,35 @@ def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
             from tacsim.mesh import make_surface, signed_distance
 
             return signed_distance(make_surface(_centred(geometry)), at)
+
+
+def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
+    """Unit gradient (n, 3) [-] of the signed distance at `points` (n, 3) [m]: away from the nearest surface, inside.
+
+    Where several parts of the surface are equally near it is their mean direction; zero where those cancel (a ball's
+    centre). Raises what :func:`distance` raises.
+    """
+    at = np.asarray(points, dtype=np.float64)
+    if isinstance(geometry, Mesh):
+        from tacsim.mesh import away_from_surface, make_surface
+
+        return away_from_surface(make_surface(_centred(geometry)), at)
+    step = 1e-6 * float(extent(geometry).max())
+    sides = [distance(geometry, at + d) - distance(geometry, at - d) for d in step * np.eye(3)]
+    gradient = np.stack(sides, axis=1) / (2 * step)
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    return np.where(length > 1e-3, gradient / np.maximum(length, 1e-3), 0.0)
+
+
+def nearest_surface(geometry: Shape, spacing: float) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """Function of points (n, 3) [m] for many calls: signed distance (n,) [m] and its gradient (n, 3) [-].
+
+    Exact for the closed forms; a mesh is asked once, at the nodes of a grid of `spacing` [m].
+    """
+    if isinstance(geometry, Mesh):
+        grid = distance_grid(geometry, spacing)
+        return lambda points: sample(grid, points)
+    return lambda points: (distance(geometry, points), outward_normals(geometry, points))
 
 
 def _outside_and_inside(beyond: FloatArray) -> FloatArray:

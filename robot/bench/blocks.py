@@ -53,8 +53,8 @@ Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 
 @ti.kernel
 def body_substeps(
-    points: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums, facts: Facts,
-    counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums,
+    facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32,
 ):  # fmt: skip
     """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it."""
     ti.loop_config(serialize=True)
@@ -71,7 +71,7 @@ def body_substeps(
                     velocity = vec4(keep_x * q[0] / q[3], keep_y * q[1] / q[3], keep_z * q[2] / q[3], 0.0)
                 velocities[node] = velocity
         for part in range(PARTS):
-            grid_to_particles(0, part, points, rates, strains, velocities, sums, facts, counts, partial)
+            grid_to_particles(0, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
 
 
 @ti.kernel
@@ -137,7 +137,7 @@ class BodyBlock(Block):
     def __init__(self, facts: BodyFacts, points: np.ndarray, dt: float) -> None:
         super().__init__(facts.facts(), dt)
         self.cell = facts.cell
-        self.state = BodyState([points], [0.5 * facts.spacing])
+        self.state = BodyState([points])
 
     def fit(self, margin: float) -> None:
         """Lays the grid round the particles, which may then move by margin [mm]."""

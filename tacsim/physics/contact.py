@@ -71,13 +71,26 @@ def surface_node(i, j, nx, ny):
 
 
 @ti.func
-def contact_ceiling(skin: ti.template(), env, g, radius):
-    """A particle higher than this above the rest surface touches nothing: a spline stays below its highest node."""
+def support_radius(plane, spacing):
+    """Distance of a particle from the body's surface: 1 / |plane|; half a spacing where it knows none (plane = 0).
+
+    plane: the nearest surface's tangent plane, outward normal over distance [1/mm], see body_surface.py.
+    """
+    size = plane.norm()
+    radius = 0.5 * spacing
+    if size > 0.0:
+        radius = ti.min(1.0 / size, spacing)  # a plane torn further away is no longer this particle's to speak for
+    return radius
+
+
+@ti.func
+def contact_ceiling(skin: ti.template(), env, g):
+    """Height of the highest surface node [mm], at least 0: the spline stays below it, and what is above touches not."""
     highest = 0.0
     for i in range(1, skin.shape[3] - 1):
         for j in range(1, skin.shape[4] - 1):
             highest = ti.max(highest, skin[env, g, 0, i, j][2])
-    return highest + 2.0 * radius  # one radius to touch, one for what the contact's memory still bridges
+    return highest
 
 
 @ti.func
@@ -92,7 +105,7 @@ def particle_contact(
     """
     h, k_n, dt = facts[env, GEL_SPACING], facts[env, STIFFNESS], facts[env, STEP]
     mu, housing = facts[env, FRICTION + g], facts[env, HOUSING]
-    cap = 0.25 * facts[env, BODY_CELL]  # half a particle spacing
+    deepest = facts[env, BODY_CELL]  # two particle spacings: the largest overlap answered in full
     touching = False
     force = vec3(0.0)
     slip = vec3(memory[0], memory[1], memory[2])
@@ -116,8 +129,8 @@ def particle_contact(
                     vs += (wx[p] * wy[q]) * skin[env, g, 1, i + p + 1, j + q + 1]
                 n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
-                if gap > 4.0 * cap:  # an overlap found late must not explode; counted
-                    gap = 4.0 * cap
+                if gap > deepest:  # an overlap found late must not explode; counted
+                    gap = deepest
                     partial[env, part, CAPPED] += 1.0
                 vr = v - vec3(vs[0], vs[1], vs[2])
                 vn = vr.dot(n)
@@ -134,8 +147,8 @@ def particle_contact(
         elif housing >= 0.0:
             gap = radius - housing - x[2]
             if gap + taken > 0.0:
-                if gap > 4.0 * cap:
-                    gap = 4.0 * cap
+                if gap > deepest:
+                    gap = deepest
                     partial[env, part, CAPPED] += 1.0
                 n = vec3(0.0, 0.0, 1.0)
                 fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)

@@ -132,7 +132,12 @@ class GelState:
         return self._view(2)
 
     def refresh(self) -> None:
-        """The skin from the nodes: call it before a launch, since somebody may have written the nodes."""
+        """The skin from the nodes, and zeros behind the last node: before a launch, since nodes may have been written.
+
+        What stands behind the last node takes part in sums with weight 0, so it must be finite.
+        """
+        nx1, ny1 = self._shape
+        self.nodes[..., nx1 * ny1 :] = 0.0
         for quantity in range(2):
             top = self._view(quantity)[..., -1, :]
             skin = self.skin[:, :, quantity, ..., :3]

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.contact import contact_ceiling, particle_contact
+from tacsim.physics.body_surface import surface_points, tangent_planes
+from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
 from tacsim.physics.controller import Path, Reading, force_floor, merged, move_and_settle, plan
 from tacsim.physics.gel import (
     MM,
@@ -49,8 +50,9 @@ from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, sha
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
+from tacsim.sampling import body_points
 from tacsim.scene import GelSurface, Scene
-from tacsim.shapes import extent, particles
+from tacsim.shapes import extent, volume
 
 COURANT = 0.4  # dt / (smallest spacing / wave speed)
 ZETA_GEL = 1.0  # zeta in alpha = zeta c / thickness
@@ -129,8 +131,8 @@ def grid_update(
 
 @ti.func
 def touch_gel(
-    env, part, g, it, drive: ti.template(), points: ti.template(), rates: ti.template(), memory: ti.template(),
-    skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
+    env, part, g, it, drive: ti.template(), points: ti.template(), planes: ti.template(), rates: ti.template(),
+    memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
     layers, nx, ny,
 ):  # fmt: skip
     """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes."""
@@ -138,19 +140,21 @@ def touch_gel(
     origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    highest = contact_ceiling(skin, env, g, 0.25 * facts[env, BODY_CELL])
+    highest, spacing = contact_ceiling(skin, env, g), 0.5 * facts[env, BODY_CELL]
     rate = facts[env, STEP] / facts[env, BODY_MASS]
     total, moment = vec3(0.0), vec3(0.0)
     n, origin_p = counts[env, PARTICLES], env * counts[env, STRIDE]
     for p in range(first_of(n, part, PARTS), first_of(n, part + 1, PARTS)):
         at = points[origin_p + p]
         arm = vec3(at[0], at[1], at[2]) - origin
-        if outward.dot(arm) < highest:  # most of the body is far away: one dot product decides
+        radius = support_radius(planes[origin_p + p], spacing)
+        # one radius to touch, half a spacing for what the contact's memory still bridges
+        if outward.dot(arm) < highest + radius + 0.5 * spacing:  # most of the body is far away: one dot product decides
             local = back @ arm
             moving = rates[origin_p + p, 0]
             relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
             touching, force, kept = particle_contact(
-                env, part, g, local, relative, memory[env, g, p], at[3], skin, touch, facts, layers, nx, ny, partial
+                env, part, g, local, relative, memory[env, g, p], radius, skin, touch, facts, layers, nx, ny, partial
             )
             memory[env, g, p] = kept
             if touching:
@@ -170,7 +174,7 @@ def substeps(
     team: ti.i32, drive: Drive,
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    points: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums, memory: ContactMemory,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums, memory: ContactMemory,
     facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
@@ -188,7 +192,7 @@ def substeps(
                     clear_touch(env, part, 2, touch)
                     for g in range(2):
                         touch_gel(
-                            env, part, g, it, drive, points, rates, memory, skin, touch, facts, counts, partial,
+                            env, part, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
                             layers, nx, ny,
                         )  # fmt: skip
                     clear_masses(env, part, masses, counts)
@@ -207,7 +211,7 @@ def substeps(
                 meet(sync, env, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    grid_to_particles(env, part, points, rates, strains, velocities, sums, facts, counts, partial)
+                    grid_to_particles(env, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
 
 
 class HybridWorld:
@@ -220,11 +224,12 @@ class HybridWorld:
         start()
         self.scene = scene
         self._gel = gel_facts(scene.gel, scene.element)
-        self._body = body_facts(scene.body.material, scene.spacing)
         self._gels = GelState(self._gel, 1, 2)
         height = float(extent(scene.body.geometry)[2])
-        points = (particles(scene.body.geometry, scene.spacing) + [0.0, 0.0, height / 2 + CLEARANCE]) * MM
-        self._particles = BodyState([points], [0.5 * self._body.spacing])
+        points = body_points(scene.body, scene.spacing)
+        self._body = body_facts(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
+        planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM  # [1/mm]
+        self._particles = BodyState([(points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM], [planes])
         self._memory = np.zeros((1, 2, len(points), 4), np.float32)  # of the contact law [mm]
         self._facts = np.zeros((1, FACTS), np.float32)
         self._counts = np.zeros((1, COUNTS), np.int32)
@@ -261,7 +266,7 @@ class HybridWorld:
         return {
             "gel_displacement": self._gels.u[0], "gel_velocity": self._gels.v[0],
             "position": b.x(), "velocity": b.v(), "affine": b.c(), "strain": b.e(), "flow": b.flow(),
-            "contact": self._memory[0], "sums": self._partial[0],
+            "planes": b.plane(), "contact": self._memory[0], "sums": self._partial[0],
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -287,8 +292,7 @@ class HybridWorld:
 
     def truth(self) -> Truth:
         x = self._particles.x()
-        z = x[:, 2]
-        height = (float(z.max()) - float(z.min()) + self._body.spacing) / MM
+        height = float(np.ptp(surface_points(x, self._particles.plane())[:, 2])) / MM
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
     # ----------------------------------------------------------------- motion

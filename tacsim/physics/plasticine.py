@@ -57,6 +57,7 @@ class BodyFacts:
     mu: float  # [MPa]
     bulk: float  # [MPa]
     limit: float  # k = sigma_y / (2 mu) [-]
+    volume: float  # of one particle [mm^3]; about h_p^3
     hardening: float = 0.0  # growth of the limit by equivalent plastic strain [-]
 
     @property
@@ -70,41 +71,46 @@ class BodyFacts:
 
     @property
     def particle_mass(self) -> float:
-        return self.density * self.spacing**3
+        return self.density * self.volume
 
 
     def facts(self) -> dict[int, float]:
         """Entries of the array `facts` (tacsim.physics.layout)."""
         return {
             BODY_CELL: self.cell, BODY_MU: self.mu, BODY_BULK: self.bulk, BODY_LIMIT: self.limit,
-            BODY_HARDENING: self.hardening, BODY_MASS: self.particle_mass, BODY_VOLUME: self.spacing**3,
+            BODY_HARDENING: self.hardening, BODY_MASS: self.particle_mass, BODY_VOLUME: self.volume,
         }  # fmt: skip
 
 
-def body_facts(material: BodyMaterial, spacing: float) -> BodyFacts:
+def body_facts(material: BodyMaterial, spacing: float, volume: float | None = None) -> BodyFacts:
+    """`spacing` [m]; `volume` of one particle [m^3], without it spacing^3."""
     mu, lam = lame(material)
     limit = material.elastic_limit
-    bulk = (lam + 2 * mu / 3) * MPA
-    return BodyFacts(spacing * MM, mu * MPA, bulk, limit if math.isfinite(limit) else ELASTIC, material.hardening)
+    return BodyFacts(
+        spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC,
+        (spacing**3 if volume is None else volume) * MM**3, material.hardening,
+    )  # fmt: skip
 
 
 class BodyState:
     """Particles of all environments, in the order that kernels like; views for everybody else.
 
-    points: (E, N, 4) position, and contact radius [mm].
+    points: (E, N, 4) position [mm]; planes: (E, N, 4) tangent planes of the body's surface [1/mm], body_surface.py.
     rates: (E, N, 4, 4) velocity; and the columns of the affine velocity, its derivatives by x, y, z.
     strains: (E, N, 8) e = b_e - I (xx, yy, zz, xy, xz, yz), equivalent plastic strain, nothing.
     masses: (E, PARTS, nodes, 4) momentum and mass, one copy a part; velocities: (E, nodes, 4).
     """
 
-    def __init__(self, points: Sequence[np.ndarray], radius: Sequence[float | np.ndarray]) -> None:
-        """points: of each environment, (n, 3) [mm]; radius: of contact [mm], one or (n,) an environment."""
+    def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
+        """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes no particle knows a surface."""
         self.counts = [len(p) for p in points]
         n, e = max(self.counts), len(points)
         self.points = np.zeros((e, n, 4), np.float32)
-        for index, (p, r) in enumerate(zip(points, radius, strict=True)):
+        self.planes = np.zeros((e, n, 4), np.float32)
+        for index, p in enumerate(points):
             self.points[index, : len(p), :3] = p
-            self.points[index, : len(p), 3] = r
+            if planes is not None:
+                self.planes[index, : len(p), :3] = planes[index]
         self.rates = np.zeros((e, n, 4, 4), np.float32)
         self.strains = np.zeros((e, n, 8), np.float32)
         self.masses = np.zeros((e, PARTS, 1, 4), np.float32)
@@ -114,6 +120,10 @@ class BodyState:
     def x(self, environment: int = 0) -> np.ndarray:
         """Positions [mm], (n, 3), a view."""
         return self.points[environment, : self.counts[environment], :3]
+
+    def plane(self, environment: int = 0) -> np.ndarray:
+        """Tangent planes [1/mm], (n, 3), a view."""
+        return self.planes[environment, : self.counts[environment], :3]
 
     def v(self, environment: int = 0) -> np.ndarray:
         """Velocities, (n, 3), a view."""
@@ -159,7 +169,7 @@ class BodyState:
     def arguments(self) -> tuple[np.ndarray, ...]:
         """What every kernel with a body takes, in this order."""
         flat = (a.reshape(-1, 4) for a in (self.strains, self.masses, self.velocities, self._sums))
-        return (self.points.reshape(-1, 4), self.rates.reshape(-1, 4, 4), *flat)
+        return (self.points.reshape(-1, 4), self.planes.reshape(-1, 4), self.rates.reshape(-1, 4, 4), *flat)
 
 
 def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tuple[int, int, int]]:
@@ -258,9 +268,15 @@ def node_sum(env, i, node, masses: ti.template(), counts: ti.template()):
 
 
 @ti.func
+def moved_plane(plane, x, y, z, dt):
+    """A tangent plane of the body's surface goes with the material, as F^-T does: m' = -C^T m; x, y, z: columns of C."""
+    return plane - dt * vec4(x.dot(plane), y.dot(plane), z.dot(plane), 0.0)
+
+
+@ti.func
 def grid_to_particles(
-    env, part, points: ti.template(), rates: ti.template(), strains: ti.template(), velocities: ti.template(),
-    sums: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
+    env, part, points: ti.template(), planes: ti.template(), rates: ti.template(), strains: ti.template(),
+    velocities: ti.template(), sums: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
 ):  # fmt: skip
     """Velocity and affine velocity back to this part's particles; strain and position follow.
 
@@ -302,6 +318,7 @@ def grid_to_particles(
         rates[p, 2] = keep_or(never, rates[p, 2], y)
         rates[p, 3] = keep_or(never, rates[p, 3], z)
         points[p] = points[p] + dt * velocity
+        planes[p] = moved_plane(planes[p], x, y, z, dt)
         step = dt * mat3([[x[i], y[i], z[i]] for i in range(3)])
         smallest = ti.min(smallest, (mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) + step).determinant())
         e, flow = strain_of(strains, p)

@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.controller import MM, Path, Reading, merged, move_and_settle, plan
-from tacsim.physics.health import Health, Place, SimulationDiverged, as_float32, attempt, require_room, retried
+from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, require_room, retried
+from tacsim.physics.layout import NUMBERS
 from tacsim.physics.world import MoveStats, put_back
 from tacsim.runtime import start
+from tacsim.sampling import body_points
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
-from tacsim.shapes import particles
 
 Float32 = NDArray[np.float32]
 
@@ -93,7 +94,7 @@ class SeedWorld:
         self._body = solid(scene.body.material, h**3)
         # force that rounding in F can pretend: one particle's area at the gel's modulus
         self._floor = scene.gel.material.youngs_modulus * MPA * h * h
-        self._initialise(particles(scene.body.geometry, scene.spacing) * MM)
+        self._initialise(body_points(scene.body, scene.spacing) * MM)
 
     def _initialise(self, body: NDArray[np.float64]) -> None:
         """Stage 1 of the scheme: undeformed particles at rest, a clear gap between body and gels."""
@@ -120,7 +121,6 @@ class SeedWorld:
         # cells of the grid between the backings; and their height / dx, the least since they last were renewed
         self._layers = np.array([round(room), room / round(room)], np.float32)
         self._grid = np.zeros((1, 1, 1, 4), np.float32)
-        as_float32([a for a in self._arrays().values() if a.dtype != np.int32 and a is not self._x])
 
     # ------------------------------------------------------------------ state
 
@@ -223,8 +223,9 @@ class SeedWorld:
         x0, y0 = self._fit_grid(path, first, last, where)
 
         def launch() -> Health:
-            health = Health.array()
-            self._launch(path.drive(first, last), path.step, x0, y0, health)
+            health = np.zeros((1, NUMBERS), np.float32)
+            Health.clear(health)
+            self._launch(path.drive(first, last), path.step, x0, y0, health[0])
             return Health.read(health)
 
         attempt(self._arrays(), launch, where)

@@ -31,9 +31,9 @@ class GelMaterial(Facts):
 
 
 class BodyMaterial(Facts):
-    """Elastoplastic body: Hencky elasticity, von Mises yield.
+    """Elastoplastic body: Hencky elasticity, von Mises yield, linear isotropic hardening.
 
-    Give the yield as a stress or as the seed's strain k; with neither the body is elastic.
+    Give the yield as a stress or as the seed's strain k; with neither the body is elastic, and can't harden.
     """
 
     youngs_modulus: Modulus = 0.5e6
@@ -41,12 +41,19 @@ class BodyMaterial(Facts):
     yield_stress: Annotated[Pressure, Field(gt=0)] | None = None
     yield_norm: Literal["uniaxial", "frobenius"] = "uniaxial"
     yield_strain: Annotated[float, Field(gt=0, lt=1)] | None = None  # k = sigma_y / (2 mu), Frobenius norm
+    # H: growth of the uniaxial yield stress by equivalent plastic strain [Pa]
+    hardening_modulus: Annotated[Pressure, Field(ge=0, le=1e12)] = 0.0
     source: str = ""
 
     @model_validator(mode="after")
     def _one_yield(self) -> Self:
         if self.yield_stress is not None and self.yield_strain is not None:
             raise ValueError("give yield_stress or yield_strain, not both")
+        if self.hardening_modulus > 0 and self.yield_stress is None and self.yield_strain is None:
+            raise ValueError(
+                f"hardening_modulus {self.hardening_modulus:g} Pa without a yield: an elastic body does not harden; "
+                f"give yield_stress or yield_strain, or leave out hardening_modulus"
+            )
         return self
 
     @property
@@ -62,6 +69,12 @@ class BodyMaterial(Facts):
         mu, _ = lame(self)
         frobenius = self.yield_stress * (math.sqrt(2.0 / 3.0) if self.yield_norm == "uniaxial" else 1.0)
         return frobenius / (2.0 * mu)
+
+    @property
+    def hardening(self) -> float:
+        """Growth of `elastic_limit` by equivalent plastic strain p [-]: 2 mu k = sqrt(2/3) (sigma_y + H p)."""
+        mu, _ = lame(self)
+        return math.sqrt(2.0 / 3.0) * self.hardening_modulus / (2.0 * mu)
 
 
 def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
@@ -152,6 +165,10 @@ class Scene(Facts):
             raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
         if self.physics == "seed" and self.indenter is not None:
             raise ValueError("physics 'seed' has no rigid indenter; use physics 'hybrid'")
+        if self.physics == "seed" and self.body is not None and self.body.material.hardening_modulus > 0:
+            raise ValueError(
+                "physics 'seed' has no hardening; use physics 'hybrid', or leave out the material's hardening_modulus"
+            )
         missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
         if missing:
             raise ValueError(f"friction of the surface '{missing[0]}' is missing; give both lower and upper")

@@ -1,67 +1,174 @@
 """Small kernels that drive the product's own laws, transfers and elements directly, where no World has the boundary
 conditions of a closed form. Units as in the physics: mm, N, MPa, wave speed 1."""
 
-from tacsim.physics.gel import Nodes, gel_advance, gel_forces
-from tacsim.physics.material import convect, hencky_return, mat3, vec3, vec4
-from tacsim.physics.plasticine import Grid, Matrices, Strains, Vectors, clear_grid, grid_to_particles, particles_to_grid
-from tacsim.runtime import ti
+import numpy as np
+
+from tacsim.physics.gel import (
+    SMALLEST_STRETCH,
+    Corners,
+    GelFacts,
+    GelState,
+    Lattice,
+    NodeLanes,
+    Nodes,
+    Skin,
+    Touch,
+    gel_advance,
+    gel_forces,
+)
+from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3, vec4
+from tacsim.physics.layout import (
+    BACKING,
+    COUNTS,
+    FACTS,
+    GEL_DAMPING,
+    GRID,
+    NUMBERS,
+    OFF_GRID,
+    SMALLEST_STEP_VOLUME,
+    SMALLEST_VOLUME,
+    STEP,
+    STEPS,
+)  # fmt: skip
+from tacsim.physics.material import convect, hencky_return, mat3, vec6
+from tacsim.physics.plasticine import (
+    BodyFacts,
+    BodyState,
+    Masses,
+    Points,
+    Rates,
+    Strains,
+    Sums,
+    Velocities,
+    clear_masses,
+    grid_to_particles,
+    node_sum,
+    particles_to_grid,
+)
+from tacsim.runtime import start, ti
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 
 
 @ti.kernel
 def body_substeps(
-    n: ti.i32, dt: ti.f32, x: Vectors, v: Vectors, c: Matrices, e: Strains, grid: Grid,
-    ox: ti.f32, oy: ti.f32, oz: ti.f32, spacing: ti.f32, mu: ti.f32, bulk: ti.f32, limit: ti.f32,
-    keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, health: Scalars,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums,
+    facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32,
 ):  # fmt: skip
     """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it."""
     ti.loop_config(serialize=True)
-    for _ in range(n):
-        cell, volume = 2.0 * spacing, spacing * spacing * spacing
-        mass = (bulk + 4.0 / 3.0 * mu) * volume
-        origin = vec3(ox, oy, oz)
-        clear_grid(grid)
-        particles_to_grid(x, v, c, e, grid, origin, cell, mass, volume, mu, bulk, limit, dt, health)
-        for i in range(grid.shape[0]):
-            for j in range(grid.shape[1]):
-                for k in range(grid.shape[2]):
-                    q = grid[i, j, k]
-                    if q[3] > 0.0:
-                        grid[i, j, k] = vec4(keep_x * q[0] / q[3], keep_y * q[1] / q[3], keep_z * q[2] / q[3], q[3])
-        grid_to_particles(x, v, c, e, grid, origin, cell, dt, health)
+    for _ in range(counts[0, STEPS]):
+        for part in range(PARTS):
+            clear_masses(0, part, masses, counts)
+            particles_to_grid(0, part, points, rates, strains, masses, facts, counts, partial)
+        plane = counts[0, GRID + 1] * counts[0, GRID + 2]
+        for i in range(counts[0, GRID]):
+            for node in range(i * plane, (i + 1) * plane):
+                q = node_sum(0, i, node, masses, counts)
+                velocity = vec4(0.0)
+                if q[3] > 0.0:
+                    velocity = vec4(keep_x * q[0] / q[3], keep_y * q[1] / q[3], keep_z * q[2] / q[3], 0.0)
+                velocities[node] = velocity
+        for part in range(PARTS):
+            grid_to_particles(0, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
 
 
 @ti.kernel
 def gel_substeps(
-    n: ti.i32, dt: ti.f32, u: Nodes, v: Nodes, f: Nodes, h: ti.f32, mu: ti.f32, lam: ti.f32, damping: ti.f32,
-    keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32, backing: Scalars, health: Scalars,
+    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
+    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    facts: Facts, counts: Counts, work: Work, partial: Partial,
+    keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32,
 ):  # fmt: skip
     """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
     ti.loop_config(serialize=True)
-    for _ in range(n):
-        gel_forces(0, u, f, h, mu, lam, health)
-        held = gel_advance(0, u, v, f, h, lam + 2.0 * mu, damping, dt)
+    for _ in range(counts[0, STEPS]):
+        layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+        for part in range(PARTS):
+            gel_forces(
+                0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial, layers, nx, ny
+            )
+        for part in range(PARTS):
+            gel_advance(0, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+        dt, keep = facts[0, STEP], vec3(keep_x, keep_y, keep_z)
         for d in ti.static(range(3)):
-            backing[d] = held[d]
-        top = u.shape[3] - 1
-        for i in range(u.shape[1]):
-            for j in range(u.shape[2]):
-                for k in range(1, u.shape[3]):
-                    before = v[0, i, j, k]
-                    after = before * vec3(keep_x, keep_y, keep_z)
-                    if driven == 1 and k == top:
-                        after[2] = speed
-                    v[0, i, j, k] = after
-                    u[0, i, j, k] = u[0, i, j, k] + dt * (after - before)
+            for k in range(1, layers + 1):
+                for n in range((nx + 1) * (ny + 1)):
+                    before = nodes[0, 0, 1, d, k, n]
+                    after = keep[d] * before
+                    if driven == 1 and k == layers and d == 2:
+                        after = speed
+                    nodes[0, 0, 1, d, k, n] = after
+                    nodes[0, 0, 0, d, k, n] = nodes[0, 0, 0, d, k, n] + dt * (after - before)
 
 
 @ti.kernel
-def shear_points(n: ti.i32, step: ti.f32, e: Strains, tau: Strains, mu: ti.f32, bulk: ti.f32, limit: ti.f32):
+def shear_points(
+    n: ti.i32, step: ti.f32, e: Symmetric, flow: Scalars, tau: Symmetric, mu: ti.f32, bulk: ti.f32, limit: ti.f32,
+    hardening: ti.f32,
+):  # fmt: skip
     """Material points in simple shear: n increments of d(v_x)/dy, each followed by the return mapping."""
     for p in range(e.shape[0]):
         for _ in range(n):
             moved = convect(e[p], mat3([[0.0, step, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
-            elastic, stress = hencky_return(moved, mu, bulk, limit)
+            elastic, new_flow, stress = hencky_return(moved, flow[p], mu, bulk, limit, hardening)
             e[p] = elastic
+            flow[p] = new_flow
             tau[p] = stress
+
+
+class Block:
+    """What a body or a gel on its own shares with its kernel. Use one of the two below."""
+
+    def __init__(self, facts: dict[int, float], dt: float) -> None:
+        start()
+        self.facts = np.zeros((1, FACTS), np.float32)
+        self.facts[0, list(facts)] = list(facts.values())
+        self.facts[0, STEP] = dt
+        self.counts = np.zeros((1, COUNTS), np.int32)
+        self.partial = np.zeros((1, PARTS, NUMBERS), np.float32)
+        self.partial[:, :, [SMALLEST_VOLUME, SMALLEST_STEP_VOLUME]] = 1.0
+
+
+class BodyBlock(Block):
+    """A free body of particles (n, 3) [mm], no damping, time step dt [mm]."""
+
+    def __init__(self, facts: BodyFacts, points: np.ndarray, dt: float) -> None:
+        super().__init__(facts.facts(), dt)
+        self.cell = facts.cell
+        self.state = BodyState([points])
+
+    def fit(self, margin: float) -> None:
+        """Lays the grid round the particles, which may then move by margin [mm]."""
+        self.state.fit(0, self.cell, margin, self.facts, self.counts)
+
+    def advance(self, substeps: int, keep: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
+        """keep: 0 forbids motion along an axis, 1 allows it. Raises RuntimeError if a particle left the grid."""
+        self.counts[0, STEPS] = substeps
+        body_substeps(*self.state.arguments(), self.facts, self.counts, self.partial, *keep)
+        if self.partial[0, :, OFF_GRID].any():
+            raise RuntimeError("particles left the grid of a body block: fit it anew, or with a wider margin")
+
+
+class GelBlock(Block):
+    """A gel on its backing that nothing touches; damping rate [1/mm], time step dt [mm]."""
+
+    def __init__(self, facts: GelFacts, dt: float, damping: float) -> None:
+        super().__init__({**facts.facts(), GEL_DAMPING: damping}, dt)
+        self.state = GelState(facts, 1, 1)
+        self._work = np.zeros((PARTS * SLOTS, LANES), np.float32)
+        self._arguments = (*self.state.arguments(), self.facts, self.counts, self._work, self.partial)
+
+    def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:
+        """keep: as for a body; speed: of the top along z, if driven. Raises RuntimeError if an element inverts."""
+        self.counts[0, STEPS] = substeps
+        gel_substeps(*self._arguments, *keep, int(speed is not None), speed or 0.0)
+        smallest = float(self.partial[0, :, SMALLEST_VOLUME].min())
+        if not smallest > SMALLEST_STRETCH:
+            raise RuntimeError(f"an element of a gel block shrank to {smallest:.3g} of its volume: drive it less far")
+
+    @property
+    def backing(self) -> np.ndarray:
+        """Force of the gel on its backing in the last substep [N], (3,)."""
+        return self.partial[0, :, BACKING : BACKING + 3].sum(axis=0, dtype=np.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from tacsim.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Scene
 CLAY = BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=30e3)
 RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
 COURANT = 0.4
+Keep = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
 HALF_PERIODS = 4  # of a standing wave that are timed
 
 
@@ -117,31 +119,25 @@ def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str,
 
 def oedometer(element: float, repeat: int) -> list[Measurement]:
     """Confined compression by 10 %: P = mu (s - 1/s) + lambda ln(s)/s at the backing."""
-    from robot.bench.blocks import gel_substeps
-    from tacsim.physics.gel import GelState, gel_facts, gel_state
-    from tacsim.runtime import start
+    from robot.bench.blocks import GelBlock
+    from tacsim.physics.gel import gel_facts
 
-    start()
     facts = gel_facts(Gel(size=(4e-3, 4e-3, 4e-3), material=GelMaterial(poisson_ratio=0.45)), element)
     dt, stretch = COURANT * facts.spacing, 0.9
     ramp = round(0.1 * facts.thickness / (0.02 * dt))
     speed = -(1 - stretch) * facts.thickness / (ramp * dt)
     hold = round(40 * facts.thickness / dt)
-    backing, health = np.zeros(3, np.float32), np.zeros(8, np.float32)
 
-    def run() -> GelState:
-        state = gel_state(facts, 1)
-        material = (facts.spacing, facts.mu, facts.lam, 1.0 / facts.thickness)
+    def run() -> GelBlock:
+        gel = GelBlock(facts, dt, 1.0 / facts.thickness)
         for count, rate in ((ramp, speed), (hold, 0.0)):
-            gel_substeps(
-                count, dt, state.u, state.v, state.f, *material, 0.0, 0.0, 1.0, 1, rate, backing, health
-            )  # fmt: skip
-        return state
+            gel.advance(count, (0.0, 0.0, 1.0), rate)
+        return gel
 
-    timing, state = timed(run, repeat)
-    reached = 1 + float(state.u[0, :, :, -1, 2].mean()) / facts.thickness
+    timing, gel = timed(run, repeat)
+    reached = 1 + float(gel.state.u[0, 0, :, :, -1, 2].mean()) / facts.thickness
     stress = facts.mu * (reached - 1 / reached) + facts.lam * math.log(reached) / reached
-    pressure = float(backing[2]) / (facts.elements[0] * facts.elements[1] * facts.spacing**2)
+    pressure = float(gel.backing[2]) / (facts.elements[0] * facts.elements[1] * facts.spacing**2)
     error = abs(abs(pressure / stress) - 1) * 100
     figures = {"stretch": reached, "pressure_mpa": abs(pressure)}
     return [Measurement(timing, error, "%", "neo-Hookean closed form", "shortened by 10 %", ramp + hold, figures)]
@@ -158,16 +154,16 @@ def simple_shear(repeat: int) -> list[Measurement]:
     steps, increment, points = 250, 2e-3, 64_000
 
     def run() -> NDArray[np.float32]:
-        strain, tau = np.zeros((points, 6), np.float32), np.zeros((points, 6), np.float32)
-        shear_points(steps, increment, strain, tau, facts.mu, facts.bulk, facts.limit)
+        strain, flow, tau = (np.zeros(shape, np.float32) for shape in ((points, 6), points, (points, 6)))
+        shear_points(steps, increment, strain, flow, tau, facts.mu, facts.bulk, facts.limit, facts.hardening)
         return tau
 
     timing, tau = timed(run, repeat)
-    b, exact = np.eye(3), np.zeros((3, 3))
+    b, flow, exact = np.eye(3), np.zeros(()), np.zeros((3, 3))
     f = np.eye(3)
     f[0, 1] = increment
     for _ in range(steps):
-        b, exact = reference.hencky_return(f @ b @ f.T, facts.mu, facts.bulk, facts.limit)
+        b, flow, exact = reference.hencky_return(f @ b @ f.T, flow, facts.mu, facts.bulk, facts.limit, facts.hardening)
     radius = 2 * facts.mu * facts.limit  # sigma_y
     closed = radius / math.sqrt(2)
     off = float(np.abs(full(tau.astype(np.float64)) - exact).max()) / radius * 100
@@ -184,31 +180,26 @@ def simple_shear(repeat: int) -> list[Measurement]:
 
 def gel_wave(element: float, repeat: int) -> list[Measurement]:
     """Standing quarter wave in a layer, pressure and shear: frequency c / 4H."""
-    from robot.bench.blocks import gel_substeps
-    from tacsim.physics.gel import gel_facts, gel_state
-    from tacsim.runtime import start
+    from robot.bench.blocks import GelBlock
+    from tacsim.physics.gel import gel_facts
 
-    start()
     facts = gel_facts(Gel(size=(4e-3, 4e-3, 4e-3), material=GelMaterial(poisson_ratio=0.45)), element)
     dt, height = COURANT * facts.spacing, facts.thickness
     depth = np.arange(facts.elements[2] + 1) * facts.spacing
     shape = np.sin(np.pi * depth / (2 * height))
-    backing, health = np.zeros(3, np.float32), np.zeros(8, np.float32)
     rows = []
     for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(facts.mu / facts.density))):
-        keep = [float(d == axis) for d in range(3)]
+        keep = (float(axis == 0), 0.0, float(axis == 2))
         count = math.ceil((HALF_PERIODS + 1) * 2 * height / (speed * dt))
 
-        def run(axis: int = axis, keep: list[float] = keep, count: int = count) -> FloatArray:
-            state = gel_state(facts, 1)
-            state.v[0, ..., axis] = 1e-3 * shape
+        def run(axis: int = axis, keep: Keep = keep, count: int = count) -> FloatArray:
+            gel = GelBlock(facts, dt, 0.0)
+            velocity = gel.state.v[0, 0, ..., axis]
+            velocity[:] = 1e-3 * shape
             heard = np.empty(count)
             for step in range(count):
-                heard[step] = state.v[0, 1, 1, :, axis] @ shape
-                gel_substeps(
-                    1, dt, state.u, state.v, state.f, facts.spacing, facts.mu, facts.lam, 0.0, *keep, 0, 0.0,
-                    backing, health,
-                )  # fmt: skip
+                heard[step] = velocity[1, 1] @ shape
+                gel.advance(1, keep)
             return heard
 
         timing, heard = timed(run, repeat)
@@ -218,34 +209,29 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
 
 def body_wave(spacing: float, repeat: int) -> list[Measurement]:
     """Standing half wave in a free block, other directions held: frequency c / 2L."""
-    from robot.bench.blocks import body_substeps
-    from tacsim.physics.plasticine import body_facts, body_state, fit_grid
-    from tacsim.runtime import start
+    from robot.bench.blocks import BodyBlock
+    from tacsim.physics.plasticine import body_facts
     from tacsim.shapes import particles
 
-    start()
     facts = body_facts(BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45), spacing)
     dt, length = COURANT * facts.cell, 8.0
     rest = particles(Box(size=(4e-3, 4e-3, 8e-3)), spacing) * 1e3
     phase = np.pi * (rest[:, 2] - rest[:, 2].min() + facts.spacing / 2) / length
-    origin, shape = fit_grid(rest, facts.cell, 2 * facts.cell)
     rows = []
     for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(facts.mu / facts.density))):
-        keep = [float(d == axis) for d in range(3)]
+        keep = (float(axis == 0), 0.0, float(axis == 2))
         count = math.ceil((HALF_PERIODS + 1) * length / (speed * dt))
 
-        def run(axis: int = axis, keep: list[float] = keep, count: int = count) -> FloatArray:
-            state, grid = body_state(rest), np.zeros((*shape, 4), np.float32)
-            health = np.zeros(8, np.float32)
-            state.v[:, axis] = 1e-3 * np.cos(phase)
-            state.c[:, axis, 2] = -1e-3 * np.pi / length * np.sin(phase)
+        def run(axis: int = axis, keep: Keep = keep, count: int = count) -> FloatArray:
+            body = BodyBlock(facts, rest, dt)
+            body.fit(2 * facts.cell)
+            velocity = body.state.v()[:, axis]
+            velocity[:] = 1e-3 * np.cos(phase)
+            body.state.c()[:, axis, 2] = -1e-3 * np.pi / length * np.sin(phase)
             heard = np.empty(count)
             for step in range(count):
-                heard[step] = state.v[:, axis] @ np.cos(phase)
-                body_substeps(
-                    1, dt, state.x, state.v, state.c, state.e, grid, *map(float, origin), facts.spacing,
-                    facts.mu, facts.bulk, facts.limit, *keep, health,
-                )  # fmt: skip
+                heard[step] = velocity @ np.cos(phase)
+                body.advance(1, keep)
             return heard
 
         timing, heard = timed(run, repeat)
@@ -271,41 +257,32 @@ def _wave_row(timing: Timing, found: float, truth: float, variant: str, count: i
 
 def momentum(repeat: int) -> list[Measurement]:
     """A free body that spins, stretches and yields over 5,000 substeps."""
-    from robot.bench.blocks import body_substeps
-    from tacsim.physics.plasticine import BodyState, body_facts, body_state, fit_grid
-    from tacsim.runtime import start
+    from robot.bench.blocks import BodyBlock
+    from tacsim.physics.plasticine import body_facts
     from tacsim.shapes import particles
 
-    start()
     spacing, steps, batch = 0.5e-3, 5000, 20
     facts = body_facts(CLAY, spacing)
     dt = COURANT * facts.cell
     rest = particles(Box(size=(4e-3, 3e-3, 5e-3)), spacing) * 1e3
     gradient = np.array([[0.02, -0.02, 0.0], [0.03, -0.02, 0.01], [0.0, -0.01, 0.01]]) * 0.5
     drift = np.array([0.004, -0.002, 0.003])
-    health = np.zeros(8, np.float32)
 
-    def initial() -> BodyState:
-        state = body_state(rest)
-        state.v[:] = rest @ gradient.T + drift
-        state.c[:] = gradient
-        return state
+    def initial() -> BodyBlock:
+        body = BodyBlock(facts, rest, dt)
+        body.state.v()[:] = rest @ gradient.T + drift
+        body.state.c()[:] = gradient
+        return body
 
-    def run() -> BodyState:
-        state, grid = initial(), np.zeros((1, 1, 1, 4), np.float32)
+    def run() -> BodyBlock:
+        body = initial()
         for _ in range(0, steps, batch):
-            reach = 2 * facts.cell + 2 * batch * dt * float(np.abs(state.v).max())
-            origin, shape = fit_grid(state.x, facts.cell, reach)
-            if grid.shape[:3] != shape:
-                grid = np.zeros((*shape, 4), np.float32)
-            body_substeps(
-                batch, dt, state.x, state.v, state.c, state.e, grid, *map(float, origin), facts.spacing,
-                facts.mu, facts.bulk, facts.limit, 1.0, 1.0, 1.0, health,
-            )  # fmt: skip
-        return state
+            body.fit(2 * facts.cell + 2 * batch * dt * float(np.abs(body.state.v()).max()))
+            body.advance(batch)
+        return body
 
-    timing, state = timed(run, repeat)
-    before, after = momenta(initial(), facts.cell), momenta(state, facts.cell)
+    timing, body = timed(run, repeat)
+    before, after = (momenta(b.x(), b.v(), b.c(), facts.cell) for b in (initial().state, body.state))
     linear, angular = (float(np.linalg.norm(b - a) / scale) for a, b, scale in zip(
         before[:2], after[:2], before[2:], strict=True))  # fmt: skip
     return [
@@ -314,12 +291,14 @@ def momentum(repeat: int) -> list[Measurement]:
     ]  # fmt: skip
 
 
-def momenta(state: object, cell: float) -> tuple[FloatArray, FloatArray, float, float]:
-    """Linear and angular momentum of particles of mass 1, the affine part included, and their scales.
+def momenta(
+    x: NDArray[Any], v: NDArray[Any], c: NDArray[Any], cell: float
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Linear and angular momentum of particles (n) of mass 1, the affine part included, and their scales.
 
     L = sum x cross v + dx^2/4 skew(C) (Jiang et al. 2015, eq. 10); the scales are sum |v| and sum |x - mean| |v|.
     """
-    x, v, c = (np.asarray(getattr(state, name), np.float64) for name in ("x", "v", "c"))
+    x, v, c = (np.asarray(a, np.float64) for a in (x, v, c))
     skew = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=1)
     angular = (np.cross(x, v) + cell**2 / 4 * skew).sum(axis=0)
     speed = np.linalg.norm(v, axis=1)

@@ -126,6 +126,11 @@ class GelState:
         """Velocity, (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
         return self._view(1)
 
+    @property
+    def f(self) -> np.ndarray:
+        """Force on the nodes in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
+        return self._view(2)
+
     def refresh(self) -> None:
         """The skin from the nodes, and zeros behind the last node: before a launch, since nodes may have been written.
 

@@ -117,10 +117,23 @@ def logarithm(a):
 
 
 @ti.func
-def exponential_minus_identity(x):
-    """exp(x) - I by its Taylor series to 4th order; |x| <= 2k after a return, error below |x|^5 / 120."""
-    x2 = product(x, x)
-    return x + 0.5 * x2 + product(x2, x * (1.0 / 6.0) + x2 * (1.0 / 24.0))
+def exponential_minus_identity(x, norm):
+    """exp(x) - I by its Taylor series to 4th order, error below |x|^5 / 120; norm: |x|.
+
+    Large strain (norm > 0.2: stiff yield, or long hardening) is halved first: exp(x) = exp(x / 2^n)^(2^n), n <= 4.
+    """
+    halvings = 0
+    small = norm
+    for _ in range(4):
+        if small > 0.2:
+            small *= 0.5
+            halvings += 1
+    y = (small / norm) * x
+    y2 = product(y, y)
+    y = y + 0.5 * y2 + product(y2, y * (1.0 / 6.0) + y2 * (1.0 / 24.0))
+    for _ in range(halvings):
+        y = 2.0 * y + product(y, y)
+    return y
 
 
 @ti.func
@@ -144,7 +157,7 @@ def hencky_return(e, flow, mu, bulk, limit, hardening):
         gamma = (norm - now) / (1.0 + ROOT * hardening)
         new_flow = flow + ROOT * gamma
         strain *= (norm - gamma) / norm
-        growth = exponential_minus_identity(2.0 * strain)
+        growth = exponential_minus_identity(2.0 * strain, 2.0 * (norm - gamma))
         excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
         volume = (1.0 - excess / 3.0) / shrink
         elastic = plus_identity(growth * volume, volume - 1.0)

@@ -88,7 +88,7 @@ def body_facts(material: BodyMaterial, spacing: float, volume: float | None = No
     limit = material.elastic_limit
     return BodyFacts(
         spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC,
-        (spacing**3 if volume is None else volume) * MM**3,
+        (spacing**3 if volume is None else volume) * MM**3, material.hardening,
     )  # fmt: skip
 
 

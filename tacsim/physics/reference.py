@@ -8,20 +8,26 @@ from numpy.typing import NDArray
 Matrix = NDArray[np.float64]
 
 
-def hencky_return(b: Matrix, mu: float, bulk: float, limit: float) -> tuple[Matrix, Matrix]:
-    """Von Mises return mapping on the Hencky strain of b (..., 3, 3), by eigenvalues.
+def hencky_return(
+    b: Matrix, flow: Matrix, mu: float, bulk: float, limit: float, hardening: float
+) -> tuple[Matrix, Matrix, Matrix]:
+    """Von Mises return mapping on the Hencky strain of b (..., 3, 3), by eigenvalues; linear isotropic hardening.
 
-    Returns the elastic left Cauchy-Green tensor after the return and the Kirchhoff stress, both (..., 3, 3).
+    flow: (...) equivalent plastic strain so far: |dev strain| stays below limit + hardening * flow (Simo & Hughes 1998,
+    box 3.1). Returns the elastic left Cauchy-Green tensor after the return (..., 3, 3), the new flow (...), and the
+    Kirchhoff stress (..., 3, 3).
     """
     values, axes = np.linalg.eigh(b)
     strain = 0.5 * np.log(values)  # principal Hencky strains
     mean = strain.mean(axis=-1, keepdims=True)
     deviator = strain - mean
-    norm = np.linalg.norm(deviator, axis=-1, keepdims=True)
-    deviator = deviator * np.minimum(1.0, limit / np.maximum(norm, 1e-300))
+    norm = np.linalg.norm(deviator, axis=-1)
+    root = np.sqrt(2.0 / 3.0)
+    lost = np.maximum(norm - (limit + hardening * flow), 0.0) / (1.0 + root * hardening)  # plastic strain, its norm
+    deviator = deviator * (1.0 - lost / np.maximum(norm, 1e-300))[..., None]
     stress = 2 * mu * deviator + bulk * 3 * mean
     elastic = np.exp(2 * (deviator + mean))
-    return _from_principal(elastic, axes), _from_principal(stress, axes)
+    return _from_principal(elastic, axes), np.asarray(flow + root * lost), _from_principal(stress, axes)
 
 
 def _from_principal(values: Matrix, axes: Matrix) -> Matrix:

@@ -77,13 +77,15 @@ def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
 
 
 class SeedWorld:
-    """World of a scene with a body, by the seed's scheme. Raises ValueError in a scene without a body."""
+    """World of a scene with a body, by the seed's scheme. Raises ValueError without a body, or for one that hardens."""
 
     sensors: tuple[str, ...] = ("lower", "upper")
 
     def __init__(self, scene: Scene) -> None:
         if scene.body is None:
             raise ValueError("physics 'seed' simulates a body between two gels; this scene has none (use 'hybrid')")
+        if scene.body.material.hardening_modulus > 0:
+            raise ValueError("physics 'seed' has no hardening (use 'hybrid', or leave out hardening_modulus)")
         start()
         self.scene = scene
         h = scene.spacing * MM

@@ -9,19 +9,22 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tacsim.physics import material, reference
+from tacsim.physics.plasticine import BodyFacts, body_facts
 from tacsim.runtime import start, ti
 from tacsim.scene import BodyMaterial, lame
 
 MU, BULK = 0.172, 1.67
 Strains = ti.types.ndarray(dtype=material.vec6, ndim=1)
+Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Matrices = ti.types.ndarray(dtype=material.mat3, ndim=1)
 
 
 @ti.kernel
-def return_all(e: Strains, tau: Strains, mu: ti.f32, bulk: ti.f32, limit: ti.f32):
+def return_all(e: Strains, flow: Scalars, tau: Strains, mu: ti.f32, bulk: ti.f32, limit: ti.f32, hardening: ti.f32):
     for p in range(e.shape[0]):
-        elastic, stress = material.hencky_return(e[p], mu, bulk, limit)
+        elastic, new_flow, stress = material.hencky_return(e[p], flow[p], mu, bulk, limit, hardening)
         e[p] = elastic
+        flow[p] = new_flow
         tau[p] = stress
 
 
@@ -48,19 +51,43 @@ def random_b(count: int, size: float, seed: int = 0) -> np.ndarray:
     return np.einsum("nik,nk,njk->nij", axes, np.exp(2 * strain), axes)
 
 
-def run(b: np.ndarray, limit: float, mu: float = MU, bulk: float = BULK) -> tuple[np.ndarray, np.ndarray]:
+def returned(
+    b: np.ndarray, flow: np.ndarray, limit: float, hardening: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Elastic b, equivalent plastic strain and stress after one return."""
     start()
     e = np.ascontiguousarray(six(b - np.eye(3)), np.float32)
+    flow = np.array(flow, np.float32)
     tau = np.zeros_like(e)
-    return_all(e, tau, mu, bulk, limit)
-    return full(e.astype(float)) + np.eye(3), full(tau.astype(float))
+    return_all(e, flow, tau, MU, BULK, limit, hardening)
+    return full(e.astype(float)) + np.eye(3), flow.astype(float), full(tau.astype(float))
+
+
+def run(b: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Without hardening."""
+    b_new, _, tau = returned(b, np.zeros(len(b)), limit, 0.0)
+    return b_new, tau
+
+
+def drive(facts: BodyFacts, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stress (n, 3, 3) and equivalent plastic strain (n,) of one material point after each of the increments d of
+    deformation (n, 3, 3)."""
+    start()
+    e, flow, tau = np.zeros((1, 6), np.float32), np.zeros(1, np.float32), np.zeros((1, 6), np.float32)
+    stresses, flows = [], []
+    for d in steps.astype(np.float32):
+        convect_all(e, d[None])
+        return_all(e, flow, tau, facts.mu, facts.bulk, facts.limit, facts.hardening)
+        stresses.append(full(tau[0].astype(float)))
+        flows.append(float(flow[0]))
+    return np.array(stresses), np.array(flows)
 
 
 @pytest.mark.parametrize(("size", "tolerance"), [(1e-3, 2e-6), (0.05, 2e-6), (0.2, 5e-6), (0.6, 2e-4)])
 def test_elastic_stress_matches_the_reference(size: float, tolerance: float) -> None:
     b = random_b(500, size)
     _, tau = run(b, 1e9)
-    _, truth = reference.hencky_return(b, MU, BULK, math.inf)
+    _, _, truth = reference.hencky_return(b, np.zeros(len(b)), MU, BULK, math.inf, 0.0)
     assert np.abs(tau - truth).max() < tolerance * np.abs(truth).max()
 
 
@@ -68,7 +95,7 @@ def test_elastic_stress_matches_the_reference(size: float, tolerance: float) -> 
 def test_return_lands_on_the_yield_surface_and_keeps_volume(limit: float) -> None:
     b = random_b(500, 0.4)
     b_new, tau = run(b, limit)
-    b_truth, tau_truth = reference.hencky_return(b, MU, BULK, limit)
+    b_truth, _, tau_truth = reference.hencky_return(b, np.zeros(len(b)), MU, BULK, limit, 0.0)
     deviator = tau - np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     assert np.linalg.norm(deviator, axis=(1, 2)).max() <= 2 * MU * limit * (1 + 1e-4) + 1e-6
     assert np.abs(np.linalg.det(b_new) / np.linalg.det(b) - 1).max() < 3e-5
@@ -152,3 +179,73 @@ def test_yield_norms() -> None:
     mu, _ = lame(uniaxial)
     deviator = 2 * mu * uniaxial.elastic_limit  # |dev tau|_F at yield = sqrt(2/3) sigma
     assert deviator * math.sqrt(1.5) == pytest.approx(30e3)
+
+
+HARD = BodyMaterial(yield_stress=30e3, hardening_modulus=200e3)
+
+
+@pytest.mark.parametrize("hardening", [0.0, 0.05, 1.0])
+def test_hardening_matches_the_reference(hardening: float) -> None:
+    b = random_b(500, 0.4)
+    flow = np.random.default_rng(4).uniform(0.0, 0.5, 500)
+    b_new, flow_new, tau = returned(b, flow, 0.05, hardening)
+    b_truth, flow_truth, tau_truth = reference.hencky_return(b, flow, MU, BULK, 0.05, hardening)
+    assert (flow_truth > flow).sum() > 100  # some yield
+    if hardening == 1.0:
+        assert (flow_truth == flow).sum() > 100  # and some have hardened enough not to
+    assert np.abs(flow_new - flow_truth).max() < 3e-5
+    assert np.abs(tau - tau_truth).max() < 3e-4 * np.abs(tau_truth).max()
+    assert np.abs(b_new - b_truth).max() < 3e-4
+
+
+def test_uniaxial_yield_stress_grows_with_the_plastic_strain() -> None:
+    """Isochoric tension by eps, then back: sigma = sigma_y + H p, with p from 3 mu (eps - p) = sigma (Simo & Hughes
+    1998, section 1.2); isotropic hardening resists the way back as much."""
+    facts = body_facts(HARD, 1e-3)
+    rate, count = 2e-3, 100
+    there = np.diag([np.expm1(rate), np.expm1(-rate / 2), np.expm1(-rate / 2)])
+    back = np.diag([np.expm1(-rate), np.expm1(rate / 2), np.expm1(rate / 2)])
+    tau, flow = drive(facts, np.array([there] * count + [back] * 2 * count))
+    stress = tau[:, 0, 0] - tau[:, 1, 1]
+    yield_stress, modulus = 30e-3, 200e-3  # [MPa]
+    strain = rate * np.arange(1, count + 1)
+    plastic = np.maximum(0.0, (3 * facts.mu * strain - yield_stress) / (3 * facts.mu + modulus))
+    elastic = 3 * facts.mu * strain <= yield_stress
+    assert 5 < elastic.sum() < 50
+    assert flow[:count] == pytest.approx(plastic, abs=1e-5)
+    assert stress[:count] == pytest.approx(np.where(elastic, 3 * facts.mu * strain, yield_stress + modulus * plastic),
+                                           rel=1e-4)  # fmt: skip
+    returning = stress[count:] < 0
+    yielding = np.diff(flow, prepend=0.0)[count:] > 0
+    assert yielding.sum() > 20
+    assert (returning | ~yielding).all()
+    grown = -(yield_stress + modulus * flow[count:])
+    assert stress[count:][yielding] == pytest.approx(grown[yielding], rel=1e-4)
+    assert (stress[count:] >= grown * (1 + 1e-4)).all()
+
+
+def test_shear_stress_grows_with_the_plastic_strain() -> None:
+    """Simple shear by g: sqrt 3 tau = sigma_y + H p with sqrt 3 p = g - tau / mu, for small elastic strain."""
+    facts = body_facts(HARD, 1e-3)
+    step, count = 1e-3, 200
+    d = np.zeros((3, 3))
+    d[0, 1] = step
+    tau, flow = drive(facts, np.array([d] * count))
+    shear = step * count
+    yield_stress, modulus = 30e-3, 200e-3  # [MPa]
+    plastic = (math.sqrt(3) * shear * facts.mu - yield_stress) / (3 * facts.mu + modulus)
+    norm = np.linalg.norm(deviator(tau), axis=(1, 2))
+    # to the digit: the yield surface grows with the plastic strain, whatever else finite shear does
+    yielding = np.diff(flow, prepend=0.0) > 0
+    grown = math.sqrt(2 / 3) * (yield_stress + modulus * flow)
+    assert norm[yielding] == pytest.approx(grown[yielding], rel=1e-4)
+    assert flow[-1] == pytest.approx(plastic, rel=0.02)
+    assert tau[-1, 0, 1] == pytest.approx((yield_stress + modulus * plastic) / math.sqrt(3), rel=0.02)
+
+
+@pytest.mark.parametrize("norm", ["uniaxial", "frobenius"])
+def test_the_hardening_modulus_is_that_of_the_uniaxial_yield_stress(norm: str) -> None:
+    """2 mu (k + growth p) = |dev tau| = sqrt(2/3) (sigma_y + H p), however the first yield stress is meant."""
+    facts = body_facts(HARD.model_copy(update={"yield_norm": norm}), 1e-3)
+    assert 2 * facts.mu * facts.hardening == pytest.approx(math.sqrt(2 / 3) * 0.2)
+    assert body_facts(BodyMaterial(yield_stress=30e3), 1e-3).hardening == 0.0

@@ -251,3 +251,10 @@ def test_a_second_scene_compiles_nothing():
     compiled = len(advance._primal.compiled_kernels)
     SeedWorld(scene().model_copy(update={"particle_spacing": 0.4e-3})).move({})
     assert len(advance._primal.compiled_kernels) == compiled == 1
+
+
+def test_a_body_that_hardens_is_refused() -> None:
+    """Also where nobody has validated the scene."""
+    hard = Body(material=BodyMaterial(yield_stress=30e3, hardening_modulus=1e5))
+    with pytest.raises(ValueError, match="physics 'seed' has no hardening"):
+        SeedWorld(scene().model_copy(update={"body": hard}))

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from tacsim.optics.geometry import CanonicalGrid
-from tacsim.scene import BodyMaterial, Box, GelMaterial, Scene, Sphere
+from tacsim.scene import Body, BodyMaterial, Box, GelMaterial, Scene, Sphere
 
 
 @pytest.mark.parametrize(
@@ -45,3 +45,33 @@ def test_sizes_beyond_what_touches_a_gel_are_refused() -> None:
             Box(size=(1e-2, size, 1e-2))
         with pytest.raises(ValidationError, match="pitch"):
             CanonicalGrid(pitch=size)
+
+
+def test_only_a_body_that_yields_can_harden() -> None:
+    assert BodyMaterial(yield_stress=30e3, hardening_modulus=1e5).hardening_modulus == 1e5
+    assert BodyMaterial(yield_strain=0.05, hardening_modulus=1e5).hardening > 0.0
+    assert BodyMaterial(hardening_modulus=0.0).hardening == 0.0
+    with pytest.raises(ValidationError, match=r"hardening_modulus 100000 Pa without a yield.*give yield_stress"):
+        BodyMaterial(hardening_modulus=1e5)
+    with pytest.raises(ValidationError, match="hardening_modulus"):
+        BodyMaterial(yield_stress=30e3, hardening_modulus=-1.0)
+
+
+def test_the_hardening_modulus_is_read_with_its_unit() -> None:
+    values = {"body": {"material": {"yield_stress": "30 kPa", "hardening_modulus": "0.2 MPa"}}}
+    body = Scene.model_validate(values).body
+    assert body is not None
+    assert body.material.hardening_modulus == pytest.approx(2e5)
+
+
+def test_hardening_grows_the_limit_as_the_uniaxial_yield_stress() -> None:
+    """A material whose yield stress is already that after p = 0.3 has the limit to which the other one grows."""
+    soft = BodyMaterial(yield_stress=30e3, hardening_modulus=1e5)
+    grown = BodyMaterial(yield_stress=30e3 + 0.3 * 1e5)
+    assert soft.elastic_limit + 0.3 * soft.hardening == pytest.approx(grown.elastic_limit)
+
+
+def test_the_seed_scheme_refuses_a_body_that_hardens() -> None:
+    body = Body(material=BodyMaterial(yield_stress=30e3, hardening_modulus=1e5))
+    with pytest.raises(ValidationError, match="physics 'seed' has no hardening; use physics 'hybrid'"):
+        Scene(physics="seed", body=body)

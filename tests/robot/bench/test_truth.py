@@ -7,7 +7,6 @@ import pytest
 
 from robot.bench import limit, materials, press, tacchi, textbook
 from robot.bench.materials import half_period, momenta, uniaxial_stress
-from tacsim.physics.plasticine import BodyState
 from tacsim.scene import GelSurface
 
 
@@ -67,8 +66,7 @@ def test_angular_momentum_counts_the_affine_part() -> None:
     x = np.random.default_rng(0).normal(size=(50, 3))
     w = np.array([0.1, -0.2, 0.3])
     spin = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-    state = BodyState(x, x @ spin.T, np.tile(spin, (50, 1, 1)), np.zeros((50, 6)))
-    linear, angular, _, _ = momenta(state, 0.7)
+    linear, angular, _, _ = momenta(x, x @ spin.T, np.tile(spin, (50, 1, 1)), 0.7)
     assert linear == pytest.approx((x @ spin.T).sum(0))
     assert angular == pytest.approx(np.cross(x, x @ spin.T).sum(0) + 50 * 0.7**2 / 2 * w)
 

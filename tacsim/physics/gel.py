@@ -10,7 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, anchor, first_of, keep_or, padded, real, vec4
-from tacsim.physics.layout import BACKING, GEL_DAMPING, GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING, NEVER, SMALLEST_VOLUME, STEP
+from tacsim.physics.layout import (
+    BACKING,
+    GEL_DAMPING,
+    GEL_DENSITY,
+    GEL_LAMBDA,
+    GEL_MU,
+    GEL_SPACING,
+    NEVER,
+    SMALLEST_VOLUME,
+    STEP,
+)
 from tacsim.physics.material import lanes_log1p
 from tacsim.runtime import ti
 from tacsim.scene import Gel, GelSurface, lame
@@ -50,7 +60,6 @@ class GelFacts:
     @property
     def half(self) -> tuple[float, float]:
         return self.elements[0] * self.spacing / 2, self.elements[1] * self.spacing / 2
-
 
     def facts(self) -> dict[int, float]:
         """Entries of the array `facts` (tacsim.physics.layout)."""
@@ -182,13 +191,14 @@ def cross(a, b):
 @ti.func
 def element_block(
     env, part, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(),
-    nij: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(), work: ti.template(), never,
+    nij: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(), work: ti.template(),
+    never,
 ):  # fmt: skip
     """Forces of LANES elements on their corners. Returns det F.
 
-    u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to: where
-    the forces go, `row` the way to the next corner or axis. One-point quadrature and hourglass stiffness (Flanagan &
-    Belytschko 1981, modes of the cube).
+    u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
+    where the forces go, `row` the way to the next corner or axis. One-point quadrature and hourglass stiffness
+    (Flanagan & Belytschko 1981, modes of the cube).
     """
     h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
     whole = lattice[block]
@@ -271,8 +281,8 @@ def gel_forces(
         if k < layers:
             for block in range(ti.max(first - halo, 0), last):
                 jacobian = element_block(
-                    env, part, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj, ni,
-                    nij, c0, lattice, facts, work, never,
+                    env, part, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj,
+                    ni, nij, c0, lattice, facts, work, never,
                 )  # fmt: skip
                 smallest = ti.min(smallest, jacobian)
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)

@@ -28,10 +28,31 @@ from tacsim.physics.gel import (
 from tacsim.physics.health import Health, attempt, require_room, retried
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, first_of, vec3, vec4
 from tacsim.physics.layout import (
-    BACKING, BODY_BULK, BODY_CELL, BODY_DAMPING, BODY_HARDENING, BODY_LIMIT, BODY_MASS, BODY_MU, BODY_VOLUME, CAPACITY, COUNTS,
-    FACTS, FORCE, FRICTION, GEL_DAMPING, GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING, GRAVITY, GRID, HOUSING,
-    LIGHTNESS, MOTION, NUMBERS, ORIGIN, OVERLAP, PARTICLES, STEP, STEPS, STIFFNESS, STRIDE,
+    BACKING,
+    BODY_CELL,
+    BODY_DAMPING,
+    BODY_MASS,
+    CAPACITY,
+    COUNTS,
+    FACTS,
+    FORCE,
+    FRICTION,
+    GEL_DAMPING,
+    GRAVITY,
+    GRID,
+    HOUSING,
+    LIGHTNESS,
+    MOTION,
+    NUMBERS,
+    ORIGIN,
+    OVERLAP,
+    PARTICLES,
+    STEP,
+    STEPS,
+    STIFFNESS,
+    STRIDE,
 )  # fmt: skip
+from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.plasticine import (
     BodyState,
     Masses,
@@ -47,7 +68,6 @@ from tacsim.physics.plasticine import (
     particles_to_grid,
 )
 from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
-from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
@@ -133,8 +153,8 @@ def grid_update(
 @ti.func
 def touch_gel(
     env, part, g, it, drive: ti.template(), points: ti.template(), planes: ti.template(), rates: ti.template(),
-    memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
-    layers, nx, ny,
+    memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(),
+    partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes."""
     rotate = rotation(drive, env, it, g)
@@ -175,7 +195,8 @@ def substeps(
     team: ti.i32, drive: Drive,
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums, memory: ContactMemory,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities,
+    sums: Sums, memory: ContactMemory,
     facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
@@ -205,14 +226,14 @@ def substeps(
                 meet(sync, env, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(
-                        env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny
-                    )
+                    gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
                 meet(sync, env, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    grid_to_particles(env, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
+                    grid_to_particles(
+                        env, part, points, planes, rates, strains, velocities, sums, facts, counts, partial
+                    )
 
 
 class HybridWorld:
@@ -250,9 +271,9 @@ class HybridWorld:
         facts = {
             **self._gel.facts(), **self._body.facts(),
             GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
-            # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were lighter
-            # by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below the step
-            # limit.
+            # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were
+            # lighter by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
+            # the step limit.
             LIGHTNESS: max(1.0, height * MM / self._body.spacing),
             STIFFNESS: reduced / self._dt**2,
             FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],

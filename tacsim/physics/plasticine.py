@@ -73,7 +73,6 @@ class BodyFacts:
     def particle_mass(self) -> float:
         return self.density * self.volume
 
-
     def facts(self) -> dict[int, float]:
         """Entries of the array `facts` (tacsim.physics.layout)."""
         return {

@@ -28,11 +28,23 @@ from tacsim.physics.hybrid import COURANT, ZETA_GEL, Drive
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3
 from tacsim.physics.layout import (
-    BACKING, COUNTS, FACTS, FORCE, FRICTION, GEL_DAMPING, KIND, NUMBERS, SHAPE, SHAPE_ORIGIN, SHAPE_SPACING, STEP,
-    STEPS, STIFFNESS,
+    BACKING,
+    COUNTS,
+    FACTS,
+    FORCE,
+    FRICTION,
+    GEL_DAMPING,
+    KIND,
+    NUMBERS,
+    SHAPE,
+    SHAPE_ORIGIN,
+    SHAPE_SPACING,
+    STEP,
+    STEPS,
+    STIFFNESS,
 )  # fmt: skip
-from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.load import keep_loads, require_loads
+from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
@@ -64,9 +76,7 @@ def press_substeps(
                 for share in range(shares(member, team)):
                     part = member + share * team
                     clear_touch(env, part, 1, touch)
-                    indent(
-                        env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny
-                    )
+                    indent(env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
                     gel_forces(
                         env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
                         layers, nx, ny,
@@ -74,9 +84,7 @@ def press_substeps(
                 meet(sync, env, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(
-                        env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny
-                    )
+                    gel_advance(env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                 meet(sync, env, team, 2 * it + 2)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.physics.load import LoadNotReached
+from tacsim.physics.load import LEAST, LoadNotReached
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import World, make_world
 from tacsim.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere

@@ -34,7 +34,7 @@ def start(arch: str = DEVICE, threads: int | None = None) -> str:
         options = {} if threads is None else {"cpu_max_num_threads": threads}
         # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
         with contextlib.redirect_stdout(io.StringIO()):
-            # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast: LLVM's do.
+            # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
             ti.init(
                 arch=getattr(ti, arch), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
                 log_level=ti.ERROR, **options,

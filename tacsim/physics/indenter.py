@@ -107,12 +107,8 @@ def indent(
     kind, size = counts[env, KIND], vec3(facts[env, SHAPE], facts[env, SHAPE + 1], facts[env, SHAPE + 2])
     grid_origin = vec3(facts[env, SHAPE_ORIGIN], facts[env, SHAPE_ORIGIN + 1], facts[env, SHAPE_ORIGIN + 2])
     grid_spacing = facts[env, SHAPE_SPACING]
-    rotate = ti.Matrix.rows(
-        [vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(3)]
-    )
-    centre = vec3(drive[env, it, 0, 3, 0], drive[env, it, 0, 3, 1], drive[env, it, 0, 3, 2])
-    velocity = vec3(drive[env, it, 0, 4, 0], drive[env, it, 0, 4, 1], drive[env, it, 0, 4, 2])
-    spin = vec3(drive[env, it, 0, 5, 0], drive[env, it, 0, 5, 1], drive[env, it, 0, 5, 2])
+    rows = [vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(6)]
+    rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
     area = h * h / (POINTS * POINTS)
     c_n = CONTACT_DAMPING * k_n * dt
     back = rotate.transpose()

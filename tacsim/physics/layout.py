@@ -1,4 +1,4 @@
-"""Where each number stands in the small arrays that kernels share with their worlds. Units: mm, N, MPa, wave speed 1."""
+"""Where each number stands in the small arrays that kernels share with worlds. Units: mm, N, MPa, wave speed 1."""
 
 # facts (environments, FACTS) float32: constants of one environment
 STEP = 0  # time step [mm]

@@ -273,7 +273,7 @@ def node_sum(env, i, node, masses: ti.template(), counts: ti.template()):
 
 @ti.func
 def moved_plane(plane, x, y, z, dt):
-    """A tangent plane of the body's surface goes with the material, as F^-T does: m' = -C^T m; x, y, z: columns of C."""
+    """A tangent plane of the surface goes with the material, as F^-T does: m' = -C^T m; x, y, z: columns of C."""
     return plane - dt * vec4(x.dot(plane), y.dot(plane), z.dot(plane), 0.0)
 
 

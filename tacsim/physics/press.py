@@ -67,7 +67,7 @@ def press_substeps(
     slip: Slip, pressure: Pressure, values: Values,
     facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
-    """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter in the sensor frame."""
+    """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
     for task in range(drive.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
             env, member = task // CHUNK // team, task // CHUNK % team

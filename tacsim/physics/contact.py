@@ -101,12 +101,12 @@ def particle_contact(
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
     x, v: position, and velocity relative to the moving sensor. memory: elastic slip, and the multiplier as the overlap
-    whose penalty it equals [mm]. Returns touching, force, new memory.
+    whose penalty it equals [mm]. Returns touching, whether the housing, force, new memory.
     """
     h, k_n, dt = facts[env, GEL_SPACING], facts[env, STIFFNESS], facts[env, STEP]
     mu, housing = facts[env, FRICTION + g], facts[env, HOUSING]
     deepest = facts[env, BODY_CELL]  # two particle spacings: the largest overlap answered in full
-    touching = False
+    touching, housed = False, False
     force = vec3(0.0)
     slip = vec3(memory[0], memory[1], memory[2])
     taken = memory[3]
@@ -155,10 +155,10 @@ def particle_contact(
                 taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vec3(v[0], v[1], 0.0), fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
-                touching = True
+                touching, housed = True, True
                 overlap = gap
     kept = vec4(0.0)
     if touching:
         kept = vec4(slip[0], slip[1], slip[2], taken)
         partial[env, part, OVERLAP] = ti.max(partial[env, part, OVERLAP], overlap)
-    return touching, force, kept
+    return touching, housed, force, kept

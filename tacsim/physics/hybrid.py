@@ -40,6 +40,7 @@ from tacsim.physics.layout import (
     GEL_DAMPING,
     GRAVITY,
     GRID,
+    HOUSED,
     HOUSING,
     LIGHTNESS,
     MOTION,
@@ -163,7 +164,7 @@ def touch_gel(
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
     highest, spacing = contact_ceiling(skin, env, g), 0.5 * facts[env, BODY_CELL]
     rate = facts[env, STEP] / facts[env, BODY_MASS]
-    total, moment = vec3(0.0), vec3(0.0)
+    total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
     n, origin_p = counts[env, PARTICLES], env * counts[env, STRIDE]
     for p in range(first_of(n, part, PARTS), first_of(n, part + 1, PARTS)):
         at = points[origin_p + p]
@@ -174,7 +175,7 @@ def touch_gel(
             local = back @ arm
             moving = rates[origin_p + p, 0]
             relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
-            touching, force, kept = particle_contact(
+            touching, housed, force, kept = particle_contact(
                 env, part, g, local, relative, memory[env, g, p], radius, skin, touch, facts, layers, nx, ny, partial
             )
             memory[env, g, p] = kept
@@ -183,11 +184,14 @@ def touch_gel(
                 rates[origin_p + p, 0] = moving + vec4(push[0], push[1], push[2], 0.0)
                 total -= force
                 moment -= local.cross(force)
+                if housed:
+                    on_housing -= force
         else:
             memory[env, g, p] = vec4(0.0)
     for d in ti.static(range(3)):
         partial[env, part, FORCE + 6 * g + d] = total[d]
         partial[env, part, FORCE + 6 * g + 3 + d] = moment[d]
+        partial[env, part, HOUSED + 3 * g + d] = on_housing[d]
 
 
 @ti.kernel
@@ -368,7 +372,8 @@ class HybridWorld:
         rotations = path.drive(last - 1, last)[-1, :, :3]
         sums = self._partial[0].astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
-        backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)
+        backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)  # which holds the housing too
+        backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
         return Reading(contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))

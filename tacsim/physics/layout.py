@@ -47,4 +47,5 @@ OVERLAP = 5  # largest of the last substep [mm]
 FORCE = 6  # on gel 0, gel 1: force x, y, z [N], moment x, y, z [N mm]; of the last substep
 BACKING = 18  # force of this part's gel on its backing [N], of the last substep
 MOTION = 21  # sum of the particles' velocities
-NUMBERS = 24
+HOUSED = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
+NUMBERS = 30

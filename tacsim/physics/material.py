@@ -7,6 +7,7 @@ The same laws in float64 NumPy: tacsim/physics/reference.py.
 
 from tacsim.runtime import ti
 
+vec3 = ti.types.vector(3, ti.f32)
 vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
@@ -88,10 +89,20 @@ def lanes_log1p(x):
 
 @ti.func
 def log_pade(a):
-    """log(I + a) by the [3/3] Padé approximant; relative error below 1.4e-5 for |a| up to 0.5."""
+    """log(I + a) by the [3/3] Padé approximant; relative error below 1.4e-5 for |a| up to 0.5.
+
+    The quotient N(a) / D(a) of two cubics is itself a quadratic c0 + c1 a + c2 a^2, since a^3 = I1 a^2 - I2 a + I3
+    (Cayley-Hamilton): three scalar equations in place of two matrix products and an inverse.
+    """
     a2 = product(a, a)
-    a3 = product(a2, a)
-    return product(60.0 * a + 60.0 * a2 + 11.0 * a3, inverse(plus_identity(90.0 * a + 36.0 * a2 + 3.0 * a3, 60.0)))
+    i1, i2, i3 = a[0] + a[1] + a[2], minors(a), determinant(a)
+    n = vec3(11.0 * i3, 60.0 - 11.0 * i2, 60.0 + 11.0 * i1)  # 60 a + 60 a^2 + 11 a^3 by powers 0, 1, 2
+    d0 = vec3(60.0 + 3.0 * i3, 90.0 - 3.0 * i2, 36.0 + 3.0 * i1)  # 60 + 90 a + 36 a^2 + 3 a^3
+    d1 = vec3(d0[2] * i3, d0[0] - d0[2] * i2, d0[1] + d0[2] * i1)  # the same times a
+    d2 = vec3(d1[2] * i3, d1[0] - d1[2] * i2, d1[1] + d1[2] * i1)  # times a^2
+    r0, r1, r2 = d1.cross(d2), d2.cross(d0), d0.cross(d1)  # Cramer's rule for c0 d0 + c1 d1 + c2 d2 = n
+    scale = 1.0 / d0.dot(r0)
+    return plus_identity((scale * n.dot(r1)) * a + (scale * n.dot(r2)) * a2, scale * n.dot(r0))
 
 
 @ti.func
@@ -109,16 +120,17 @@ def logarithm(a):
     """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
     scale = 1.0
     root = a
-    for _ in range(3):
-        if frobenius(root) > 0.5:
-            root = square_root(root)
-            scale *= 2.0
+    if frobenius(a) > 0.5:
+        for _ in range(3):
+            if frobenius(root) > 0.5:
+                root = square_root(root)
+                scale *= 2.0
     return scale * log_pade(root)
 
 
 @ti.func
 def exponential_minus_identity(x, norm):
-    """exp(x) - I by its Taylor series to 4th order, error below |x|^5 / 120; norm: |x|.
+    """exp(x) - I for tr x = 0, by its Taylor series to 4th order, error below |x|^5 / 120; norm: |x|.
 
     Large strain (norm > 0.2: stiff yield, or long hardening) is halved first: exp(x) = exp(x / 2^n)^(2^n), n <= 4.
     """
@@ -129,8 +141,8 @@ def exponential_minus_identity(x, norm):
             small *= 0.5
             halvings += 1
     y = (small / norm) * x
-    y2 = product(y, y)
-    y = y + 0.5 * y2 + product(y2, y * (1.0 / 6.0) + y2 * (1.0 / 24.0))
+    i2, i3 = minors(y), determinant(y)  # y^3 = -i2 y + i3, since tr y = 0
+    y = plus_identity((1.0 - i2 / 6.0 + i3 / 24.0) * y + (0.5 - i2 / 24.0) * product(y, y), i3 / 6.0)
     for _ in range(halvings):
         y = 2.0 * y + product(y, y)
     return y

@@ -192,7 +192,7 @@ def stencil(x, origin, cell, low, high, ny, nz):
     base = ti.floor(s - 0.5).cast(ti.i32)
     most = ti.Vector([high - 3, ny - 3, nz - 3])
     base = ti.max(ti.Vector([low, 0, 0]), ti.min(base, most))  # so that no index is wild; who may be off must ask
-    fx = s - base.cast(ti.f32)
+    fx = ti.select(inside, s - base.cast(ti.f32), vec3(1.0))
     w0 = 0.5 * (1.5 - fx) ** 2
     w1 = 0.75 - (fx - 1.0) ** 2
     w2 = 0.5 * (fx - 0.5) ** 2
@@ -236,29 +236,32 @@ def particles_to_grid(
     low, high = counts[env, SLAB + 2 * part], counts[env, SLAB + 2 * part + 1]
     n, stride = counts[env, PARTICLES], counts[env, STRIDE]
     base = (env * PARTS + part) * counts[env, CAPACITY]
+    lost = 0
     for p in range(env * stride + first_of(n, part, PARTS), env * stride + first_of(n, part + 1, PARTS)):
         inside, node, fx, w0, w1, w2 = stencil(points[p], origin, cell, low, high, ny, nz)
-        if not inside:
-            partial[env, part, OFF_GRID] += 1.0
-        else:
-            e, flow = strain_of(strains, p)
-            elastic, new_flow, tau = hencky_return(e, flow, mu, bulk, limit, hardening)
-            store_strain(strains, p, elastic, new_flow)
-            inertia = mass * cell
-            ax = impulse * vec4(tau[0], tau[3], tau[4], 0.0) + inertia * rates[p, 1]
-            ay = impulse * vec4(tau[3], tau[1], tau[5], 0.0) + inertia * rates[p, 2]
-            az = impulse * vec4(tau[4], tau[5], tau[2], 0.0) + inertia * rates[p, 3]
-            velocity = rates[p, 0]
-            q = mass * vec4(velocity[0], velocity[1], velocity[2], 1.0) - fx[0] * ax - fx[1] * ay - fx[2] * az
-            wx, wy, wz = vec3(w0[0], w1[0], w2[0]), vec3(w0[1], w1[1], w2[1]), vec3(w0[2], w1[2], w2[2])
-            first = base + (node[0] * ny + node[1]) * nz + node[2]
-            for i in ti.static(range(3)):
-                qi, yi, zi = wx[i] * (q + float(i) * ax), wx[i] * ay, wx[i] * az
-                for j in ti.static(range(3)):
-                    qj, zj = wy[j] * (qi + float(j) * yi), wy[j] * zi
-                    line = first + (i * ny + j) * nz
-                    for k in ti.static(range(3)):
-                        masses[line + k] = masses[line + k] + wz[k] * (qj + float(k) * zj)
+        lost += ti.select(inside, 0, 1)
+        e, flow = strain_of(strains, p)
+        elastic, new_flow, tau = hencky_return(e, flow, mu, bulk, limit, hardening)
+        store_strain(strains, p, elastic, new_flow)
+        inertia = mass * cell
+        ax = impulse * vec4(tau[0], tau[3], tau[4], 0.0) + inertia * rates[p, 1]
+        ay = impulse * vec4(tau[3], tau[1], tau[5], 0.0) + inertia * rates[p, 2]
+        az = impulse * vec4(tau[4], tau[5], tau[2], 0.0) + inertia * rates[p, 3]
+        velocity = rates[p, 0]
+        q = mass * vec4(velocity[0], velocity[1], velocity[2], 1.0) - fx[0] * ax - fx[1] * ay - fx[2] * az
+        # Who is off the grid adds nothing, and without a branch, in which the compiler would not merge lanes.
+        q, ax = ti.select(inside, q, vec4(0.0)), ti.select(inside, ax, vec4(0.0))
+        ay, az = ti.select(inside, ay, vec4(0.0)), ti.select(inside, az, vec4(0.0))
+        wx, wy, wz = vec3(w0[0], w1[0], w2[0]), vec3(w0[1], w1[1], w2[1]), vec3(w0[2], w1[2], w2[2])
+        first = base + (node[0] * ny + node[1]) * nz + node[2]
+        for i in ti.static(range(3)):
+            qi, yi, zi = wx[i] * (q + float(i) * ax), wx[i] * ay, wx[i] * az
+            for j in ti.static(range(3)):
+                qj, zj = wy[j] * (qi + float(j) * yi), wy[j] * zi
+                line = first + (i * ny + j) * nz
+                for k in ti.static(range(3)):
+                    masses[line + k] = masses[line + k] + wz[k] * (qj + float(k) * zj)
+    partial[env, part, OFF_GRID] += float(lost)
 
 
 @ti.func

@@ -163,7 +163,7 @@ class BodyState:
                 low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
                 high = min(math.ceil((float(own.max()) + margin - float(origin[0])) / cell) + 3, shape[0])
             counts[environment, SLAB + 2 * part : SLAB + 2 * part + 2] = low, high
-        nodes = math.prod(shape)
+        nodes = (shape[0] + 3) * shape[1] * shape[2]  # three planes for what particles off the grid would add
         if self.masses.shape[2] < nodes:
             nodes = nodes * 5 // 4  # a body that spreads asks for more again and again
             self.masses = np.zeros((*self.masses.shape[:2], nodes, 4), np.float32)
@@ -186,13 +186,11 @@ def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tup
 @ti.func
 def stencil(x, origin, cell, low, high, ny, nz):
     """First node of the 3x3x3 stencil, offset from it, weights by axis; `inside` is False off the slab (or NaN)."""
-    s = (vec3(x[0], x[1], x[2]) - origin) / cell
-    inside = s[0] >= low + 0.5 and s[1] >= 0.5 and s[2] >= 0.5
-    inside = inside and s[0] < high - 2.0 and s[1] < ny - 2.0 and s[2] < nz - 2.0
-    base = ti.floor(s - 0.5).cast(ti.i32)
-    most = ti.Vector([high - 3, ny - 3, nz - 3])
-    base = ti.max(ti.Vector([low, 0, 0]), ti.min(base, most))  # so that no index is wild; who may be off must ask
-    fx = ti.select(inside, s - base.cast(ti.f32), vec3(1.0))
+    s = (vec3(x[0], x[1], x[2]) - origin) * (1.0 / cell)
+    wanted = ti.floor(s - 0.5).cast(ti.i32)
+    base = ti.max(ti.Vector([low, 0, 0]), ti.min(wanted, ti.Vector([high - 3, ny - 3, nz - 3])))  # never a wild index
+    inside = wanted[0] == base[0] and wanted[1] == base[1] and wanted[2] == base[2]
+    fx = s - base.cast(ti.f32)
     w0 = 0.5 * (1.5 - fx) ** 2
     w1 = 0.75 - (fx - 1.0) ** 2
     w2 = 0.5 * (fx - 0.5) ** 2
@@ -236,6 +234,7 @@ def particles_to_grid(
     low, high = counts[env, SLAB + 2 * part], counts[env, SLAB + 2 * part + 1]
     n, stride = counts[env, PARTICLES], counts[env, STRIDE]
     base = (env * PARTS + part) * counts[env, CAPACITY]
+    dump = base + counts[env, GRID] * ny * nz  # three planes behind the grid, never read: for particles off the grid
     lost = 0
     for p in range(env * stride + first_of(n, part, PARTS), env * stride + first_of(n, part + 1, PARTS)):
         inside, node, fx, w0, w1, w2 = stencil(points[p], origin, cell, low, high, ny, nz)
@@ -249,11 +248,9 @@ def particles_to_grid(
         az = impulse * vec4(tau[4], tau[5], tau[2], 0.0) + inertia * rates[p, 3]
         velocity = rates[p, 0]
         q = mass * vec4(velocity[0], velocity[1], velocity[2], 1.0) - fx[0] * ax - fx[1] * ay - fx[2] * az
-        # Who is off the grid adds nothing, and without a branch, in which the compiler would not merge lanes.
-        q, ax = ti.select(inside, q, vec4(0.0)), ti.select(inside, ax, vec4(0.0))
-        ay, az = ti.select(inside, ay, vec4(0.0)), ti.select(inside, az, vec4(0.0))
         wx, wy, wz = vec3(w0[0], w1[0], w2[0]), vec3(w0[1], w1[1], w2[1]), vec3(w0[2], w1[2], w2[2])
         first = base + (node[0] * ny + node[1]) * nz + node[2]
+        first = ti.select(inside, first, dump)  # no branch: in one the compiler would not merge lanes
         for i in ti.static(range(3)):
             qi, yi, zi = wx[i] * (q + float(i) * ax), wx[i] * ay, wx[i] * az
             for j in ti.static(range(3)):

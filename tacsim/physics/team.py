@@ -16,8 +16,8 @@ from tacsim.physics.lanes import PARTS
 from tacsim.runtime import ti
 
 CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
-PROBE = 50  # launches between two tries of the team size that was slower
-SMOOTH = 0.3  # weight of the newest time
+PROBE = 25  # launches between two tries of a size that may be slower
+SMOOTH = 0.5  # weight of the newest time
 
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
@@ -55,22 +55,23 @@ def cores() -> int:
 class _Pace:
     """Seconds per unit of work of each team size, of late."""
 
-    def __init__(self) -> None:
+    def __init__(self, sizes: tuple[int, ...]) -> None:
+        self.sizes = sizes
         self.seconds: dict[int, float] = {}
         self.launches = 0
 
-    def choose(self, sizes: tuple[int, ...]) -> int:
+    def choose(self) -> int:
+        """The first launch compiles and says nothing; then each size has its turn, twice; later the slower ones do."""
         self.launches += 1
-        untried = [size for size in sizes if size not in self.seconds]
-        if untried:
-            return untried[0]
-        if self.launches % PROBE == 0:
-            return sizes[self.launches // PROBE % len(sizes)]
-        return min(sizes, key=lambda size: self.seconds[size])
+        if self.launches <= 1 + 2 * len(self.sizes) or self.launches % PROBE == 0:
+            turn = self.launches if self.launches < PROBE else self.launches // PROBE
+            return self.sizes[turn % len(self.sizes)]
+        return min(self.sizes, key=lambda size: self.seconds[size])
 
     def note(self, size: int, seconds: float) -> None:
-        old = self.seconds.get(size, seconds)
-        self.seconds[size] = (1 - SMOOTH) * old + SMOOTH * seconds
+        if self.launches > 1:
+            old = self.seconds.get(size, seconds)
+            self.seconds[size] = (1 - SMOOTH) * old + SMOOTH * seconds
 
 
 _paces: dict[Any, _Pace] = {}
@@ -91,8 +92,8 @@ def run_team(kernel: Any, drive: np.ndarray, *arguments: Any) -> None:
     flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
     sync = np.zeros((drive.shape[0], 16), np.int32)
     sizes = team_sizes(drive.shape[0])
-    pace = _paces.setdefault((kernel.__name__, drive.shape[0]), _Pace())
-    team = pace.choose(sizes)
+    pace = _paces.setdefault((kernel.__name__, drive.shape[0], sizes), _Pace(sizes))
+    team = pace.choose()
     work = drive.shape[1] * sum(a.size for a in flat if isinstance(a, np.ndarray))
     begin = time.perf_counter()
     kernel(team, drive, *flat, sync)

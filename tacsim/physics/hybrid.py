@@ -276,7 +276,7 @@ class HybridState:
         self.gels.refresh()
         run_team(
             substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.facts, self.counts,
-            self._work, self.partial, active=len(drives),
+            self._work, self.partial,
         )  # fmt: skip
 
 

@@ -149,7 +149,7 @@ class PressState:
         self.gels.refresh()
         run_team(
             press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
-            self.counts, self._work, self.partial, active=len(drives),
+            self.counts, self._work, self.partial,
         )  # fmt: skip
 
 

@@ -83,17 +83,15 @@ def team_sizes(environments: int) -> tuple[int, ...]:
     return tuple(size for size in (1, 2, 4) if size <= largest)
 
 
-def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: int | None = None) -> None:
+def run_team(kernel: Any, drive: np.ndarray, *arguments: Any) -> None:
     """Launches `kernel(team, drive, ..., sync)` with the team that is fastest of late; tuples of arguments are spread.
 
-    drive: (environments, substeps, ...); active: how many of them have any substeps to do, without it all. Threads go
-    to those: the others' are done at once, so no meeting waits for a thread that does not run.
+    drive: (environments, substeps, ...).
     """
     flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
     sync = np.zeros((drive.shape[0], 16), np.int32)
-    environments = drive.shape[0] if active is None else active
-    sizes = team_sizes(environments)
-    pace = _paces.setdefault((kernel.__name__, drive.shape[0], environments), _Pace())
+    sizes = team_sizes(drive.shape[0])
+    pace = _paces.setdefault((kernel.__name__, drive.shape[0]), _Pace())
     team = pace.choose(sizes)
     work = drive.shape[1] * sum(a.size for a in flat if isinstance(a, np.ndarray))
     begin = time.perf_counter()

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.physics import team
 from tacsim.physics.batch import Batch
 from tacsim.physics.health import RETRIES, SimulationDiverged
 from tacsim.physics.hybrid import HybridWorld
@@ -145,7 +144,7 @@ def test_one_that_diverges_is_taken_back_while_others_go_on(
         assert fresh.worlds[1].wrench("lower")[2] == pytest.approx(force, rel=0.05)
     else:
         assert isinstance(ends[1], SimulationDiverged)
-        assert "is nan" in str(ends[1]) and f"1/{2**RETRIES} of the time step" in str(ends[1])
+        assert f"1/{2**RETRIES} of the time step" in str(ends[1])
         assert state(fresh.worlds[1]) == before
 
 
@@ -195,21 +194,6 @@ def test_an_interruption_takes_back_who_is_on_the_way(fresh: Batch, monkeypatch:
     with pytest.raises(KeyboardInterrupt):
         fresh.move([closed(world, 0.4e-3) for world in fresh.worlds])
     assert [state(world) for world in fresh.worlds] == before
-
-
-def test_threads_go_to_those_that_have_something_to_do(fresh: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A team of two for the only one that moves, and the same bits."""
-    if team.cores() < 2:
-        pytest.skip("one core")
-    sizes: list[int] = []
-    monkeypatch.delenv("TACSIM_THREADS", raising=False)
-    monkeypatch.setattr(team._Pace, "choose", lambda pace, given: sizes.append(max(given)) or max(given))
-    fresh.move([closed(fresh.worlds[0], 0.4e-3), None, None])
-    assert min(sizes) >= 2
-    monkeypatch.setattr(team._Pace, "choose", lambda pace, given: 1)
-    alone = HybridWorld(SCENES[0])
-    alone.move(closed(alone, 0.4e-3))
-    assert_same([fresh.worlds[0]], [alone])
 
 
 @pytest.fixture(scope="module")

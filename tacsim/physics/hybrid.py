@@ -80,7 +80,7 @@ from tacsim.physics.plasticine import (
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
@@ -216,9 +216,10 @@ def substeps(
 
     Two meetings a substep: what is scattered must be whole before it is summed, and summed before it is gathered.
     """
-    for task in range(drive.shape[0] * team * CHUNK):
+    for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            env, member = task // CHUNK // team, task // CHUNK % team
+            turn, member = task // CHUNK // team, task // CHUNK % team
+            env = sync[turn, WHO]
             layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
@@ -236,12 +237,12 @@ def substeps(
                         env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
                         layers, nx, ny,
                     )  # fmt: skip
-                meet(sync, env, team, 2 * it + 1)
+                meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
                     gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
-                meet(sync, env, team, 2 * it + 2)
+                meet(sync, turn, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
                     grid_to_particles(
@@ -276,7 +277,7 @@ class HybridState:
         self.gels.refresh()
         run_team(
             substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.facts, self.counts,
-            self._work, self.partial,
+            self._work, self.partial, active=list(drives),
         )  # fmt: skip
 
 

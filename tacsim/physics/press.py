@@ -57,7 +57,7 @@ from tacsim.physics.layout import (
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.load import keep_loads, require_loads
-from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
@@ -81,9 +81,10 @@ def press_substeps(
     facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
-    for task in range(drive.shape[0] * team * CHUNK):
+    for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            env, member = task // CHUNK // team, task // CHUNK % team
+            turn, member = task // CHUNK // team, task // CHUNK % team
+            env = sync[turn, WHO]
             layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
@@ -94,11 +95,11 @@ def press_substeps(
                         env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
                         layers, nx, ny,
                     )  # fmt: skip
-                meet(sync, env, team, 2 * it + 1)
+                meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
                     gel_advance(env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
-                meet(sync, env, team, 2 * it + 2)
+                meet(sync, turn, team, 2 * it + 2)
 
 
 def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
@@ -149,7 +150,7 @@ class PressState:
         self.gels.refresh()
         run_team(
             press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
-            self.counts, self._work, self.partial,
+            self.counts, self._work, self.partial, active=list(drives),
         )  # fmt: skip
 
 

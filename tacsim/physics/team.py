@@ -8,6 +8,7 @@ was faster lately.
 
 import os
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,17 +20,19 @@ CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every me
 PROBE = 50  # launches between two tries of the team size that was slower
 SMOOTH = 0.3  # weight of the newest time
 
+WHO = 1  # column of `sync`: the environment whose turn it is
+
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
 
 @ti.func
-def meet(sync: ti.template(), env, team, meeting):
+def meet(sync: ti.template(), turn, team, meeting):
     """Nobody goes on before all members are here; meeting counts from 1."""
     if team > 1:
-        ti.atomic_add(sync[env, 0], 1)
+        ti.atomic_add(sync[turn, 0], 1)
         here = 0
         while here < team * meeting:
-            here = ti.atomic_add(sync[env, 0], 0)
+            here = ti.atomic_add(sync[turn, 0], 0)
 
 
 # Loops that run once or not at all, in place of branches: inside a branch the compiler does not merge lanes.
@@ -83,15 +86,17 @@ def team_sizes(environments: int) -> tuple[int, ...]:
     return tuple(size for size in (1, 2, 4) if size <= largest)
 
 
-def run_team(kernel: Any, drive: np.ndarray, *arguments: Any) -> None:
+def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: Sequence[int] = (0,)) -> None:
     """Launches `kernel(team, drive, ..., sync)` with the team that is fastest of late; tuples of arguments are spread.
 
-    drive: (environments, substeps, ...).
+    drive: (environments, substeps, ...); active: those that have substeps to do. Only they take turns: Taichi cuts a
+    longer loop into as many equal pieces as there are threads, whether there is work in a piece or not.
     """
     flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
-    sync = np.zeros((drive.shape[0], 16), np.int32)
-    sizes = team_sizes(drive.shape[0])
-    pace = _paces.setdefault((kernel.__name__, drive.shape[0]), _Pace())
+    sync = np.zeros((len(active), 16), np.int32)
+    sync[:, WHO] = active
+    sizes = team_sizes(len(active))
+    pace = _paces.setdefault((kernel.__name__, drive.shape[0], len(active)), _Pace())
     team = pace.choose(sizes)
     work = drive.shape[1] * sum(a.size for a in flat if isinstance(a, np.ndarray))
     begin = time.perf_counter()

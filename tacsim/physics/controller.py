@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.health import Place, SimulationDiverged
+from tacsim.physics.health import Place, SimulationDiverged, State
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Settling
 
@@ -135,6 +136,36 @@ class Launch:
     last: int
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """A launch that one environment is ready for: its grid is laid and its numbers are set."""
+
+    launch: Launch
+    drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel
+    where: Place
+    good: State  # the environment's arrays before it
+
+
+class Kernels(Protocol):
+    """The arrays of some environments, and the kernel that advances them."""
+
+    def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
+        """One launch: every environment named goes along its own drive, however long; all others rest."""
+        ...
+
+
+class Environment(Protocol):
+    """A world as one environment of such arrays."""
+
+    def prepare(self, launch: Launch) -> Prepared:
+        """Sets everything of this environment for the launch. Raises SimulationDiverged if it cannot be done."""
+        ...
+
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        ...
+
+
 # The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the Reading at its end, or
 # thrown the SimulationDiverged that the launch ended in. So whoever advances many worlds in one launch of kernels holds
 # one motion for each, all at their own phases; `run` is that for a single world.
@@ -157,6 +188,27 @@ def run(motion: Motion, advance: Callable[[Path, int, int], Reading]) -> MoveSta
         return stats
     finally:
         motion.close()
+
+
+def advance_all(
+    kernels: Kernels, environments: Sequence[Environment], wanted: Mapping[int, Launch]
+) -> dict[int, Reading | SimulationDiverged]:
+    """One launch of kernels for all environments that want one; what each came to, a failure in its own place only."""
+    results: dict[int, Reading | SimulationDiverged] = {}
+    ready: dict[int, Prepared] = {}
+    for index, launch in wanted.items():
+        try:
+            ready[index] = environments[index].prepare(launch)
+        except SimulationDiverged as failure:
+            results[index] = failure
+    if ready:
+        kernels.advance({index: prepared.drive for index, prepared in ready.items()})
+    for index, prepared in ready.items():
+        try:
+            results[index] = environments[index].outcome(prepared)
+        except SimulationDiverged as failure:
+            results[index] = failure
+    return results
 
 
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:

@@ -5,6 +5,7 @@ world; its gel does not notice. Inside: mm, N, MPa; density scaled so that the P
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,6 +80,23 @@ def gel_facts(gel: Gel, element: float) -> GelFacts:
     nx, ny = (round(side / spacing) for side in gel.size[:2])
     mu, lam = lame(gel.material)
     return GelFacts((nx, ny, counts[2]), spacing * MM, mu * MPA, lam * MPA)
+
+
+def one_lattice(gels: Sequence[GelFacts]) -> GelFacts:
+    """What the gels of all environments share: how they are cut. Raises ValueError if they are not cut alike."""
+    first = gels[0]
+    for index, gel in enumerate(gels):
+        if (gel.elements, gel.spacing) != (first.elements, first.spacing):
+            raise ValueError(
+                f"environments of a batch need one gel lattice: environment {index} has {_lattice_words(gel)}, "
+                f"environment 0 {_lattice_words(first)}; give both the same gel.size, preset and element_size"
+            )
+    return first
+
+
+def _lattice_words(gel: GelFacts) -> str:
+    nx, ny, nz = gel.elements
+    return f"{nx} x {ny} x {nz} elements of {gel.spacing:.4g} mm"
 
 
 class GelState:

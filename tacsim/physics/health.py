@@ -120,15 +120,22 @@ def attempt(arrays: State, launch: Callable[[], Health], where: Place) -> Health
 
     Raises SimulationDiverged if that is unphysical; whoever runs the motion (see `retried`) rolls back and retries.
     """
-    good = {name: a.copy() for name, a in arrays.items()}
-    health = launch()
+    return judged(arrays, copies(arrays), launch(), where)
+
+
+def copies(arrays: State) -> dict[str, NDArray[Any]]:
+    return {name: a.copy() for name, a in arrays.items()}
+
+
+def judged(arrays: State, good: State, health: Health, where: Place) -> Health:
+    """`health` of a launch that changed `arrays` from `good` to what they are. Raises as `attempt` does."""
     complaint = health.complaint() or _complaint(arrays)
     if complaint is None:
         return health
     words, quantity = complaint
     failure = SimulationDiverged(words, str(where))
     failure.quantity, failure.health, failure.poses = quantity, health, where.poses
-    failure.good, failure.failed = good, {name: a.copy() for name, a in arrays.items()}
+    failure.good, failure.failed = good, copies(arrays)
     raise failure
 
 

@@ -8,7 +8,18 @@ import numpy as np
 from tacsim.interface import Pose, Truth
 from tacsim.physics.body_surface import surface_points, tangent_planes
 from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
-from tacsim.physics.controller import Motion, Path, Reading, force_floor, merged, move_and_settle, plan, run
+from tacsim.physics.controller import (
+    Launch,
+    Motion,
+    Path,
+    Prepared,
+    Reading,
+    force_floor,
+    merged,
+    move_and_settle,
+    plan,
+    run,
+)
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -24,8 +35,9 @@ from tacsim.physics.gel import (
     gel_facts,
     gel_forces,
     gel_surface,
+    one_lattice,
 )
-from tacsim.physics.health import Health, attempt, require_room, retried
+from tacsim.physics.health import Health, copies, judged, require_room, retried
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, first_of, vec3, vec4
 from tacsim.physics.layout import (
     BACKING,
@@ -55,6 +67,7 @@ from tacsim.physics.layout import (
 )  # fmt: skip
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.plasticine import (
+    BodyFacts,
     BodyState,
     Masses,
     Points,
@@ -68,7 +81,7 @@ from tacsim.physics.plasticine import (
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start, ti
@@ -207,9 +220,10 @@ def substeps(
 
     Two meetings a substep: what is scattered must be whole before it is summed, and summed before it is gathered.
     """
-    for task in range(drive.shape[0] * team * CHUNK):
+    for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            env, member = task // CHUNK // team, task // CHUNK % team
+            turn, member = task // CHUNK // team, task // CHUNK % team
+            env = sync[turn, WHO]
             layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
@@ -227,12 +241,12 @@ def substeps(
                         env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
                         layers, nx, ny,
                     )  # fmt: skip
-                meet(sync, env, team, 2 * it + 1)
+                meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
                     gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
-                meet(sync, env, team, 2 * it + 2)
+                meet(sync, turn, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
                     grid_to_particles(
@@ -240,27 +254,71 @@ def substeps(
                     )
 
 
+class HybridState:
+    """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
+
+    Environments share the gels' lattice; bodies, materials, friction and settling are each one's own.
+    """
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Raises ValueError for gels that are not cut alike."""
+        start()
+        self.gel = [gel_facts(scene.gel, scene.element) for scene in scenes]
+        self.gels = GelState(one_lattice(self.gel), len(scenes), 2)
+        placed = [_placed(scene) for scene in scenes]
+        self.body = [body for body, _, _ in placed]
+        self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
+        # of the contact law [mm]
+        self.memory = np.zeros((len(scenes), 2, self.particles.points.shape[1], 4), np.float32)
+        self.facts = np.zeros((len(scenes), FACTS), np.float32)
+        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
+        self._work = np.zeros((len(scenes) * PARTS * SLOTS, LANES), np.float32)
+
+    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
+        """One launch; drives: (n, 2, 6, 3) of the environments that go on, n each one's own."""
+        drive = side_by_side(drives, self.counts)
+        self.gels.refresh()
+        run_team(
+            substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.facts, self.counts,
+            self._work, self.partial, active=list(drives),
+        )  # fmt: skip
+
+
+def _placed(scene: Scene) -> tuple[BodyFacts, np.ndarray, np.ndarray]:
+    """A scene's body: facts; particles at construction (n, 3) [mm]; their tangent planes (n, 3) [1/mm]."""
+    assert scene.body is not None
+    height = float(extent(scene.body.geometry)[2])
+    points = body_points(scene.body, scene.spacing)
+    body = body_facts(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
+    planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM
+    return body, (points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM, planes
+
+
+def side_by_side(drives: Mapping[int, np.ndarray], counts: np.ndarray) -> np.ndarray:
+    """Drives (n, frames, 6, 3) of some environments in one array (E, longest, ...); writes all n into `counts`."""
+    counts[:, STEPS] = 0
+    first = next(iter(drives.values()))
+    longest = max(len(drive) for drive in drives.values())
+    together = np.zeros((len(counts), longest, *first.shape[1:]), np.float32)
+    for index, drive in drives.items():
+        together[index, : len(drive)] = drive
+        counts[index, STEPS] = len(drive)
+    return together
+
+
 class HybridWorld:
     """World of a scene with a body: `lower` and `upper` gel, and the plasticine between them."""
 
     sensors: tuple[str, ...] = ("lower", "upper")
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, state: HybridState | None = None, index: int = 0) -> None:
+        """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
         assert scene.body is not None
-        start()
         self.scene = scene
-        self._gel = gel_facts(scene.gel, scene.element)
-        self._gels = GelState(self._gel, 1, 2)
+        self._state, self._index = HybridState([scene]) if state is None else state, index
+        self._gel, self._body = self._state.gel[index], self._state.body[index]
         height = float(extent(scene.body.geometry)[2])
-        points = body_points(scene.body, scene.spacing)
-        self._body = body_facts(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
-        planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM  # [1/mm]
-        self._particles = BodyState([(points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM], [planes])
-        self._memory = np.zeros((1, 2, len(points), 4), np.float32)  # of the contact law [mm]
-        self._facts = np.zeros((1, FACTS), np.float32)
-        self._counts = np.zeros((1, COUNTS), np.int32)
-        self._work = np.zeros((PARTS * SLOTS, LANES), np.float32)
-        self._partial = np.zeros((1, PARTS, NUMBERS), np.float32)
         self._poses = {
             "lower": Pose(),
             "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
@@ -283,16 +341,17 @@ class HybridWorld:
             FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
             HOUSING: -1.0 if housing is None else housing * MM,
         }  # fmt: skip
-        self._facts[0, list(facts)] = list(facts.values())
+        self._state.facts[index, list(facts)] = list(facts.values())
 
     # ------------------------------------------------------------------ state
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        b = self._particles
+        state, i = self._state, self._index
+        b = state.particles
         return {
-            "gel_displacement": self._gels.u[0], "gel_velocity": self._gels.v[0],
-            "position": b.x(), "velocity": b.v(), "affine": b.c(), "strain": b.e(), "flow": b.flow(),
-            "planes": b.plane(), "contact": self._memory[0], "sums": self._partial[0],
+            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i],
+            "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.flow(i),
+            "planes": b.plane(i), "contact": state.memory[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -302,7 +361,7 @@ class HybridWorld:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self._poses = put_back(self._arrays(), self.sensors, state)
-        self._particles.refresh()
+        self._state.particles.refresh()
         self._speed = float(state["speed"])
 
     def pose(self, name: str) -> Pose:
@@ -310,16 +369,16 @@ class HybridWorld:
 
     def wrench(self, name: str) -> np.ndarray:
         first = FORCE + 6 * self.sensors.index(name)
-        wrench = self._partial[0, :, first : first + 6].astype(np.float64).sum(axis=0)
+        wrench = self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
         wrench[3:] /= MM
         return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._gels, 0, self.sensors.index(name))
+        return gel_surface(self._gel, self._state.gels, self._index, self.sensors.index(name))
 
     def truth(self) -> Truth:
-        x = self._particles.x()
-        height = float(np.ptp(surface_points(x, self._particles.plane())[:, 2])) / MM
+        x, planes = self._state.particles.x(self._index), self._state.particles.plane(self._index)
+        height = float(np.ptp(surface_points(x, planes)[:, 2])) / MM
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
     # ----------------------------------------------------------------- motion
@@ -349,28 +408,32 @@ class HybridWorld:
         return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half))
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
-        span = (last - first) * self._dt
+        prepared = self.prepare(Launch(path, first, last))
+        self._state.advance({self._index: prepared.drive})
+        return self.outcome(prepared)
+
+    def prepare(self, launch: Launch) -> Prepared:
+        """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
+        state, index, path = self._state, self._index, launch.path
+        span = (launch.last - launch.first) * self._dt
         margin = 2 * self._body.cell + 2 * span * max(self._speed, self.scene.settling.mach)
-        where = path.place(self._poses, first, last)
-        x = self._particles.x()
+        where = path.place(self._poses, launch.first, launch.last)
+        x = state.particles.x(index)
         require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
-        self._particles.fit(0, self._body.cell, margin, self._facts, self._counts)
+        state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
+        good = copies(self._arrays())
+        state.facts[index, STEP] = path.step
+        Health.clear(state.partial[index])
+        return Prepared(launch, path.drive(launch.first, launch.last), where, good)
 
-        def launch() -> Health:
-            drive = path.drive(first, last)
-            self._facts[0, STEP], self._counts[0, STEPS] = path.step, len(drive)
-            Health.clear(self._partial)
-            self._gels.refresh()
-            run_team(
-                substeps, drive[None], self._gels.arguments(), self._particles.arguments(), self._memory, self._facts,
-                self._counts, self._work, self._partial,
-            )  # fmt: skip
-            return Health.read(self._partial[0])
-
-        health = attempt(self._arrays(), launch, where)
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        partial = self._state.partial[self._index]
+        health = judged(self._arrays(), prepared.good, Health.read(partial), prepared.where)
         self._speed = health.fastest
-        rotations = path.drive(last - 1, last)[-1, :, :3]
-        sums = self._partial[0].astype(np.float64)
+        launch = prepared.launch
+        rotations = launch.path.drive(launch.last - 1, launch.last)[-1, :, :3]
+        sums = partial.astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
         backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)  # which holds the housing too
         backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)

@@ -14,6 +14,7 @@ from tacsim.physics.layout import (
     KIND,
     OVERLAP,
     SHAPE,
+    SHAPE_NODES,
     SHAPE_ORIGIN,
     SHAPE_SPACING,
     STEP,
@@ -58,10 +59,11 @@ def direction(y):
 
 
 @ti.func
-def signed_distance(kind, size, y, values: ti.template(), origin, spacing):
+def signed_distance(env, kind, size, y, values: ti.template(), nodes, origin, spacing):
     """Distance from the indenter's surface (negative inside) and its outward normal, at y in the indenter's frame.
 
     size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere.
+    nodes, origin, spacing: of this environment's distance grid in `values`.
     """
     phi, n = FAR, vec3(0.0, 0.0, 1.0)
     if kind == SPHERE:
@@ -78,7 +80,7 @@ def signed_distance(kind, size, y, values: ti.template(), origin, spacing):
         at = (y - origin) / spacing
         known = True
         for d in ti.static(range(3)):
-            known = known and at[d] >= 0.0 and at[d] < values.shape[d] - 1
+            known = known and at[d] >= 0.0 and at[d] < nodes[d] - 1
         if known:
             cell = ti.floor(at).cast(ti.i32)
             w = at - cell.cast(ti.f32)
@@ -86,7 +88,7 @@ def signed_distance(kind, size, y, values: ti.template(), origin, spacing):
             n = vec3(0.0)
             for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
                 wx, wy, wz = (w[0] if a else 1.0 - w[0]), (w[1] if b else 1.0 - w[1]), (w[2] if c else 1.0 - w[2])
-                value = values[cell + ti.Vector([a, b, c])]
+                value = values[env, cell[0] + a, cell[1] + b, cell[2] + c]
                 phi += value * wx * wy * wz
                 n += value * vec3((2 * a - 1) * wy * wz, (2 * b - 1) * wx * wz, (2 * c - 1) * wx * wy)
             n = n / ti.max(n.norm(), 1e-12)
@@ -107,6 +109,7 @@ def indent(
     kind, size = counts[env, KIND], vec3(facts[env, SHAPE], facts[env, SHAPE + 1], facts[env, SHAPE + 2])
     grid_origin = vec3(facts[env, SHAPE_ORIGIN], facts[env, SHAPE_ORIGIN + 1], facts[env, SHAPE_ORIGIN + 2])
     grid_spacing = facts[env, SHAPE_SPACING]
+    nodes = ti.Vector([counts[env, SHAPE_NODES], counts[env, SHAPE_NODES + 1], counts[env, SHAPE_NODES + 2]])
     rows = [vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(6)]
     rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
     area = h * h / (POINTS * POINTS)
@@ -124,7 +127,7 @@ def indent(
             )  # fmt: skip
             at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
             at += vec3(middle[0], middle[1], middle[2])
-            far, _ = signed_distance(kind, size, back @ (at - centre), values, grid_origin, grid_spacing)
+            far, _ = signed_distance(env, kind, size, back @ (at - centre), values, nodes, grid_origin, grid_spacing)
             if far > FAR_CELL * h:
                 for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                     slip[env, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
@@ -140,7 +143,9 @@ def indent(
                         us += (wx[p] * wy[q]) * skin[env, 0, 0, first_i + p + 1, first_j + q + 1]
                         vs += (wx[p] * wy[q]) * skin[env, 0, 1, first_i + p + 1, first_j + q + 1]
                     x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
-                    phi, n_local = signed_distance(kind, size, back @ (x - centre), values, grid_origin, grid_spacing)
+                    phi, n_local = signed_distance(
+                        env, kind, size, back @ (x - centre), values, nodes, grid_origin, grid_spacing
+                    )
                     touching = False
                     if phi < 0.5 * h:
                         n = rotate @ n_local  # out of the indenter: pushes the gel

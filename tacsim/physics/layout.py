@@ -35,7 +35,8 @@ SLAB = 6  # first node plane and the one after the last of part 0, 1, ...
 KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
 CAPACITY = 16  # grid nodes that an environment has room for, in each copy
-COUNTS = 17
+SHAPE_NODES = 17  # of an indenter's distance grid x, y, z
+COUNTS = 20
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements

@@ -6,7 +6,18 @@ from dataclasses import replace
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import Motion, Path, Reading, force_floor, merged, move_and_settle, plan, run
+from tacsim.physics.controller import (
+    Launch,
+    Motion,
+    Path,
+    Prepared,
+    Reading,
+    force_floor,
+    merged,
+    move_and_settle,
+    plan,
+    run,
+)
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -22,9 +33,10 @@ from tacsim.physics.gel import (
     gel_facts,
     gel_forces,
     gel_surface,
+    one_lattice,
 )
-from tacsim.physics.health import Health, attempt, retried
-from tacsim.physics.hybrid import COURANT, ZETA_GEL, Drive
+from tacsim.physics.health import Health, copies, judged, retried
+from tacsim.physics.hybrid import COURANT, ZETA_GEL, Drive, side_by_side
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3
 from tacsim.physics.layout import (
@@ -37,6 +49,7 @@ from tacsim.physics.layout import (
     KIND,
     NUMBERS,
     SHAPE,
+    SHAPE_NODES,
     SHAPE_ORIGIN,
     SHAPE_SPACING,
     STEP,
@@ -44,7 +57,7 @@ from tacsim.physics.layout import (
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.load import keep_loads, require_loads
-from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
 from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
@@ -56,7 +69,7 @@ REACH = 3e-3  # of a mesh's distance grid, up from its tip [m]
 
 Slip = ti.types.ndarray(dtype=vec3, ndim=3)
 Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
-Values = ti.types.ndarray(dtype=ti.f32, ndim=3)
+Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 
 @ti.kernel
@@ -68,9 +81,10 @@ def press_substeps(
     facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
-    for task in range(drive.shape[0] * team * CHUNK):
+    for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            env, member = task // CHUNK // team, task // CHUNK % team
+            turn, member = task // CHUNK // team, task // CHUNK % team
+            env = sync[turn, WHO]
             layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
@@ -81,11 +95,11 @@ def press_substeps(
                         env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
                         layers, nx, ny,
                     )  # fmt: skip
-                meet(sync, env, team, 2 * it + 1)
+                meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
                     gel_advance(env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
-                meet(sync, env, team, 2 * it + 2)
+                meet(sync, turn, team, 2 * it + 2)
 
 
 def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
@@ -101,42 +115,81 @@ def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(out, np.float32)
 
 
+class PressState:
+    """Arrays of E environments that one launch of `press_substeps` advances; each environment is a PressWorld.
+
+    Environments share the gel's lattice; indenters, materials, friction and settling are each one's own.
+    """
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Raises ValueError for gels that are not cut alike."""
+        start()
+        self.gel = [gel_facts(scene.gel, scene.element) for scene in scenes]
+        lattice = one_lattice(self.gel)
+        self.gels = GelState(lattice, len(scenes), 1)
+        nx, ny, _ = lattice.elements
+        self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
+        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # multiplier of the normal contact [MPa]
+        self.facts = np.zeros((len(scenes), FACTS), np.float32)
+        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
+        self._work = np.zeros((len(scenes) * PARTS * SLOTS, LANES), np.float32)
+        self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])
+
+    def _set_shape(self, index: int, scene: Scene) -> np.ndarray:
+        """Writes one environment's indenter into facts and counts; returns its distance values [mm]."""
+        kind, size, values, origin, spacing = _distance_facts(scene)
+        self.counts[index, KIND], self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = kind, values.shape
+        self.facts[index, SHAPE : SHAPE + 3], self.facts[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = size, origin
+        self.facts[index, SHAPE_SPACING] = spacing
+        return values
+
+    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
+        """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
+        drive = side_by_side(drives, self.counts)
+        self.gels.refresh()
+        run_team(
+            press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
+            self.counts, self._work, self.partial, active=list(drives),
+        )  # fmt: skip
+
+
+def _stacked(grids: Sequence[np.ndarray]) -> np.ndarray:
+    """Distance values of all environments in one array (E, most x, most y, most z); each has its own node counts."""
+    most = np.max([grid.shape for grid in grids], axis=0)
+    values = np.zeros((len(grids), *most), np.float32)
+    for index, grid in enumerate(grids):
+        values[index, : grid.shape[0], : grid.shape[1], : grid.shape[2]] = grid
+    return values
+
+
 class PressWorld:
     """World of a scene with an indenter: the `lower` gel, and the `indenter` above it."""
 
     sensors: tuple[str, ...] = ("lower",)
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
+        """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
         assert scene.indenter is not None
-        start()
         self.scene = scene
-        self._gel = gel_facts(scene.gel, scene.element)
-        self._gels = GelState(self._gel, 1, 1)
-        nx, ny, _ = self._gel.elements
-        self._slip = np.zeros((1, nx * POINTS, ny * POINTS, 3), np.float32)
-        self._pressure = np.zeros((1, nx * POINTS, ny * POINTS), np.float32)  # multiplier of the normal contact [MPa]
-        self._counts = np.zeros((1, COUNTS), np.int32)
-        self._work = np.zeros((PARTS * SLOTS, LANES), np.float32)
-        self._partial = np.zeros((1, PARTS, NUMBERS), np.float32)
+        self._state, self._index = PressState([scene]) if state is None else state, index
+        self._gel = self._state.gel[index]
         self._dt = COURANT * self._gel.spacing
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
-        self._counts[0, KIND], size, self._values, origin, spacing = _distance_facts(scene)
         facts = {
             **self._gel.facts(), GEL_DAMPING: ZETA_GEL / self._gel.thickness,
             STIFFNESS: self._gel.density * self._gel.spacing / (2 * self._dt**2), FRICTION: scene.indenter.friction,
-            **{SHAPE + d: size[d] for d in range(3)}, **{SHAPE_ORIGIN + d: origin[d] for d in range(3)},
-            SHAPE_SPACING: spacing,
         }  # fmt: skip
-        self._facts = np.zeros((1, FACTS), np.float32)
-        self._facts[0, list(facts)] = list(facts.values())
+        self._state.facts[index, list(facts)] = list(facts.values())
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
 
     def _arrays(self) -> dict[str, np.ndarray]:
+        state, i = self._state, self._index
         return {
-            "gel_displacement": self._gels.u[0], "gel_velocity": self._gels.v[0], "slip": self._slip[0],
-            "pressure": self._pressure[0], "sums": self._partial[0],
+            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "slip": state.slip[i],
+            "pressure": state.pressure[i], "sums": state.partial[i],
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -150,12 +203,12 @@ class PressWorld:
 
     def wrench(self, name: str) -> np.ndarray:
         first = FORCE + 6 * self.sensors.index(name)
-        wrench = self._partial[0, :, first : first + 6].astype(np.float64).sum(axis=0)
+        wrench = self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
         wrench[3:] /= MM
         return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._gels, 0, self.sensors.index(name))
+        return gel_surface(self._gel, self._state.gels, self._index, self.sensors.index(name))
 
     def truth(self) -> None:
         return None
@@ -185,20 +238,25 @@ class PressWorld:
         return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half))
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
-        def launch() -> Health:
-            both = path.drive(first, last)
-            drive = relative_drive(both[:, 0], both[:, 1])
-            self._facts[0, STEP], self._counts[0, STEPS] = path.step, len(drive)
-            Health.clear(self._partial)
-            self._gels.refresh()
-            run_team(
-                press_substeps, drive[None], self._gels.arguments(), self._slip, self._pressure, self._values,
-                self._facts, self._counts, self._work, self._partial,
-            )  # fmt: skip
-            return Health.read(self._partial[0])
+        prepared = self.prepare(Launch(path, first, last))
+        self._state.advance({self._index: prepared.drive})
+        return self.outcome(prepared)
 
-        health = attempt(self._arrays(), launch, path.place(self._poses, first, last))
-        sums = self._partial[0].astype(np.float64).sum(axis=0)
+    def prepare(self, launch: Launch) -> Prepared:
+        """Sets this environment's numbers for a launch."""
+        path = launch.path
+        where = path.place(self._poses, launch.first, launch.last)
+        good = copies(self._arrays())
+        both = path.drive(launch.first, launch.last)
+        self._state.facts[self._index, STEP] = path.step
+        Health.clear(self._state.partial[self._index])
+        return Prepared(launch, relative_drive(both[:, 0], both[:, 1]), where, good)
+
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        partial = self._state.partial[self._index]
+        health = judged(self._arrays(), prepared.good, Health.read(partial), prepared.where)
+        sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
         return Reading(force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))

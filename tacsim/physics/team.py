@@ -8,6 +8,7 @@ was faster lately.
 
 import os
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,17 +20,19 @@ CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every me
 PROBE = 25  # launches between two tries of a size that may be slower
 SMOOTH = 0.5  # weight of the newest time
 
+WHO = 1  # column of `sync`: the environment whose turn it is
+
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
 
 @ti.func
-def meet(sync: ti.template(), env, team, meeting):
+def meet(sync: ti.template(), turn, team, meeting):
     """Nobody goes on before all members are here; meeting counts from 1."""
     if team > 1:
-        ti.atomic_add(sync[env, 0], 1)
+        ti.atomic_add(sync[turn, 0], 1)
         here = 0
         while here < team * meeting:
-            here = ti.atomic_add(sync[env, 0], 0)
+            here = ti.atomic_add(sync[turn, 0], 0)
 
 
 # Loops that run once or not at all, in place of branches: inside a branch the compiler does not merge lanes.
@@ -78,21 +81,29 @@ _paces: dict[Any, _Pace] = {}
 
 
 def team_sizes(environments: int) -> tuple[int, ...]:
-    """Sizes worth trying: with many environments each keeps to one thread. TACSIM_THREADS bounds the threads in all."""
-    most = min(int(os.environ.get("TACSIM_THREADS", cores())), cores())
+    """Sizes worth trying: with many environments each keeps to one thread. TACSIM_THREADS bounds the threads in all.
+
+    Never more members in all than threads: one would wait for another that has none to run on.
+    """
+    wanted = os.environ.get("TACSIM_THREADS", str(cores()))
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise ValueError(f"TACSIM_THREADS must be a whole number from 1 on, found '{wanted}'")
+    most = min(int(wanted), cores())
     largest = max(1, min(most // environments, PARTS))
     return tuple(size for size in (1, 2, 4) if size <= largest)
 
 
-def run_team(kernel: Any, drive: np.ndarray, *arguments: Any) -> None:
+def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: Sequence[int] = (0,)) -> None:
     """Launches `kernel(team, drive, ..., sync)` with the team that is fastest of late; tuples of arguments are spread.
 
-    drive: (environments, substeps, ...).
+    drive: (environments, substeps, ...); active: those that have substeps to do. Only they take turns: Taichi cuts a
+    longer loop into as many equal pieces as there are threads, whether there is work in a piece or not.
     """
     flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
-    sync = np.zeros((drive.shape[0], 16), np.int32)
-    sizes = team_sizes(drive.shape[0])
-    pace = _paces.setdefault((kernel.__name__, drive.shape[0], sizes), _Pace(sizes))
+    sync = np.zeros((len(active), 16), np.int32)
+    sync[:, WHO] = active
+    sizes = team_sizes(len(active))
+    pace = _paces.setdefault((kernel.__name__, drive.shape[0], len(active), sizes), _Pace(sizes))
     team = pace.choose()
     work = drive.shape[1] * sum(a.size for a in flat if isinstance(a, np.ndarray))
     begin = time.perf_counter()

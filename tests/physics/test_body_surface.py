@@ -100,7 +100,7 @@ def test_random_and_lattice_bodies_press_alike_and_weigh_the_same() -> None:
     for sampling in ("lattice", "random"):
         world = squeezed(CUBE, sampling, 1e-3)
         forces.append(world.wrench("lower")[2])
-        assert len(world._particles.x()) * world._body.volume == pytest.approx(volume(CUBE) * 1e9, rel=1e-9)
+        assert len(world.truth().points) * world._body.volume == pytest.approx(volume(CUBE) * 1e9, rel=1e-9)
     assert forces[1] == pytest.approx(forces[0], rel=0.03)
 
 

@@ -233,24 +233,27 @@ def escape(world: World) -> Iterator[Targets]:
     yield {}
 
 
-def poisoned(times: int) -> Callable[..., Any]:
-    """`attempt` that puts a NaN into a velocity before the 3rd launch, and before the ones after it: `times` in all."""
+def poisoned(name: str, times: int) -> Callable[..., Any]:
+    """The function `name` of health, which worlds call with their arrays before a launch, puts a NaN into a velocity.
+
+    Before the 3rd launch, and before the ones after it: `times` in all.
+    """
     launches = 0
 
-    def attempt(arrays: Mapping[str, np.ndarray], launch: Any, where: Any) -> Any:
+    def spoilt(arrays: Mapping[str, np.ndarray], *others: Any) -> Any:
         nonlocal launches
         launches += 1
         if 3 <= launches < 3 + times:
             velocity = arrays.get("velocity", arrays.get("gel_velocity"))
             assert velocity is not None
             velocity[(0,) * velocity.ndim] = math.nan
-        return health.attempt(arrays, launch, where)
+        return getattr(health, name)(arrays, *others)
 
-    return attempt
+    return spoilt
 
 
-def in_all(attribute: str, value: Any) -> dict[str, Any]:
-    return {f"{module}.{attribute}": value for module in ("hybrid", "press", "seed")}
+def with_nan(times: int) -> dict[str, Any]:
+    return {"hybrid.copies": times, "press.copies": times, "seed.attempt": times}
 
 
 TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
@@ -312,10 +315,10 @@ CASES: dict[str, Case] = {
     **{f"NaN in {name}": Case(cube(), poison(name), ("seed",)) for name in ("deformation_gradient", "stress")},
     "NaN in gel_velocity": Case(BALL, poison("gel_velocity"), PRESS),
     "infinite velocity": Case(cube(), poison("velocity", math.inf)),
-    "a NaN on the way": Case(cube(), squeeze_by(1.0e-3, 1), patch=in_all("attempt", 1)),
-    "a NaN on the way, press": Case(BALL, push(0.8e-3), PRESS, in_all("attempt", 1)),
-    "NaNs all the way": Case(cube(), squeeze_by(1.0e-3, 1), patch=in_all("attempt", ALWAYS)),
-    "NaNs all the way, press": Case(BALL, push(0.8e-3), PRESS, in_all("attempt", ALWAYS)),
+    "a NaN on the way": Case(cube(), squeeze_by(1.0e-3, 1), patch=with_nan(1)),
+    "a NaN on the way, press": Case(BALL, push(0.8e-3), PRESS, with_nan(1)),
+    "NaNs all the way": Case(cube(), squeeze_by(1.0e-3, 1), patch=with_nan(ALWAYS)),
+    "NaNs all the way, press": Case(BALL, push(0.8e-3), PRESS, with_nan(ALWAYS)),
     "a particle far away": Case(cube(), escape),
 }
 
@@ -334,8 +337,8 @@ def run(name: str, physics: str) -> Outcome:
     with ExitStack() as stack:
         for target, value in case.patch.items():
             module, _, attribute = target.partition(".")
-            if attribute == "attempt":
-                value = poisoned(value)
+            if attribute in ("attempt", "copies"):
+                value = poisoned(attribute, value)
             stack.enter_context(mock.patch.object(modules[module], attribute, value))
         try:
             world = make_world(case.scene("seed" if physics == "seed" else "hybrid"))

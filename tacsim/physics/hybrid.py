@@ -119,7 +119,7 @@ def grid_update(
     dt, cell, damping = facts[env, STEP], facts[env, BODY_CELL], facts[env, BODY_DAMPING]
     origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
     weight = vec3(facts[env, GRAVITY], facts[env, GRAVITY + 1], facts[env, GRAVITY + 2])
-    push = vec3(0.0)  # total contact force on the body, world axes
+    push = facts[env, BODY_MASS] * counts[env, PARTICLES] * weight  # total force on the body: weight and contact
     for g in ti.static(range(2)):
         push -= rotation(drive, env, it, g) @ part_sum(partial, env, FORCE + 6 * g)
     mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
@@ -268,6 +268,10 @@ class HybridWorld:
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._speed = scene.settling.mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
+        # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
+        force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
+        self._weight = force * self._body.volume * len(points)  # [N]
+        gravity = force / self._body.density  # [1/mm]
         facts = {
             **self._gel.facts(), **self._body.facts(),
             GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
@@ -278,6 +282,7 @@ class HybridWorld:
             STIFFNESS: reduced / self._dt**2,
             FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
             HOUSING: -1.0 if housing is None else housing * MM,
+            GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
         }  # fmt: skip
         self._facts[0, list(facts)] = list(facts.values())
 
@@ -346,7 +351,8 @@ class HybridWorld:
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         span = (last - first) * self._dt
-        margin = 2 * self._body.cell + 2 * span * max(self._speed, self.scene.settling.mach)
+        fall = self._facts[0, LIGHTNESS] * float(np.linalg.norm(self._facts[0, GRAVITY : GRAVITY + 3])) * span
+        margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, self.scene.settling.mach)
         where = path.place(self._poses, first, last)
         x = self._particles.x()
         require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
@@ -371,4 +377,6 @@ class HybridWorld:
         backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
-        return Reading(contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))
+        return Reading(
+            contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half), self._weight
+        )

@@ -18,6 +18,7 @@ UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
     "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
     "speed": {"m/s": 1.0, "mm/s": 1e-3},
+    "acceleration": {"m/s^2": 1.0, "mm/s^2": 1e-3},
     "density": {"kg/m^3": 1.0, "g/cm^3": 1e3},
 }
 # pydantic leaves the bounds of a validated number under its own names in the JSON schema.
@@ -98,6 +99,8 @@ Angle = Annotated[float, Quantity("angle")]  # [rad]
 Time = Annotated[float, Quantity("time")]  # [s]
 Force = Annotated[float, Quantity("force")]  # [N]
 Speed = Annotated[float, Quantity("speed")]  # [m/s]
+Acceleration = Annotated[float, Quantity("acceleration")]  # [m/s^2]
+Density = Annotated[float, Quantity("density")]  # [kg/m^3]
 
 
 class Facts(BaseModel):

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from tacsim.quantity import Angle, Facts, Length, Pressure
+from tacsim.quantity import Acceleration, Angle, Density, Facts, Length, Pressure
 
 Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
 Modulus = Annotated[Pressure, Field(ge=1.0, le=1e12)]  # from a foam of liquid to beyond diamond [Pa]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
+Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
 # particle spacing and gel element size [m] of each preset
@@ -43,6 +44,8 @@ class BodyMaterial(Facts):
     yield_strain: Annotated[float, Field(gt=0, lt=1)] | None = None  # k = sigma_y / (2 mu), Frobenius norm
     # H: growth of the uniaxial yield stress by equivalent plastic strain [Pa]
     hardening_modulus: Annotated[Pressure, Field(ge=0, le=1e12)] = 0.0
+    # Weight only: inertia is scaled (tacsim.physics). Plasticine; a guess within the 1.5 to 2 g/cm^3 usually told.
+    density: Annotated[Density, Field(gt=0, le=1e5)] = 1700.0
     source: str = ""
 
     @model_validator(mode="after")
@@ -157,6 +160,7 @@ class Scene(Facts):
     body: Body | None = Body()
     indenter: Indenter | None = None
     friction: dict[Literal["lower", "upper"], Annotated[float, Field(ge=0, le=5)]] = {"lower": 0.6, "upper": 0.6}
+    gravity: tuple[Along, Along, Along] = (0.0, 0.0, 0.0)  # world axes [m/s^2]; acts on the body
     settling: Settling = Settling()
 
     @model_validator(mode="after")
@@ -169,6 +173,9 @@ class Scene(Facts):
             raise ValueError(
                 "physics 'seed' has no hardening; use physics 'hybrid', or leave out the material's hardening_modulus"
             )
+        if any(self.gravity) and (self.physics == "seed" or self.body is None):
+            what = "physics 'seed' has no gravity" if self.physics == "seed" else "gravity has no body to act on"
+            raise ValueError(f"{what}; use physics 'hybrid' with a body, or set gravity to [0, 0, 0]")
         missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
         if missing:
             raise ValueError(f"friction of the surface '{missing[0]}' is missing; give both lower and upper")

@@ -104,8 +104,8 @@ def markdown(report: Report) -> str:
         parts += ["## Failed", *(f"- {f.case}, {f.method}, {f.resolution}: {f.cause}" for f in report.failures)]
     parts += [
         "## Not measured",
-        "`incline`: the worlds have no gravity; sliding friction is measured by `sliding_force` instead. Whether hard "
-        "cases end their process is counted by a test, `test_no_case_ended_the_process` in `tests/stability`.",
+        "Whether hard cases end their process is counted by a test, `test_no_case_ended_the_process` in "
+        "`tests/stability`.",
     ]
     return "\n\n".join(parts) + "\n"
 

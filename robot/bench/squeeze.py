@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from robot.bench.cache import cached
 from robot.bench.measure import Measurement, timed
+from robot.bench.roughness import print_roughness
 from robot.bench.runner import Case
 from tacsim.interface import Pose
 from tacsim.physics.world import MoveStats, World, make_world
@@ -173,6 +174,34 @@ def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
     ]  # fmt: skip
 
 
+ROUGH = {"draft": (2e-3, 3e-3), "standard": (3e-3,)}  # squeezes whose prints are judged [m]
+
+
+def roughness(preset: str, repeat: int) -> list[Measurement]:
+    """What the sampling of the cube prints on the lower gel, above its local form (robot/bench/roughness.py)."""
+    samplings: tuple[Literal["lattice", "random"], ...] = ("lattice", "random")
+    return [_rough_row(preset, sampling, by, repeat) for sampling in samplings for by in ROUGH[preset]]
+
+
+def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, repeat: int) -> Measurement:
+    scene = squeeze_scene(preset)
+    assert scene.body is not None
+    body = scene.body.model_copy(update={"sampling": sampling})
+    world = touching(scene.model_copy(update={"body": body}))
+    begin = world.snapshot()
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        return close(world, by)
+
+    timing, stats = timed(run, repeat, warm=lambda: None)
+    error = print_roughness(world.surface("lower"))
+    return Measurement(
+        timing, error * 1e6, "µm rms", "the print's own local form", f"{sampling}, {by * 1e3:g} mm", stats.substeps, {},
+        "" if stats.settled else "not settled",
+    )  # fmt: skip
+
+
 SEED_DRAFT = "particles 0.5 mm, dx 1 mm"
 PRESETS = {"draft": "particles 0.5 mm, gel 1 mm", "standard": "particles 0.25 mm, gel 0.5 mm"}
 
@@ -199,4 +228,11 @@ def _cases(physics: str, method: str) -> tuple[Case, ...]:
     )
 
 
-CASES = (*_cases("hybrid", "tacsim"), *_cases("seed", "seed"))
+CASES = (
+    *_cases("hybrid", "tacsim"),
+    *_cases("seed", "seed"),
+    *(
+        Case("squeeze", "roughness", "tacsim", PRESETS[preset], partial(roughness, preset), long=preset == "standard")
+        for preset in ROUGH
+    ),
+)

@@ -103,6 +103,7 @@ class Reading:
     """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
 
     moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
+    load: external force on the body besides contact, world axes; None is none.
     """
 
     contact: NDArray[np.float64]  # (gels, 3)
@@ -111,19 +112,21 @@ class Reading:
     overlap: float  # [mm]
     guard_hits: int
     moment: NDArray[np.float64] | None = None  # (gels, 3)
+    load: NDArray[np.float64] | None = None  # (3,) of the body from elsewhere: its weight
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
     """Largest force imbalance, or change of force or moment since `before`, relative to the largest force [-].
 
-    `balanced`: the contact forces of all gels must add up to zero (a free body between them).
+    `balanced`: the contact forces on all gels must add up to the body's load: zero without weight (a free body).
     """
     scale = max(float(np.abs(now.contact).max()), now.floor)
     parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
     if now.moment is not None and before.moment is not None:  # a twist settles later than the forces
         parts.append(np.abs(now.moment - before.moment).max())
     if balanced:
-        parts.append(np.abs(now.contact.sum(axis=0)).max())
+        load = 0.0 if now.load is None else now.load
+        parts.append(np.abs(now.contact.sum(axis=0) - load).max())
     return float(max(parts)) / scale
 
 

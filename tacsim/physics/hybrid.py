@@ -133,7 +133,7 @@ def grid_update(
     dt, cell, damping = facts[env, STEP], facts[env, BODY_CELL], facts[env, BODY_DAMPING]
     origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
     weight = vec3(facts[env, GRAVITY], facts[env, GRAVITY + 1], facts[env, GRAVITY + 2])
-    push = vec3(0.0)  # total contact force on the body, world axes
+    push = facts[env, BODY_MASS] * counts[env, PARTICLES] * weight  # total force on the body: weight and contact
     for g in ti.static(range(2)):
         push -= rotation(drive, env, it, g) @ part_sum(partial, env, FORCE + 6 * g)
     mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
@@ -330,6 +330,10 @@ class HybridWorld:
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._speed = scene.settling.mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
+        # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
+        force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
+        self._weight = force * self._body.volume * len(self._state.particles.x(index))  # [N]
+        gravity = force / self._body.density  # [1/mm]
         facts = {
             **self._gel.facts(), **self._body.facts(),
             GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
@@ -340,6 +344,7 @@ class HybridWorld:
             STIFFNESS: reduced / self._dt**2,
             FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
             HOUSING: -1.0 if housing is None else housing * MM,
+            GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
         }  # fmt: skip
         self._state.facts[index, list(facts)] = list(facts.values())
 
@@ -416,7 +421,9 @@ class HybridWorld:
         """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
         state, index, path = self._state, self._index, launch.path
         span = (launch.last - launch.first) * self._dt
-        margin = 2 * self._body.cell + 2 * span * max(self._speed, self.scene.settling.mach)
+        weight = float(np.linalg.norm(state.facts[index, GRAVITY : GRAVITY + 3]))
+        fall = float(state.facts[index, LIGHTNESS]) * weight * span
+        margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, self.scene.settling.mach)
         where = path.place(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
         require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
@@ -439,4 +446,6 @@ class HybridWorld:
         backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
-        return Reading(contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))
+        return Reading(
+            contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half), self._weight
+        )

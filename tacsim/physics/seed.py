@@ -86,6 +86,8 @@ class SeedWorld:
             raise ValueError("physics 'seed' simulates a body between two gels; this scene has none (use 'hybrid')")
         if scene.body.material.hardening_modulus > 0:
             raise ValueError("physics 'seed' has no hardening (use 'hybrid', or leave out hardening_modulus)")
+        if any(scene.gravity):
+            raise ValueError("physics 'seed' has no gravity (use 'hybrid', or set gravity to [0, 0, 0])")
         start()
         self.scene = scene
         h = scene.spacing * MM

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import PEAK, plan, ramp
+from tacsim.physics.controller import PEAK, Reading, plan, ramp, residual
 
 
 def test_ramp_starts_and_ends_at_rest() -> None:
@@ -41,3 +41,15 @@ def test_refining_cuts_the_same_path_finer() -> None:
 
 def test_no_motion_needs_no_substeps() -> None:
     assert plan([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0).substeps == 0
+
+
+def test_contact_forces_balance_the_weight_of_the_body() -> None:
+    weight = np.array([0.0, 0.3, -0.4])
+    contact = np.array([[0.0, 0.3, -1.4], [0.0, 0.0, 1.0]])  # on the gels
+    hung = Reading(contact, contact, 0.1, 0.0, 0, load=weight)
+    assert residual(hung, hung, balanced=True) == pytest.approx(0.0, abs=1e-12)
+    weightless = replace(hung, load=None)
+    assert residual(weightless, weightless, balanced=True) == pytest.approx(0.4 / 1.4)
+    falling = replace(hung, contact=np.zeros((2, 3)), backing=np.zeros((2, 3)))
+    assert residual(falling, falling, balanced=True) == pytest.approx(0.4 / 0.1)
+    assert residual(falling, falling, balanced=False) == 0.0

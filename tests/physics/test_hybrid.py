@@ -164,3 +164,28 @@ def test_an_impossible_motion_ends_in_an_error_or_a_finite_state() -> None:
 def test_unknown_frames_are_refused() -> None:
     with pytest.raises(KeyError, match="no driven frame middle"):
         world().move({"middle": Pose()})
+
+
+@pytest.mark.parametrize("g", [-9.81, -200.0])
+def test_a_body_presses_with_its_weight(g: float) -> None:
+    """Let go on the lower gel, the upper one far away; heavy clay needs no more than the scene's own facts."""
+    heavy = BodyMaterial(density=2500.0)
+    w = world(
+        Body(geometry=CUBE.geometry, material=heavy), gravity=(0.0, 0.0, g),
+        gel={"size": (0.012, 0.012, 0.004)}, settling={"tolerance": 1e-3, "max_substeps": 6000},
+    )  # fmt: skip
+    stats = w.move(shift(w, "upper", (0, 0, 1e-3)))
+    assert stats.settled and stats.guard_hits == 0
+    weight = 2500.0 * 6e-3 * 6e-3 * 5e-3 * -g
+    assert -w.wrench("lower")[2] == pytest.approx(weight, rel=5e-3)
+    assert np.abs(w.wrench("lower")[:2]).max() < 1e-3 * weight
+    assert not w.wrench("upper").any()
+
+
+def test_the_upper_gel_carries_what_falls_up_and_both_differ_by_the_weight() -> None:
+    weight = 1700.0 * 6e-3 * 6e-3 * 5e-3 * 500.0
+    w = world(gravity=(0.0, 0.0, 500.0), settling={"tolerance": 2e-3, "max_substeps": 6000})
+    squeeze(w, 0.4e-3)
+    lower, upper = -w.wrench("lower")[2], -w.wrench("upper")[2]
+    assert lower > weight
+    assert upper - lower == pytest.approx(weight, rel=2e-2)

@@ -258,3 +258,9 @@ def test_a_body_that_hardens_is_refused() -> None:
     hard = Body(material=BodyMaterial(yield_stress=30e3, hardening_modulus=1e5))
     with pytest.raises(ValueError, match="physics 'seed' has no hardening"):
         SeedWorld(scene().model_copy(update={"body": hard}))
+
+
+def test_gravity_is_refused() -> None:
+    """Also where nobody has validated the scene."""
+    with pytest.raises(ValueError, match="physics 'seed' has no gravity"):
+        SeedWorld(scene().model_copy(update={"gravity": (0.0, 0.0, -9.81)}))

@@ -31,6 +31,7 @@ from tacsim.quantity import UNITS, Length, parse
         ("33 ms", "time", 0.033),
         ("50 mN", "force", 0.05),
         ("10 mm/s", "speed", 0.01),
+        ("9810 mm/s^2", "acceleration", 9.81),
         ("1.8 g/cm^3", "density", 1800.0),
         (3, "length", 3.0),
         (0.5, "pressure", 0.5),

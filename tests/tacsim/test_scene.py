@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from tacsim.optics.geometry import CanonicalGrid
-from tacsim.scene import Body, BodyMaterial, Box, GelMaterial, Scene, Sphere
+from tacsim.scene import Body, BodyMaterial, Box, GelMaterial, Indenter, Scene, Sphere
 
 
 @pytest.mark.parametrize(
@@ -75,3 +75,14 @@ def test_the_seed_scheme_refuses_a_body_that_hardens() -> None:
     body = Body(material=BodyMaterial(yield_stress=30e3, hardening_modulus=1e5))
     with pytest.raises(ValidationError, match="physics 'seed' has no hardening; use physics 'hybrid'"):
         Scene(physics="seed", body=body)
+
+
+def test_gravity_is_read_with_its_unit_and_needs_a_body_that_can_fall() -> None:
+    assert Scene.model_validate({"gravity": [0, 0, "-9810 mm/s^2"]}).gravity == pytest.approx((0, 0, -9.81))
+    assert BodyMaterial.model_validate({"density": "1.7 g/cm^3"}) == BodyMaterial()
+    with pytest.raises(ValidationError, match="physics 'seed' has no gravity; use physics 'hybrid'"):
+        Scene(physics="seed", gravity=(0.0, 0.0, -9.81))
+    with pytest.raises(ValidationError, match="gravity has no body to act on"):
+        Scene(body=None, indenter=Indenter(), gravity=(0.0, 0.0, -9.81))
+    with pytest.raises(ValidationError, match="gravity"):
+        Scene(gravity=(0.0, 0.0, -1e9))

@@ -15,16 +15,10 @@ with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the st
     warnings.simplefilter("ignore")
     import taichi as ti
 
-DEVICES = ("cpu", "cuda")
-DEVICE = os.environ.get("TACSIM_DEVICE", "cpu")  # kernels are laid out for one of them when they are imported
-if DEVICE not in DEVICES:
-    raise ValueError(f"TACSIM_DEVICE must be one of {', '.join(DEVICES)}, found '{DEVICE}'")
-CPU = DEVICE == "cpu"
-
 _running: tuple[str, int] | None = None  # arch, process
 
 
-def start(arch: str = DEVICE, threads: int | None = None) -> str:
+def start(arch: str = "cpu", threads: int | None = None) -> str:
     """Starts Taichi if it does not run yet; returns the arch in use.
 
     Raises RuntimeError for a second arch in one process, and in a forked child, where kernels would hang.

@@ -115,7 +115,7 @@ class GelState:
         row = ny + 1
         nodes = (nx + 1) * row
         width = padded(nodes)
-        pieces = PARTS // gels if PARTS > 1 else 1
+        pieces = PARTS // gels
         blocks = -(-nodes // LANES)
         halo = -(-(row + 1) // LANES)
         longest = -(-blocks // pieces)

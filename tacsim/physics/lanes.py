@@ -3,16 +3,16 @@
 Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
 side by side, starting from stores to neighbouring addresses that it has seen before. Hence `real` holds one number of
 eight neighbours (particles, elements, nodes), arrays keep these eight side by side, and `put` and `anchor` store in the
-way that is recognised. On a GPU, threads are the lanes and LANES is 1.
+way that is recognised.
 
 Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
 a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
 """
 
-from tacsim.runtime import CPU, ti
+from tacsim.runtime import ti
 
-LANES = 8 if CPU else 1
-PARTS = 4 if CPU else 1
+LANES = 8  # floats in a vector register of AVX2
+PARTS = 4
 
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tacsim.config import ConfigError, config_root, load_rig, load_scene, load_sensor
 
-SCENE_KEYS = "name, physics, preset, particle_spacing, element_size, gel, body, indenter, friction, settling"
+SCENE_KEYS = "name, physics, preset, particle_spacing, element_size, gel, body, indenter, friction, gravity, settling"
 LENGTH = "length > 0 m, bare in m or with a unit (m, mm, cm, um)"
 
 

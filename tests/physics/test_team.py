@@ -1,0 +1,65 @@
+"""Threads of one environment: what comes out does not depend on them, and nobody waits for ever."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tacsim.interface import Pose
+from tacsim.physics import team
+from tacsim.physics.batch import Batch
+from tacsim.physics.press import PressWorld
+from tacsim.scene import Gel, Indenter, Scene, Sphere
+
+
+def scene(radius: float) -> Scene:
+    return Scene(body=None, indenter=Indenter(geometry=Sphere(radius=radius)), gel=Gel(size=(8e-3, 8e-3, 4e-3)))
+
+
+def down(world: PressWorld) -> dict[str, Pose]:
+    return {"indenter": Pose(world.pose("indenter").position - [0.0, 0.0, 0.3e-3])}
+
+
+@pytest.mark.skipif(team.cores() < 2, reason="one processor: no team to compare")
+def test_any_team_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = []
+    for chosen in (min, max):
+        monkeypatch.setattr(team._Pace, "choose", lambda pace, chosen=chosen: chosen(pace.sizes))
+        world = PressWorld(scene(3e-3))
+        world.move(down(world))
+        states.append(world.snapshot())
+    assert all(states[0][name].tobytes() == states[1][name].tobytes() for name in states[0])
+
+
+@pytest.mark.parametrize("moving", [0, 2])
+def test_one_of_three_moves_with_the_largest_team(moving: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Members of a team must never share a thread: they would wait for each other for ever."""
+    monkeypatch.setattr(team._Pace, "choose", lambda pace: max(pace.sizes))
+    batch = Batch([scene(radius) for radius in (2e-3, 3e-3, 4e-3)])
+    targets = [down(world) if index == moving else None for index, world in enumerate(batch.worlds)]  # type: ignore[arg-type]
+    ends = batch.move(targets)
+    assert [end is not None for end in ends] == [index == moving for index in range(3)]
+    assert np.isfinite(batch.worlds[moving].wrench("lower")).all()
+
+
+def test_the_launch_that_compiles_says_nothing_about_pace() -> None:
+    pace = team._Pace((1, 2))
+    for seconds in (100.0, 2.0, 1.0, 2.0, 1.0):
+        size = pace.choose()
+        pace.note(size, seconds if seconds == 100.0 else {1: 2.0, 2: 1.0}[size])
+    assert pace.choose() == 2
+    assert set(pace.seconds) == {1, 2} and max(pace.seconds.values()) < 3.0
+
+
+@pytest.mark.parametrize("threads", ["0", "two", "-1", ""])
+def test_a_wrong_number_of_threads_is_refused(threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TACSIM_THREADS", threads)
+    with pytest.raises(ValueError, match="TACSIM_THREADS must be a whole number"):
+        team.team_sizes(1)
+
+
+def test_teams_fit_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(team, "cores", lambda: 4)
+    assert [team.team_sizes(n) for n in (1, 2, 3, 8)] == [(1, 2, 4), (1, 2), (1,), (1,)]
+    monkeypatch.setenv("TACSIM_THREADS", "1")
+    assert team.team_sizes(1) == (1,)

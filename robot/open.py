@@ -73,7 +73,7 @@ def make_env(
 
 def _check_parts(facts: RigFacts) -> None:
     """All parts of a rig go by one clock, and every recorded sensor names its recording."""
-    parts = {f"arms.{name}": arm.driver for name, arm in facts.arms.items()}
+    parts: dict[str, str] = {f"arms.{name}": arm.driver for name, arm in facts.arms.items()}
     parts |= {f"sensors.{name}": sensor.driver for name, sensor in facts.sensors.items()}
     for key, driver in parts.items():
         if driver != facts.clock:

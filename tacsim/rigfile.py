@@ -7,11 +7,10 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from tacsim.hardware import CameraSensorFacts, HardwareStart, KeepOut, Name, UrArmFacts
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
 from tacsim.quantity import Facts, Force, Length, Speed, Time
 from tacsim.scene import Scene
-
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 
 class SimArmFacts(Facts):
@@ -50,8 +49,8 @@ class ReplaySensorFacts(Facts):
     reference: str | None = None  # picture without contact; None: the first frame
 
 
-ArmFacts = Annotated[SimArmFacts | ReplayArmFacts, Field(discriminator="driver")]
-SensorFacts = Annotated[SimSensorFacts | ReplaySensorFacts, Field(discriminator="driver")]
+ArmFacts = Annotated[SimArmFacts | UrArmFacts | ReplayArmFacts, Field(discriminator="driver")]
+SensorFacts = Annotated[SimSensorFacts | CameraSensorFacts | ReplaySensorFacts, Field(discriminator="driver")]
 
 
 class SqueezeFacts(Facts):
@@ -89,13 +88,17 @@ class RigFacts(Facts):
     """One rig file."""
 
     name: str
-    clock: Literal["sim", "replay"]
+    clock: Literal["sim", "wall", "replay"]
     period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
     task: TaskFacts | None = None
     scene: Scene | None = None  # overrides the task's scene
     arms: dict[Name, ArmFacts] = {}
     sensors: dict[Name, SensorFacts] = Field(min_length=1)
     canonical: CanonicalGrid = CanonicalGrid()
+    # Mock rigs: a control period ends when the arms rest and the twin has drawn the picture for just that pose.
+    lock_step: bool = True
+    keep_out: tuple[KeepOut, ...] = Field(default=(), max_length=16)
+    start: HardwareStart = HardwareStart()  # of rigs that go by the wall clock
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -111,4 +114,12 @@ class RigFacts(Facts):
                         "at": ("sensors", name, sensor.driver, "arm"),
                     },
                 )
+        for index, apart in enumerate(self.keep_out):
+            for name in apart.arms:
+                if name not in self.arms:
+                    raise PydanticCustomError(
+                        "no_such_arm",
+                        "no arm '{arm}'; allowed: {arms}",
+                        {"arm": name, "arms": ", ".join(self.arms) or "(none)", "at": ("keep_out", index, "arms")},
+                    )
         return self

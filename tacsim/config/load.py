@@ -71,8 +71,11 @@ def _has(root: Node, key: str) -> bool:
 
 
 def _simulated(root: Node) -> bool:
+    """A driver 'sim', or a mock sensor: what it sees is simulated."""
     parts = [*_entries(root, "arms"), *_entries(root, "sensors")]
-    return any(part.items["driver"].value == "sim" for part in parts if "driver" in part.items)
+    return any(part.items["driver"].value == "sim" for part in parts if "driver" in part.items) or any(
+        _has(sensor, "mock") for sensor in _entries(root, "sensors")
+    )
 
 
 def _entries(root: Node, key: str) -> list[Node]:

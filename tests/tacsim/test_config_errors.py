@@ -165,7 +165,7 @@ def test_an_arm_that_is_not_there_is_reported_at_the_sensor(folder: Path) -> Non
 
 OVERRIDES = {
     "scene.presett=draft": f"scene.presett: unknown key; allowed: {SCENE_KEYS}; did you mean 'preset'?",
-    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, sensors, canonical; did you mean 'scene'?",
+    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, sensors, canonical, lock_step, keep_out, start; did you mean 'scene'?",
     "scene.body.material=doh": "scene.body.material: no material 'doh'; allowed: cold-plasticine, dough, modelling-clay, seed, silicone, "
     "soft-clay; did you mean 'dough'?",
     "scene=missing.yaml": "scene: there is no file 'missing.yaml'",
@@ -173,7 +173,7 @@ OVERRIDES = {
     "name.x=1": "name.x: 'name' is 'sim', which has no keys",
     "sensors.upper.model.lighting.lights.3.colour=[1, 1, 1]": "sensors.upper.model.lighting.lights.3: no such entry; "
     "allowed: an index from 0 to 2",
-    "clock={a: 1}": "clock: a mapping does not fit; allowed: sim | replay",
+    "clock={a: 1}": "clock: a mapping does not fit; allowed: sim | wall | replay",
     "scene.friction.upper=.nan": ".nan is not finite; give a finite number",
     "period=[": "not valid YAML: while parsing a flow node, expected the node content, but found '<stream end>'",
     "period=&a 1": "anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name",

@@ -82,7 +82,7 @@ def replay(dump: Dump, world: World) -> Replay:
     """Runs the motion again, with all its retries; leaves `world` in the state before it, or in the new one."""
     with no_dumps():
         try:
-            return Replay(None, world.move(dump.targets), False)
+            return Replay(None, world.move(dump.targets, duration=dump.facts.duration), False)
         except SimulationDiverged as failure:
             same = (failure.cause, failure.where) == (dump.facts.cause, dump.facts.where)
             for moment, state in (("good", failure.good), ("failed", failure.failed)):

@@ -95,6 +95,8 @@ class RigFacts(Facts):
     arms: dict[Name, ArmFacts] = {}
     sensors: dict[Name, SensorFacts] = Field(min_length=1)
     canonical: CanonicalGrid = CanonicalGrid()
+    # Simulated: each period is lived through in real time by true inertia (slow); the reset stays quasi-static.
+    dynamic: bool = False
     # Mock rigs: a control period ends when the arms rest and the twin has drawn the picture for just that pose.
     lock_step: bool = True
     keep_out: tuple[KeepOut, ...] = Field(default=(), max_length=16)

@@ -28,6 +28,7 @@ class GelMaterial(Facts):
 
     youngs_modulus: Modulus = 0.145e6
     poisson_ratio: PoissonRatio = 0.48
+    density: Annotated[Density, Field(gt=0, le=1e5)] = 1000.0  # of dynamic motions only; a guess near silicone's
     source: str = ""
 
 
@@ -44,7 +45,7 @@ class BodyMaterial(Facts):
     yield_strain: Annotated[float, Field(gt=0, lt=1)] | None = None  # k = sigma_y / (2 mu), Frobenius norm
     # H: growth of the uniaxial yield stress by equivalent plastic strain [Pa]
     hardening_modulus: Annotated[Pressure, Field(ge=0, le=1e12)] = 0.0
-    # Weight only: inertia is scaled (tacsim.physics). Plasticine; a guess within the 1.5 to 2 g/cm^3 usually told.
+    # Weight and dynamic motions; inertia is scaled elsewhere. Plasticine: a guess within the 1.5 to 2 g/cm^3 told.
     density: Annotated[Density, Field(gt=0, le=1e5)] = 1700.0
     source: str = ""
 

@@ -30,12 +30,15 @@ class NoTouch(RuntimeError):
 class SimClock:
     """Simulated time. `tick` drives all arms to what they were commanded and advances time by one period.
 
+    `dynamic`: each period is lived through in its own time, by true inertia (tacsim.physics.inertia); otherwise it ends
+    in the state of rest.
     `version` counts the states of the world, so that a picture is rendered once a state.
     """
 
-    def __init__(self, world: World, period: float) -> None:
+    def __init__(self, world: World, period: float, dynamic: bool = False) -> None:
         self._world = world
         self._period = period
+        self._dynamic = dynamic
         self._targets: dict[str, Pose] = {}
         self._limited: dict[str, bool] = {}  # by frame, of the last period
         self._time = 0.0
@@ -60,10 +63,12 @@ class SimClock:
         self._targets = {}
 
     def tick(self) -> None:
-        """Raises SimulationDiverged. A world that is settled and commanded to stay is left as it is."""
+        """Raises SimulationDiverged. A world at rest that is commanded to stay is left as it is."""
         targets, self._targets = self._targets, {}
         before = {frame: self._world.pose(frame) for frame in targets}
-        if targets or (self.stats is not None and not self.stats.settled):
+        if self._dynamic:
+            self.stats = self._world.move(targets, duration=self._period)
+        elif targets or (self.stats is not None and not self.stats.settled):
             self.stats = self._world.move(targets)
         elif self.stats is not None:
             self.stats = replace(self.stats, substeps=0, hold=0)

@@ -83,12 +83,18 @@ class Path:
         return Place(f"in {part}", poses)
 
 
-def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float) -> Path:
-    """A path whose fastest point moves at peak Mach `mach`; `lever` [mm] turns rotation into speed at the gel's rim."""
+def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
+    """The way of the fastest point [mm]; `lever` [mm] turns rotation into a way at the gel's rim."""
     length = 0.0
     for a, b in zip(start, end, strict=True):
         turn = float((Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).magnitude())
         length = max(length, float(np.linalg.norm(b.position - a.position)) * MM + turn * lever)
+    return length
+
+
+def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float) -> Path:
+    """A path whose fastest point moves at peak Mach `mach`."""
+    length = longest_way(start, end, lever)
     substeps = math.ceil(PEAK * length / (mach * dt)) if length > 0 else 0
     return Path(start, end, substeps, dt)
 
@@ -216,9 +222,7 @@ def advance_all(
 
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Goes along `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
-    seen: list[Reading] = []
-    for first in range(0, path.substeps, CHECK):
-        seen.append((yield Launch(path, first, min(first + CHECK, path.substeps))))
+    seen = yield from _driven(path)
     rest = replace(path, start=path.end, substeps=0)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
@@ -229,9 +233,27 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
             worst = residual(seen[-1], seen[-2], balanced)
             if worst <= settling.tolerance:
                 break
+    return _stats(seen, path.substeps, held, worst, settling)
+
+
+def move_in_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path` and holds nowhere; the residual says how far from rest the scene is at the end."""
+    seen = yield from _driven(path)
+    worst = residual(seen[-1], seen[-2], balanced) if len(seen) > 1 else math.inf
+    return _stats(seen, path.substeps, 0, worst, settling)
+
+
+def _driven(path: Path) -> Generator[Launch, Reading, list[Reading]]:
+    seen: list[Reading] = []
+    for first in range(0, path.substeps, CHECK):
+        seen.append((yield Launch(path, first, min(first + CHECK, path.substeps))))
+    return seen
+
+
+def _stats(seen: Sequence[Reading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
     overlap = seen[-1].overlap / MM if seen else 0.0
     hits = sum(reading.guard_hits for reading in seen)
-    return MoveStats(path.substeps + held, held, worst, worst <= settling.tolerance, overlap, hits)
+    return MoveStats(substeps + held, held, worst, worst <= settling.tolerance, overlap, hits)
 
 
 def merged(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:

@@ -62,6 +62,7 @@ class DumpFacts(Facts):
     scene: Scene
     poses: dict[str, Numbers7]  # before the motion
     targets: dict[str, Numbers7]  # asked for
+    duration: float | None = None  # of a dynamic motion [s]
     failed_poses: dict[str, Numbers7]  # at the end of the launch that went wrong; empty if there was none
     health: dict[str, str]  # what the kernels saw in the last launch
     versions: dict[str, str]
@@ -112,7 +113,15 @@ def no_dumps() -> Iterator[None]:
             os.environ[FOLDER] = given
 
 
-def write(folder: Path, scene: Scene, poses: Poses, targets: Poses, before: State, failure: SimulationDiverged) -> Path:
+def write(
+    folder: Path,
+    scene: Scene,
+    poses: Poses,
+    targets: Poses,
+    before: State,
+    failure: SimulationDiverged,
+    duration: float | None = None,
+) -> Path:
     """Writes a dump into a new folder below `folder` and returns it.
 
     poses: of the driven frames before the motion; before: the state then. Raises OSError, DumpError when there are
@@ -132,6 +141,7 @@ def write(folder: Path, scene: Scene, poses: Poses, targets: Poses, before: Stat
         scene=scene,
         poses={name: _numbers(pose) for name, pose in poses.items()},
         targets={name: _numbers(pose) for name, pose in targets.items()},
+        duration=duration,
         failed_poses={name: _numbers(pose) for name, pose in failure.poses.items()},
         health={} if failure.health is None else {k: f"{v:.9g}" for k, v in asdict(failure.health).items()},
         versions=_versions(),

@@ -168,9 +168,14 @@ Seen = TypeVar("Seen")
 
 
 def retried(
-    world: Driven, targets: Mapping[str, Pose], motion: Callable[[int], Generator[Wanted, Seen, MoveStats]]
+    world: Driven,
+    targets: Mapping[str, Pose],
+    motion: Callable[[int], Generator[Wanted, Seen, MoveStats]],
+    duration: float | None = None,
 ) -> Generator[Wanted, Seen, MoveStats]:
     """The motion `motion(refine)`, which drives `world` to `targets` with 1/refine of its step; refine = 1, 2, 4.
+
+    duration: of a dynamic motion [s], for the dump.
 
     Whoever runs it throws in the SimulationDiverged of a launch; the world then rolls back by itself and yields the
     first launch of the next try. After every failure, an interruption included, the world is as it was before. Raises
@@ -195,7 +200,7 @@ def retried(
                 world.restore(before)
                 raise
     failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, world.scene.gel.size)
-    _dump(world, targets, before, failure)
+    _dump(world, targets, duration, before, failure)
     raise failure
 
 
@@ -219,7 +224,9 @@ def _poses(world: Driven) -> dict[str, Pose]:
     return {name: world.pose(name) for name in frames}
 
 
-def _dump(world: Driven, targets: Mapping[str, Pose], before: State, failure: SimulationDiverged) -> None:
+def _dump(
+    world: Driven, targets: Mapping[str, Pose], duration: float | None, before: State, failure: SimulationDiverged
+) -> None:
     """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
     folder = os.environ.get("TACSIM_DUMPS")
     if not folder:
@@ -227,7 +234,7 @@ def _dump(world: Driven, targets: Mapping[str, Pose], before: State, failure: Si
     from tacsim.physics import dump
 
     try:
-        failure.dump = dump.write(Path(folder), world.scene, _poses(world), targets, before, failure)
+        failure.dump = dump.write(Path(folder), world.scene, _poses(world), targets, before, failure, duration)
     except (OSError, ValueError) as error:
         failure.no_dump = f"no dump could be written to {folder}: {error}"
 

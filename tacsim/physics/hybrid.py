@@ -1,5 +1,6 @@
 """Two gels (FEM in their sensor frames) round a plasticine body (MLS-MPM), coupled by contact with friction memory."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -7,7 +8,6 @@ import numpy as np
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.body_surface import surface_points, tangent_planes
-from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
 from tacsim.physics.controller import (
     Launch,
     Motion,
@@ -17,74 +17,51 @@ from tacsim.physics.controller import (
     force_floor,
     merged,
     move_and_settle,
+    move_in_time,
     plan,
     run,
 )
 from tacsim.physics.gel import (
     MM,
     MPA,
-    Corners,
     GelState,
-    Lattice,
-    NodeLanes,
-    Nodes,
-    Skin,
-    Touch,
-    clear_touch,
-    gel_advance,
     gel_facts,
-    gel_forces,
     gel_surface,
     one_lattice,
 )
 from tacsim.physics.health import Health, copies, judged, require_room, retried
-from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, first_of, vec3, vec4
+from tacsim.physics.hybrid_kernels import substeps
+from tacsim.physics.inertia import Inertia, kernel_density, kernel_second, plan_in_time
+from tacsim.physics.lanes import LANES, PARTS, SLOTS
 from tacsim.physics.layout import (
     BACKING,
-    BODY_CELL,
     BODY_DAMPING,
     BODY_MASS,
-    CAPACITY,
     COUNTS,
     FACTS,
     FORCE,
     FRICTION,
     GEL_DAMPING,
+    GEL_DENSITY,
     GRAVITY,
-    GRID,
     HOUSED,
     HOUSING,
     LIGHTNESS,
-    MOTION,
     NUMBERS,
-    ORIGIN,
-    OVERLAP,
-    PARTICLES,
     STEP,
     STEPS,
     STIFFNESS,
-    STRIDE,
 )  # fmt: skip
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.plasticine import (
     BodyFacts,
     BodyState,
-    Masses,
-    Points,
-    Rates,
-    Strains,
-    Sums,
-    Velocities,
     body_facts,
-    clear_masses,
-    grid_to_particles,
-    node_sum,
-    particles_to_grid,
 )
-from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.team import run_team
 from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
-from tacsim.runtime import start, ti
+from tacsim.runtime import start
 from tacsim.sampling import body_points
 from tacsim.scene import GelSurface, Scene
 from tacsim.shapes import extent, volume
@@ -93,165 +70,6 @@ COURANT = 0.4  # dt / (smallest spacing / wave speed)
 ZETA_GEL = 1.0  # zeta in alpha = zeta c / thickness
 ZETA_BODY = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
-
-Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
-ContactMemory = ti.types.ndarray(dtype=vec4, ndim=3)
-
-
-@ti.func
-def row(drive: ti.template(), env, it, g, r):
-    return vec3(drive[env, it, g, r, 0], drive[env, it, g, r, 1], drive[env, it, g, r, 2])
-
-
-@ti.func
-def rotation(drive: ti.template(), env, it, g):
-    return ti.Matrix.rows([row(drive, env, it, g, 0), row(drive, env, it, g, 1), row(drive, env, it, g, 2)])
-
-
-@ti.func
-def part_sum(partial: ti.template(), env, first):
-    """Sum of three numbers over all parts, in their order."""
-    total = vec3(0.0)
-    for part in ti.static(range(PARTS)):
-        total += vec3(partial[env, part, first], partial[env, part, first + 1], partial[env, part, first + 2])
-    return total
-
-
-@ti.func
-def grid_update(
-    env, part, it, drive: ti.template(), masses: ti.template(), velocities: ti.template(), facts: ti.template(),
-    counts: ti.template(), partial: ti.template(),
-):  # fmt: skip
-    """Momentum to velocity; damps towards the affine motion that the two sensors impose, not towards rest.
-
-    A boost is added to every velocity: selective mass scaling of the slowest mode, the rigid translation of a body that
-    hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
-
-    Across the sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides
-    on one sensor must not be dragged back by the other.
-    """
-    dt, cell, damping = facts[env, STEP], facts[env, BODY_CELL], facts[env, BODY_DAMPING]
-    origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
-    weight = vec3(facts[env, GRAVITY], facts[env, GRAVITY + 1], facts[env, GRAVITY + 2])
-    push = facts[env, BODY_MASS] * counts[env, PARTICLES] * weight  # total force on the body: weight and contact
-    for g in ti.static(range(2)):
-        push -= rotation(drive, env, it, g) @ part_sum(partial, env, FORCE + 6 * g)
-    mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
-    boost = ((facts[env, LIGHTNESS] - 1.0) * dt / (facts[env, BODY_MASS] * counts[env, PARTICLES])) * push
-    p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
-    v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
-    w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
-    axis = p1 - p0
-    length2 = axis.norm_sqr() + 1e-12
-    driven = v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr() > 0.0
-    mean_across = mean - axis * (mean.dot(axis) / length2)
-    nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
-    base = env * counts[env, CAPACITY]
-    for i in range(first_of(nx, part, PARTS), first_of(nx, part + 1, PARTS)):
-        for j in range(ny):
-            for k in range(nz):
-                node = (i * ny + j) * nz + k
-                q = node_sum(env, i, node, masses, counts)
-                velocity = vec3(0.0)
-                if q[3] != 0.0:  # a mass that is not a number must show
-                    velocity = vec3(q[0], q[1], q[2]) / q[3] + boost + dt * weight
-                    x = origin + cell * vec3(i, j, k)
-                    t = ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
-                    reference = (1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1))
-                    if driven:
-                        reference = axis * (reference.dot(axis) / length2) + mean_across
-                    velocity -= damping * dt * (velocity - reference)
-                velocities[base + node] = vec4(velocity[0], velocity[1], velocity[2], 0.0)
-
-
-@ti.func
-def touch_gel(
-    env, part, g, it, drive: ti.template(), points: ti.template(), planes: ti.template(), rates: ti.template(),
-    memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(),
-    partial: ti.template(), layers, nx, ny,
-):  # fmt: skip
-    """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes."""
-    rotate = rotation(drive, env, it, g)
-    origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
-    back = rotate.transpose()
-    outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    highest, spacing = contact_ceiling(skin, env, g), 0.5 * facts[env, BODY_CELL]
-    rate = facts[env, STEP] / facts[env, BODY_MASS]
-    total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
-    n, origin_p = counts[env, PARTICLES], env * counts[env, STRIDE]
-    for p in range(first_of(n, part, PARTS), first_of(n, part + 1, PARTS)):
-        at = points[origin_p + p]
-        arm = vec3(at[0], at[1], at[2]) - origin
-        radius = support_radius(planes[origin_p + p], spacing)
-        # one radius to touch, half a spacing for what the contact's memory still bridges
-        if outward.dot(arm) < highest + radius + 0.5 * spacing:  # most of the body is far away: one dot product decides
-            local = back @ arm
-            moving = rates[origin_p + p, 0]
-            relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
-            touching, housed, force, kept = particle_contact(
-                env, part, g, local, relative, memory[env, g, p], radius, skin, touch, facts, layers, nx, ny, partial
-            )
-            memory[env, g, p] = kept
-            if touching:
-                push = rate * (rotate @ force)
-                rates[origin_p + p, 0] = moving + vec4(push[0], push[1], push[2], 0.0)
-                total -= force
-                moment -= local.cross(force)
-                if housed:
-                    on_housing -= force
-        else:
-            memory[env, g, p] = vec4(0.0)
-    for d in ti.static(range(3)):
-        partial[env, part, FORCE + 6 * g + d] = total[d]
-        partial[env, part, FORCE + 6 * g + 3 + d] = moment[d]
-        partial[env, part, HOUSED + 3 * g + d] = on_housing[d]
-
-
-@ti.kernel
-def substeps(
-    team: ti.i32, drive: Drive,
-    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
-    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities,
-    sums: Sums, memory: ContactMemory,
-    facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
-):  # fmt: skip
-    """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
-
-    Two meetings a substep: what is scattered must be whole before it is summed, and summed before it is gathered.
-    """
-    for task in range(sync.shape[0] * team * CHUNK):
-        for _ in range(first_in_chunk(task)):
-            turn, member = task // CHUNK // team, task // CHUNK % team
-            env = sync[turn, WHO]
-            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
-            for it in range(counts[env, STEPS]):
-                for share in range(shares(member, team)):
-                    part = member + share * team
-                    partial[env, part, OVERLAP] = 0.0
-                    clear_touch(env, part, 2, touch)
-                    for g in range(2):
-                        touch_gel(
-                            env, part, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
-                            layers, nx, ny,
-                        )  # fmt: skip
-                    clear_masses(env, part, masses, counts)
-                    particles_to_grid(env, part, points, rates, strains, masses, facts, counts, partial)
-                    gel_forces(
-                        env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
-                        layers, nx, ny,
-                    )  # fmt: skip
-                meet(sync, turn, team, 2 * it + 1)
-                for share in range(shares(member, team)):
-                    part = member + share * team
-                    gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
-                    grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
-                meet(sync, turn, team, 2 * it + 2)
-                for share in range(shares(member, team)):
-                    part = member + share * team
-                    grid_to_particles(
-                        env, part, points, planes, rates, strains, velocities, sums, facts, counts, partial
-                    )
 
 
 class HybridState:
@@ -323,30 +141,69 @@ class HybridWorld:
             "lower": Pose(),
             "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
         }
-        self._dt = COURANT * min(self._body.cell, self._gel.spacing)
-        # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
-        share = self._gel.density * self._gel.spacing * self._body.spacing**2 / 2
-        reduced = 1.0 / (1.0 / self._body.particle_mass + 1.0 / share)
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._speed = scene.settling.mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
-        force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
-        self._weight = force * self._body.volume * len(self._state.particles.x(index))  # [N]
-        gravity = force / self._body.density  # [1/mm]
+        self._pull = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
+        self._weight = self._pull * self._body.volume * len(self._state.particles.x(index))  # [N]
         facts = {
             **self._gel.facts(), **self._body.facts(),
+            FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
+            HOUSING: -1.0 if housing is None else housing * MM,
+        }  # fmt: skip
+        self._state.facts[index, list(facts)] = list(facts.values())
+        self._scaled, self._true = self._scaled_inertia(height * MM), self._true_inertia()
+        self._take(self._scaled)
+
+    # ---------------------------------------------------------------- inertia
+
+    def _scaled_inertia(self, height: float) -> Inertia:
+        """For the way to rest; height: of the body [mm]."""
+        step = COURANT * min(self._body.cell, self._gel.spacing)
+        damping = {
             GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
             # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were
             # lighter by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
             # the step limit.
-            LIGHTNESS: max(1.0, height * MM / self._body.spacing),
-            STIFFNESS: reduced / self._dt**2,
-            FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
-            HOUSING: -1.0 if housing is None else housing * MM,
+            LIGHTNESS: max(1.0, height / self._body.spacing),
+        }  # fmt: skip
+        return Inertia({**self._masses(self._gel.density, self._body.density, step), **damping}, step)
+
+    def _true_inertia(self) -> Inertia:
+        assert self.scene.body is not None
+        second = kernel_second(self._gel, self.scene.gel.material.density)
+        density = kernel_density(self.scene.body.material.density, second)
+        wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
+        step = COURANT * min(self._body.cell / wave, self._gel.spacing)
+        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, LIGHTNESS: 1.0}
+        return Inertia({**self._masses(self._gel.density, density, step), **undamped}, step, second)
+
+    def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
+        """Entries of `facts` that follow from the densities [MPa] and the substep [mm]."""
+        particle = body * self._body.volume
+        # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
+        share = gel * self._gel.spacing * self._body.spacing**2 / 2
+        reduced = 1.0 / (1.0 / particle + 1.0 / share)
+        gravity = self._pull / body  # [1/mm]
+        return {
+            GEL_DENSITY: gel, BODY_MASS: particle, STIFFNESS: reduced / step**2,
             GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
         }  # fmt: skip
-        self._state.facts[index, list(facts)] = list(facts.values())
+
+    def _take(self, inertia: Inertia) -> None:
+        """Answers to forces by `inertia` from now on."""
+        self._inertia = inertia
+        self._state.facts[self._index, list(inertia.facts)] = list(inertia.facts.values())
+
+    def _change(self, inertia: Inertia) -> None:
+        """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
+        if inertia is not self._inertia:
+            b, i = self._state.particles, self._index
+            for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
+                moving[...] = 0.0
+            b.refresh()
+            self._take(inertia)
 
     # ------------------------------------------------------------------ state
 
@@ -362,19 +219,21 @@ class HybridWorld:
     def snapshot(self) -> dict[str, np.ndarray]:
         state = taken(self._arrays(), self._poses)
         state["speed"] = np.array(self._speed)
+        state["true_inertia"] = np.array(float(self._inertia.true))
         return state
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self._poses = put_back(self._arrays(), self.sensors, state)
         self._state.particles.refresh()
         self._speed = float(state["speed"])
+        self._take(self._true if state["true_inertia"] else self._scaled)
 
     def pose(self, name: str) -> Pose:
         return self._poses[name]
 
     def wrench(self, name: str) -> np.ndarray:
         first = FORCE + 6 * self.sensors.index(name)
-        wrench = self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
+        wrench: np.ndarray = self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
         wrench[3:] /= MM
         return wrench
 
@@ -388,29 +247,38 @@ class HybridWorld:
 
     # ----------------------------------------------------------------- motion
 
-    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
-        return run(self.motion(targets, loads), self._advance)
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
+    ) -> MoveStats:
+        return run(self.motion(targets, loads, duration), self._advance)
 
-    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
+    def motion(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
+    ) -> Motion:
         """`move`, a launch at a time."""
         end = merged(self._poses, targets)
         require_loads(loads or {}, self.sensors)
         begin, goals = dict(self._poses), dict(end)
+        a, b, lever = list(begin.values()), list(end.values()), max(self._gel.half)
+        timed = None if duration is None else plan_in_time(a, b, duration, self._true, lever, bool(loads))
 
         def tried(refine: int) -> Motion:
+            self._change(self._scaled if timed is None else self._true)
+            if timed is not None:
+                return move_in_time(replace(timed, refine=refine), self.scene.settling, balanced=True)
             if loads:
                 end.update(goals)
                 return keep_loads(self, begin, end, loads, refine, balanced=True)
-            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            path = replace(self.plan(a, b), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = yield from retried(self, targets, tried)
+        stats = yield from retried(self, targets, tried, duration)
         self._poses = end
         return stats
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
-        return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half))
+        return plan(start, end, self.scene.settling.mach, self._scaled.step, max(self._gel.half))
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         prepared = self.prepare(Launch(path, first, last))
@@ -420,10 +288,12 @@ class HybridWorld:
     def prepare(self, launch: Launch) -> Prepared:
         """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
         state, index, path = self._state, self._index, launch.path
-        span = (launch.last - launch.first) * self._dt
+        span = (launch.last - launch.first) * path.dt
         weight = float(np.linalg.norm(state.facts[index, GRAVITY : GRAVITY + 3]))
         fall = float(state.facts[index, LIGHTNESS]) * weight * span
-        margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, self.scene.settling.mach)
+        drive = path.drive(launch.first, launch.last)
+        driven = max(self.scene.settling.mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
+        margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
         where = path.place(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
         require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
@@ -431,7 +301,7 @@ class HybridWorld:
         good = copies(self._arrays())
         state.facts[index, STEP] = path.step
         Health.clear(state.partial[index])
-        return Prepared(launch, path.drive(launch.first, launch.last), where, good)
+        return Prepared(launch, drive, where, good)
 
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""

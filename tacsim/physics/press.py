@@ -15,6 +15,7 @@ from tacsim.physics.controller import (
     force_floor,
     merged,
     move_and_settle,
+    move_in_time,
     plan,
     run,
 )
@@ -36,8 +37,10 @@ from tacsim.physics.gel import (
     one_lattice,
 )
 from tacsim.physics.health import Health, copies, judged, retried
-from tacsim.physics.hybrid import COURANT, ZETA_GEL, Drive, side_by_side
+from tacsim.physics.hybrid import COURANT, ZETA_GEL, side_by_side
+from tacsim.physics.hybrid_kernels import Drive
 from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
+from tacsim.physics.inertia import Inertia, kernel_second, plan_in_time
 from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3
 from tacsim.physics.layout import (
     BACKING,
@@ -174,16 +177,30 @@ class PressWorld:
         self.scene = scene
         self._state, self._index = PressState([scene]) if state is None else state, index
         self._gel = self._state.gel[index]
-        self._dt = COURANT * self._gel.spacing
+        step = COURANT * self._gel.spacing
+        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL / self._gel.thickness}, step)
+        self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         facts = {
-            **self._gel.facts(), GEL_DAMPING: ZETA_GEL / self._gel.thickness,
-            STIFFNESS: self._gel.density * self._gel.spacing / (2 * self._dt**2), FRICTION: scene.indenter.friction,
+            **self._gel.facts(), STIFFNESS: self._gel.density * self._gel.spacing / (2 * step**2),
+            FRICTION: scene.indenter.friction,
         }  # fmt: skip
         self._state.facts[index, list(facts)] = list(facts.values())
+        self._take(self._scaled)
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
+
+    def _take(self, inertia: Inertia) -> None:
+        """Answers to forces by `inertia` from now on."""
+        self._inertia = inertia
+        self._state.facts[self._index, list(inertia.facts)] = list(inertia.facts.values())
+
+    def _change(self, inertia: Inertia) -> None:
+        """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
+        if inertia is not self._inertia:
+            self._state.gels.v[self._index] = 0.0
+            self._take(inertia)
 
     def _arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
@@ -193,10 +210,13 @@ class PressWorld:
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        return taken(self._arrays(), self._poses)
+        state = taken(self._arrays(), self._poses)
+        state["true_inertia"] = np.array(float(self._inertia.true))
+        return state
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self._poses = put_back(self._arrays(), list(self._poses), state)
+        self._take(self._true if state["true_inertia"] else self._scaled)
 
     def pose(self, name: str) -> Pose:
         return self._poses[name]
@@ -213,29 +233,38 @@ class PressWorld:
     def truth(self) -> None:
         return None
 
-    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
-        return run(self.motion(targets, loads), self._advance)
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
+    ) -> MoveStats:
+        return run(self.motion(targets, loads, duration), self._advance)
 
-    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
+    def motion(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
+    ) -> Motion:
         """`move`, a launch at a time."""
         end = merged(self._poses, targets)
         require_loads(loads or {}, self.sensors)
         begin, goals = dict(self._poses), dict(end)
+        a, b, lever = list(begin.values()), list(end.values()), max(self._gel.half)
+        timed = None if duration is None else plan_in_time(a, b, duration, self._true, lever, bool(loads))
 
         def tried(refine: int) -> Motion:
+            self._change(self._scaled if timed is None else self._true)
+            if timed is not None:
+                return move_in_time(replace(timed, refine=refine), self.scene.settling, balanced=False)
             if loads:
                 end.update(goals)
                 return keep_loads(self, begin, end, loads, refine, balanced=False)
-            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            path = replace(self.plan(a, b), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=False)
 
-        stats = yield from retried(self, targets, tried)
+        stats = yield from retried(self, targets, tried, duration)
         self._poses = end
         return stats
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
-        return plan(start, end, self.scene.settling.mach, self._dt, max(self._gel.half))
+        return plan(start, end, self.scene.settling.mach, self._scaled.step, max(self._gel.half))
 
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         prepared = self.prepare(Launch(path, first, last))

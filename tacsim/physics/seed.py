@@ -178,8 +178,12 @@ class SeedWorld:
 
     # ----------------------------------------------------------------- motion
 
-    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
-        """See World. Raises ValueError for a tilted target, or one that would crush the gels."""
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
+    ) -> MoveStats:
+        """See World. Raises ValueError for a tilted target, or one that would crush the gels; and for a duration."""
+        if duration is not None:
+            raise ValueError("physics 'seed' knows no true inertia; leave out the duration, or use physics 'hybrid'")
         return run(self.motion(targets, loads), self._advance)
 
     def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:

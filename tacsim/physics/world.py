@@ -40,12 +40,19 @@ class World(Protocol):
         """world_from_sensor (or world_from_indenter for "indenter")."""
         ...
 
-    def move(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> MoveStats:
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
+    ) -> MoveStats:
         """Drives the named frames to their targets along a ramped straight path, then holds until settled.
 
         loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis; across it,
         and in orientation, they follow their target (or stay). Afterwards `pose` says where they came to. Raises
         LoadNotReached (tacsim.physics.load), with the world as it was, for a load out of reach.
+
+        duration [s]: makes the motion dynamic (tacsim.physics.inertia): it takes just so long, by the materials' true
+        densities and undamped, and is not held at its end; what still moves then goes on in a next motion with a
+        duration, and stops in one without. Raises ValueError together with loads, for one too short, and where the
+        world has no true inertia (`seed`).
 
         Raises SimulationDiverged (tacsim.physics.health) when no step size gives a finite state.
         """

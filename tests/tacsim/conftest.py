@@ -43,6 +43,7 @@ class SpringWorld:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
+        self.durations: list[float | None] = []
         self.moves: list[dict[str, Pose]] = []  # every call of move
         self.worst = 0.0
         self.poses = {
@@ -53,7 +54,8 @@ class SpringWorld:
     def pose(self, name: str) -> Pose:
         return self.poses[name]
 
-    def move(self, targets: Mapping[str, Pose]) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose], duration: float | None = None) -> MoveStats:
+        self.durations.append(duration)
         self.moves.append(dict(targets))
         self.poses |= targets
         self.worst = max(self.worst, self.force)

@@ -196,3 +196,13 @@ def test_without_touch_force_the_gels_stay_clear(spring_world: Any) -> None:
     clock = SimClock(spring_world, 0.1)
     SimStart(spring_world, clock, {}, None).touch()
     assert spring_world.moves == []
+
+
+def test_a_dynamic_clock_gives_every_period_its_own_time(spring_world: Any) -> None:
+    """Also one in which nothing is commanded: what moves goes on moving."""
+    clock = SimClock(spring_world, 0.1, dynamic=True)
+    clock.tick()
+    clock.target("lower", shifted(Pose(), z=1e-4), limited=False)
+    clock.tick()
+    assert spring_world.durations == [0.1, 0.1]
+    assert clock.now() == pytest.approx(0.2)

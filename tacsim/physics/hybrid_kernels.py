@@ -1,0 +1,212 @@
+"""Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
+
+from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
+from tacsim.physics.gel import (
+    Corners,
+    Lattice,
+    NodeLanes,
+    Nodes,
+    Skin,
+    Touch,
+    clear_touch,
+    gel_advance,
+    gel_forces,
+)
+from tacsim.physics.lanes import PARTS, Counts, Facts, Partial, Work, first_of, vec3, vec4
+from tacsim.physics.layout import (
+    BODY_CELL,
+    BODY_DAMPING,
+    BODY_MASS,
+    CAPACITY,
+    FORCE,
+    GRAVITY,
+    GRID,
+    HOUSED,
+    LIGHTNESS,
+    MOTION,
+    ORIGIN,
+    OVERLAP,
+    PARTICLES,
+    STEP,
+    STEPS,
+    STRIDE,
+)  # fmt: skip
+from tacsim.physics.plasticine import (
+    Masses,
+    Points,
+    Rates,
+    Strains,
+    Sums,
+    Velocities,
+    clear_masses,
+    grid_to_particles,
+    node_sum,
+    particles_to_grid,
+)
+from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, shares
+from tacsim.runtime import ti
+
+Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
+ContactMemory = ti.types.ndarray(dtype=vec4, ndim=3)
+
+
+@ti.func
+def row(drive: ti.template(), env, it, g, r):
+    return vec3(drive[env, it, g, r, 0], drive[env, it, g, r, 1], drive[env, it, g, r, 2])
+
+
+@ti.func
+def rotation(drive: ti.template(), env, it, g):
+    return ti.Matrix.rows([row(drive, env, it, g, 0), row(drive, env, it, g, 1), row(drive, env, it, g, 2)])
+
+
+@ti.func
+def part_sum(partial: ti.template(), env, first):
+    """Sum of three numbers over all parts, in their order."""
+    total = vec3(0.0)
+    for part in ti.static(range(PARTS)):
+        total += vec3(partial[env, part, first], partial[env, part, first + 1], partial[env, part, first + 2])
+    return total
+
+
+@ti.func
+def grid_update(
+    env, part, it, drive: ti.template(), masses: ti.template(), velocities: ti.template(), facts: ti.template(),
+    counts: ti.template(), partial: ti.template(),
+):  # fmt: skip
+    """Momentum to velocity; damps towards the affine motion that the two sensors impose, not towards rest.
+
+    A boost is added to every velocity: selective mass scaling of the slowest mode, the rigid translation of a body that
+    hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
+
+    Only a sensor that touches the body imposes anything; one that nobody touches is damped towards rest. Across the
+    sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides on one
+    sensor must not be dragged back by the other.
+    """
+    dt, cell, damping = facts[env, STEP], facts[env, BODY_CELL], facts[env, BODY_DAMPING]
+    origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
+    weight = vec3(facts[env, GRAVITY], facts[env, GRAVITY + 1], facts[env, GRAVITY + 2])
+    force0, force1 = part_sum(partial, env, FORCE), part_sum(partial, env, FORCE + 6)
+    push = facts[env, BODY_MASS] * counts[env, PARTICLES] * weight  # total force on the body: weight and contact
+    push -= rotation(drive, env, it, 0) @ force0
+    push -= rotation(drive, env, it, 1) @ force1
+    touch0, touch1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
+    mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
+    boost = ((facts[env, LIGHTNESS] - 1.0) * dt / (facts[env, BODY_MASS] * counts[env, PARTICLES])) * push
+    p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
+    v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
+    w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
+    axis = p1 - p0
+    length2 = axis.norm_sqr() + 1e-12
+    share = ti.select(touch0 and touch1, 1.0, 0.0)  # of the way from one sensor to the other that counts
+    alone = ti.select(touch1 and not touch0, 1.0, 0.0)
+    held = ti.select(touch0 or touch1, 1.0, 0.0)
+    driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
+    mean_across = mean - axis * (mean.dot(axis) / length2)
+    nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
+    base = env * counts[env, CAPACITY]
+    for i in range(first_of(nx, part, PARTS), first_of(nx, part + 1, PARTS)):
+        for j in range(ny):
+            for k in range(nz):
+                node = (i * ny + j) * nz + k
+                q = node_sum(env, i, node, masses, counts)
+                velocity = vec3(0.0)
+                if q[3] != 0.0:  # a mass that is not a number must show
+                    velocity = vec3(q[0], q[1], q[2]) / q[3] + boost + dt * weight
+                    x = origin + cell * vec3(i, j, k)
+                    t = alone + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
+                    reference = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
+                    if driven:
+                        reference = axis * (reference.dot(axis) / length2) + mean_across
+                    velocity -= damping * dt * (velocity - reference)
+                velocities[base + node] = vec4(velocity[0], velocity[1], velocity[2], 0.0)
+
+
+@ti.func
+def touch_gel(
+    env, part, g, it, drive: ti.template(), points: ti.template(), planes: ti.template(), rates: ti.template(),
+    memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(),
+    partial: ti.template(), layers, nx, ny,
+):  # fmt: skip
+    """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes."""
+    rotate = rotation(drive, env, it, g)
+    origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
+    back = rotate.transpose()
+    outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
+    highest, spacing = contact_ceiling(skin, env, g), 0.5 * facts[env, BODY_CELL]
+    rate = facts[env, STEP] / facts[env, BODY_MASS]
+    total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
+    n, origin_p = counts[env, PARTICLES], env * counts[env, STRIDE]
+    for p in range(first_of(n, part, PARTS), first_of(n, part + 1, PARTS)):
+        at = points[origin_p + p]
+        arm = vec3(at[0], at[1], at[2]) - origin
+        radius = support_radius(planes[origin_p + p], spacing)
+        # one radius to touch, half a spacing for what the contact's memory still bridges
+        if outward.dot(arm) < highest + radius + 0.5 * spacing:  # most of the body is far away: one dot product decides
+            local = back @ arm
+            moving = rates[origin_p + p, 0]
+            relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
+            touching, housed, force, kept = particle_contact(
+                env, part, g, local, relative, memory[env, g, p], radius, skin, touch, facts, layers, nx, ny, partial
+            )
+            memory[env, g, p] = kept
+            if touching:
+                push = rate * (rotate @ force)
+                rates[origin_p + p, 0] = moving + vec4(push[0], push[1], push[2], 0.0)
+                total -= force
+                moment -= local.cross(force)
+                if housed:
+                    on_housing -= force
+        else:
+            memory[env, g, p] = vec4(0.0)
+    for d in ti.static(range(3)):
+        partial[env, part, FORCE + 6 * g + d] = total[d]
+        partial[env, part, FORCE + 6 * g + 3 + d] = moment[d]
+        partial[env, part, HOUSED + 3 * g + d] = on_housing[d]
+
+
+@ti.kernel
+def substeps(
+    team: ti.i32, drive: Drive,
+    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
+    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities,
+    sums: Sums, memory: ContactMemory,
+    facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
+):  # fmt: skip
+    """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
+
+    Two meetings a substep: what is scattered must be whole before it is summed, and summed before it is gathered.
+    """
+    for task in range(sync.shape[0] * team * CHUNK):
+        for _ in range(first_in_chunk(task)):
+            turn, member = task // CHUNK // team, task // CHUNK % team
+            env = sync[turn, WHO]
+            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            for it in range(counts[env, STEPS]):
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    partial[env, part, OVERLAP] = 0.0
+                    clear_touch(env, part, 2, touch)
+                    for g in range(2):
+                        touch_gel(
+                            env, part, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
+                            layers, nx, ny,
+                        )  # fmt: skip
+                    clear_masses(env, part, masses, counts)
+                    particles_to_grid(env, part, points, rates, strains, masses, facts, counts, partial)
+                    gel_forces(
+                        env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
+                        layers, nx, ny,
+                    )  # fmt: skip
+                meet(sync, turn, team, 2 * it + 1)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
+                meet(sync, turn, team, 2 * it + 2)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    grid_to_particles(
+                        env, part, points, planes, rates, strains, velocities, sums, facts, counts, partial
+                    )

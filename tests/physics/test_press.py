@@ -154,5 +154,5 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     w = world(Sphere(radius=4e-3))
     assert w.truth() is None
     assert set(w.snapshot()) == {
-        "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses",
+        "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses", "true_inertia",
     }  # fmt: skip

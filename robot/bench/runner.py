@@ -1,10 +1,12 @@
-"""Runs cases one after the other, each in a process of its own, and collects the report.
+"""Runs cases one after the other, in processes apart from this one, and collects the report.
 
-A process a case: its peak memory is its own, Taichi starts once in it, and one that dies takes no other along.
+Cases that share a process count memory from their own start, with what the kernels before them left behind. A process
+that dies costs one case: those after it go on in a new one.
 """
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import platform
@@ -12,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -20,7 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from robot.bench.cache import fingerprint
-from robot.bench.measure import Measurement, peak_memory
+from robot.bench.measure import Measurement, forget_peak_memory, peak_memory
 from robot.bench.schema import Failure, Group, Machine, Metadata, Report, Row
 
 EXIT = 10.0  # [s] a process may take to end after its last word
@@ -53,15 +55,13 @@ def run_cases(
     (commit, modified), code = _commit(), fingerprint("tacsim", "robot", "calibration")
     rows: list[Row] = []
     failures: list[Failure] = []
-    for case in cases:
-        on_start(case)
-        found = _in_own_process(case, repeat, stop)
-        if isinstance(found, str):
-            failures.append(
-                Failure(group=case.group, case=case.name, method=case.method, resolution=case.resolution, cause=found)
-            )
-        else:
-            rows += found
+    for together in _apart(cases):
+        for case, found in _run(together, repeat, on_start, stop):
+            if isinstance(found, str):
+                names = {"group": case.group, "case": case.name, "method": case.method, "resolution": case.resolution}
+                failures.append(Failure(**names, cause=found))
+            else:
+                rows += found
     groups = list(dict.fromkeys(case.group for case in cases))
     return Report(
         metadata=Metadata(
@@ -82,35 +82,82 @@ def run_cases(
     )
 
 
-def _in_own_process(case: Case, repeat: int, stop: Callable[[], bool]) -> list[Row] | str:
-    """Rows of the case, or what went wrong in words."""
-    context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(case, repeat, there), daemon=True)
-    process.start()
-    there.close()
+def _apart(cases: Sequence[Case]) -> list[list[Case]]:
+    """Our own cases of a group share a process, since loading the kernels takes longer than most of them run; another
+    method gets one of its own, and so does every long case."""
+    parts: list[list[Case]] = []
+    for case in cases:
+        shared = not (case.baseline or case.long)
+        last = parts[-1][-1] if parts else None
+        if shared and last is not None and last.group == case.group and not (last.baseline or last.long):
+            parts[-1].append(case)
+        else:
+            parts.append([case])
+    return parts
+
+
+class _Worker:
+    """A process that runs cases in turn. When it dies, the next is started for those that are left."""
+
+    def __init__(self, cases: Sequence[Case], repeat: int) -> None:
+        context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
+        self._here, there = context.Pipe(duplex=False)
+        self._process = context.Process(target=_work, args=(list(cases), repeat, there), daemon=True)
+        self._process.start()
+        there.close()
+
+    def next(self, stop: Callable[[], bool]) -> list[Row] | str | None:
+        """Rows of the next case, or what went wrong in words; None when the process has died. Raises Stopped."""
+        try:
+            while not self._here.poll(0.1):
+                if stop():
+                    raise Stopped("stopped before all cases were over")
+            found: list[Row] | str = self._here.recv()
+            return found
+        except EOFError:
+            self._process.join(EXIT)
+            return None
+
+    @property
+    def exit_code(self) -> int | None:
+        return self._process.exitcode
+
+    def close(self) -> None:
+        self._process.kill()  # nothing happens to one that is over
+        self._process.join()
+        self._here.close()
+
+
+def _run(
+    cases: Sequence[Case], repeat: int, on_start: Callable[[Case], None], stop: Callable[[], bool]
+) -> Iterator[tuple[Case, list[Row] | str]]:
+    """What each case came to, all in one process as long as it lives."""
+    worker: _Worker | None = None
     try:
-        while not here.poll(0.1):
-            if stop():
-                raise Stopped("stopped before all cases were over")
-        found: list[Row] | str = here.recv()
-        process.join(EXIT)
-    except EOFError:
-        process.join(EXIT)
-        found = f"its process died with exit code {process.exitcode}"
+        for index, case in enumerate(cases):
+            on_start(case)
+            worker = worker or _Worker(cases[index:], repeat)
+            found = worker.next(stop)
+            if found is not None:
+                yield case, found
+            else:
+                yield case, f"its process died with exit code {worker.exit_code}"
+                worker.close()
+                worker = None
     finally:
-        process.kill()  # nothing happens to one that is over
-        process.join()
-        here.close()
-    return found
+        if worker is not None:
+            worker.close()
 
 
-def _work(case: Case, repeat: int, report: Connection) -> None:
+def _work(cases: Sequence[Case], repeat: int, report: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
-    try:
-        report.send(measure(case, repeat))
-    except Exception as error:  # whatever it is, the other cases go on, and the report names it
-        report.send(f"{type(error).__name__}: {error}")
+    for case in cases:
+        gc.collect()
+        forget_peak_memory()
+        try:
+            report.send(measure(case, repeat))
+        except Exception as error:  # whatever it is, the other cases go on, and the report names it
+            report.send(f"{type(error).__name__}: {error}")
     report.close()
 
 

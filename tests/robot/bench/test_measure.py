@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from robot.bench import cache, measure
 from robot.bench.cases import CASES, chosen, description
-from robot.bench.measure import Timing, peak_memory, timed
+from robot.bench.measure import Timing, forget_peak_memory, peak_memory, timed
 from robot.bench.press import layer_press
 from robot.bench.runner import Case, Stopped, run_cases
 from robot.bench.schema import GROUPS, Report, Row, json_schema
@@ -47,6 +47,16 @@ def test_peak_memory_sees_a_large_array_that_is_gone() -> None:
     block[::4096] = b"x" * len(block[::4096])
     del block
     assert peak_memory() > 1.5 * before
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux forgets a peak")
+def test_a_forgotten_peak_does_not_count_for_the_next_case() -> None:
+    before = peak_memory()
+    block = bytearray(int(before * 1e6))
+    block[::4096] = b"x" * len(block[::4096])
+    del block
+    forget_peak_memory()
+    assert peak_memory() < 1.3 * before
 
 
 # Importable by name, as a spawned process needs it: json.loads(3) raises, os._exit(3) dies, time.sleep(30) hangs.

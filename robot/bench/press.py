@@ -61,6 +61,11 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
+USUAL = 0.02  # the controller's default peak Mach number: a tenth of the shear wave's speed
+# Half of it; this group's own; and half of the shear wave's speed, where contact sticks and slips by inertia.
+OTHERS = (0.01, 0.05, 0.1)
+
+
 def profile(world: PressWorld) -> Float64:
     return surface_profile(world.surface("lower"))
 
@@ -92,15 +97,18 @@ def quasi_static(repeat: int) -> list[Measurement]:
             stats.substeps, {"largest_um": _largest(difference), "force_percent": _percent(*forces)},
         )
     ]  # fmt: skip
-    speeds = [press(press_scene(ball, element, mach=mach), DEPTH) for mach in (0.02, 0.1)]
-    difference = profile(speeds[0][0]) - profile(speeds[1][0])
-    both = {"substeps_slow": float(speeds[0][1].substeps), "substeps_fast": float(speeds[1][1].substeps)}
-    rows.append(
-        Measurement(
-            timing, _largest(difference), "µm at most", "the same press at Mach 0.02 and 0.1, tolerance 1e-2",
-            "two speeds", stats.substeps, {"rms_um": rms(difference) * 1e6, **both}, "seconds: at Mach 0.05",
-        )
-    )  # fmt: skip
+    usual, usual_stats = press(press_scene(ball, element, mach=USUAL), DEPTH)
+    for mach in OTHERS:
+        other, other_stats = press(press_scene(ball, element, mach=mach), DEPTH)
+        difference = profile(other) - profile(usual)
+        both = {"substeps_usual": float(usual_stats.substeps), "substeps_other": float(other_stats.substeps)}
+        rows.append(
+            Measurement(
+                timing, _largest(difference), "µm at most", f"the same press at Mach {USUAL:g}, tolerance 1e-2",
+                f"two speeds, Mach {USUAL:g} and {mach:g}", stats.substeps, {"rms_um": rms(difference) * 1e6, **both},
+                "seconds: at Mach 0.05",
+            )
+        )  # fmt: skip
     return rows
 
 

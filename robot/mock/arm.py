@@ -129,7 +129,7 @@ class Arm:
         return not self.target_qd.any() and float(np.abs(self.qd).max()) < REST
 
     def _servo(self, before: FloatArray) -> None:
-        """One period of q'' = w^2 (target - q) - 2 w q', solved exactly for a target that moves steadily from `before`."""
+        """One period of q'' = w^2 (target - q) - 2 w q', solved exactly for a target in steady motion."""
         speed, trail = self.target_qd, 2.0 / SERVO_RATE * self.target_qd
         error, rate = self.q - before + trail, self.qd - speed
         drift, decay = (rate + SERVO_RATE * error) * PERIOD, math.exp(-SERVO_RATE * PERIOD)

@@ -7,7 +7,7 @@ nothing is modelled behind them: temperatures, voltages, currents, moments, mome
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ FORMATS = {  # struct codes, big endian
 }
 
 Value = float | int | bool
-Values = Sequence[Value] | Value
+Values = list[float] | tuple[Value, ...] | Value
 
 
 @dataclass(frozen=True)

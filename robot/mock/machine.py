@@ -16,7 +16,7 @@ from enum import IntEnum
 import numpy as np
 
 from robot.mock.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
-from robot.mock.load import GRAVITY, Load
+from robot.mock.load import GRAVITY, Load, cross
 from robot.mock.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, admit
 from robot.mock.script import Program
 from tacsim.hardware import Model
@@ -145,9 +145,11 @@ class Machine:
     @property
     def raw_wrench(self) -> FloatArray:
         """Load on the flange in its axes, with the weight of the payload and no zero taken off (6,) [N, N m]."""
+        if self.payload == 0.0 and not self.load.true.any():
+            return np.zeros(6)
         flange = self.arm.kinematics.forward(self.arm.q)
         weight = -self.payload * flange[:3, :3].T @ self.gravity
-        own = np.concatenate([weight, np.cross(self.payload_centre, weight)])
+        own = np.concatenate([weight, cross(self.payload_centre, weight)])
         return own + self.load.at_flange(self.load.true, self.arm, flange)
 
     @property

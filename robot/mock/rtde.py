@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from robot.mock.arm import PERIOD
@@ -74,10 +74,12 @@ class OutputRecipe:
         flat: list[Value] = []
         for name, output in zip(self.names, self.fields, strict=True):
             value = output.read(machine)
-            values = value if isinstance(value, Sequence) else (value,)
             if spoilt and name.startswith("actual_") and FORMATS[output.type].endswith("d"):
-                values = [math.nan] * len(values)
-            flat.extend(values)
+                value = [math.nan] * len(value) if isinstance(value, (list, tuple)) else math.nan
+            if isinstance(value, (list, tuple)):
+                flat.extend(value)
+            else:
+                flat.append(value)
         return self.layout.pack(self.layout.size, DATA, 1, *flat)
 
 

@@ -88,9 +88,14 @@ class FrameSource:
             self._changed.wait_for(lambda: self._closed or self._newest[0] > than)
             if self._closed:
                 return None
-            if than:
-                self.counts["skipped"] += self._newest[0] - than - 1
+            self.counts["skipped"] += self._newest[0] - than - 1
             self.counts["sent"] += 1
+            return self._newest
+
+    @property
+    def newest(self) -> tuple[int, bytes]:
+        """Number and JPEG of the newest frame; number 0 before the first."""
+        with self._changed:
             return self._newest
 
     def run(self) -> None:
@@ -170,7 +175,7 @@ class Listener:
     """The camera's port: hands the frames of a source to HTTP clients."""
 
     def __init__(self, host: str, port: int, source: FrameSource) -> None:
-        self._source = source
+        self.source = source
         self._clients: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._host = host
@@ -217,9 +222,6 @@ class Listener:
         with self._lock:
             self._clients.discard(client)
 
-    def newer(self, than: int) -> tuple[int, bytes] | None:
-        return self._source.newer(than)
-
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
@@ -257,17 +259,18 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
         self._head(f"multipart/x-mixed-replace;boundary={BOUNDARY}")
         self.wfile.write(f"--{BOUNDARY}\r\n".encode())
-        last = 0
-        while (frame := self.server.listener.newer(last)) is not None:
+        last = self.server.listener.source.newest[0]  # a frame that is over is not sent again
+        while (frame := self.server.listener.source.newer(last)) is not None:
             last, jpeg = frame
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp: {time.time():.6f}\r\n\r\n"
             self.wfile.write(head.encode() + jpeg + f"\r\n--{BOUNDARY}\r\n".encode())
 
     def _snapshot(self) -> None:
-        frame = self.server.listener.newer(0)
-        if frame is not None:
-            self._head("image/jpeg")
-            self.wfile.write(frame[1])
+        number, jpeg = self.server.listener.source.newest
+        if number == 0:
+            return self.send_error(503, "no frame yet")
+        self._head("image/jpeg")
+        self.wfile.write(jpeg)
 
     def _head(self, kind: str) -> None:
         self.send_response(200)

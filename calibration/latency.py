@@ -1,0 +1,128 @@
+"""How much later a camera's picture arrives than an arm's state, from a few taps on something firm.
+
+The arm goes down and up; how deep it is, and how much touch the picture shows, are two signals over arrival times. The
+touch is some growing function of the depth, whatever it is: by the rearrangement inequality (Hardy, Littlewood, Polya
+1934, section 10.13) the correlation of the two is then greatest at the true shift. It is evaluated at the camera's own,
+irregular times, so that only the arm's fast signal is interpolated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize_scalar
+
+from tacsim.interface import FloatArray
+
+MIN_CORRELATION = 0.7  # below it the two signals are not of one motion
+MAX_RIVAL = 0.95  # a second peak as high as this part of the best one: which of them is it?
+MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
+BLOCKS = 8  # of the jackknife
+STEP = 1e-3  # of the coarse search [s]
+
+
+class NoLatency(ValueError):
+    """The two signals do not determine a latency."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """How much later the second signal arrives than the first."""
+
+    seconds: float  # latency of the camera minus that of the arm [s]
+    uncertainty: float  # one standard deviation: jackknife over stretches of the record [s]
+    correlation: float  # at the best shift [-]
+    samples: int  # pictures that took part
+
+
+def estimate_latency(
+    depth_times: ArrayLike,
+    depth: ArrayLike,
+    touch_times: ArrayLike,
+    touch: ArrayLike,
+    search: tuple[float, float] = (-0.1, 0.5),
+) -> Latency:
+    """Latency of `touch` (m,) at `touch_times` (m,) [s] behind `depth` (n,) at `depth_times` (n,) [s].
+
+    `depth` grows towards contact, in any unit (of a sensor that presses down: minus z); rates may be irregular. The
+    record begins and ends without contact and has three taps or more, at uneven intervals. `search`: bounds of the
+    latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays that
+    are no signals.
+    """
+    arm_times, arm = _signal(depth_times, depth, "depth")
+    times, seen = _signal(touch_times, touch, "touch")
+    low, high = search
+    if not low < high:
+        raise ValueError(f"search must be two growing bounds [s], got {search}")
+    covered = (times - high >= arm_times[0]) & (times - low <= arm_times[-1])
+    times, seen = times[covered], seen[covered]
+    if len(times) < MIN_SAMPLES:
+        raise NoLatency(
+            f"only {len(times)} pictures lie where the arm's record covers latencies of {low:g} to {high:g} s, "
+            f"{MIN_SAMPLES} are needed; record longer, with a pause before and after the taps"
+        )
+
+    def correlation(shift: float, part: slice | FloatArray = slice(None)) -> float:
+        return _correlation(np.interp(times[part] - shift, arm_times, arm), seen[part])
+
+    shifts = np.arange(low, high + 0.5 * STEP, STEP)
+    curve = np.array([correlation(shift) for shift in shifts])
+    best = int(np.argmax(curve))
+    _check_peak(shifts, curve, best)
+
+    def peak(part: slice | FloatArray) -> float:
+        around = (float(shifts[best]) - 20 * STEP, float(shifts[best]) + 20 * STEP)
+        found = minimize_scalar(lambda shift: -correlation(shift, part), bounds=around, method="bounded")
+        return float(found.x)
+
+    shift = peak(slice(None))
+    without = np.array([peak(np.delete(np.arange(len(times)), gone)) for gone in _stretches(len(times))])
+    spread = (len(without) - 1) / len(without) * float(((without - without.mean()) ** 2).sum())
+    return Latency(
+        seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=correlation(shift), samples=len(times)
+    )
+
+
+def _signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[FloatArray, FloatArray]:
+    t, x = np.array(times, dtype=np.float64), np.array(values, dtype=np.float64)
+    if t.ndim != 1 or t.shape != x.shape or len(t) < 2:
+        raise ValueError(f"{what}: needs as many times as values, two at least, got shapes {t.shape} and {x.shape}")
+    if not (np.isfinite(t).all() and np.isfinite(x).all()):
+        raise ValueError(f"{what}: times and values must be finite")
+    if not (np.diff(t) > 0.0).all():
+        raise ValueError(f"{what}: times must grow from sample to sample")
+    if float(np.ptp(x)) <= 1e-12 * max(1.0, float(np.abs(x).max())):
+        raise NoLatency(f"{what}: the signal never changes; tap so that the gel is touched and left")
+    return t, x
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    """Pearson's; 0 where one of them is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size > 0.0 else 0.0
+
+
+def _check_peak(shifts: FloatArray, curve: FloatArray, best: int) -> None:
+    """Raises NoLatency unless the peak is high, inside the range and the only one."""
+    if curve[best] < MIN_CORRELATION:
+        raise NoLatency(
+            f"the signals do not correlate: {curve[best]:.2f} at best, {MIN_CORRELATION} is needed. Does the sensor see "
+            "this arm's taps, and does `depth` grow towards contact?"
+        )
+    if best in (0, len(curve) - 1):
+        raise NoLatency(f"the best latency is at the edge of the search, {shifts[best]:.3f} s; widen the search")
+    inner = curve[1:-1]
+    peaks = np.flatnonzero((inner >= curve[:-2]) & (inner >= curve[2:])) + 1
+    rivals = [k for k in peaks if abs(k - best) * STEP > 20 * STEP and curve[k] > MAX_RIVAL * curve[best]]
+    if rivals:
+        raise NoLatency(
+            f"latencies of {shifts[best]:.3f} s and {shifts[rivals[0]]:.3f} s fit alike; tap at uneven intervals"
+        )
+
+
+def _stretches(count: int) -> list[FloatArray]:
+    """Numbers of the samples of BLOCKS stretches of the record: neighbours are not independent, stretches nearly are."""
+    return np.array_split(np.arange(count), BLOCKS)

@@ -2,17 +2,19 @@
 
 The arm goes down and up; how deep it is, and how much touch the picture shows, are two signals over arrival times. The
 touch is some growing function of the depth, whatever it is: by the rearrangement inequality (Hardy, Littlewood, Polya
-1934, section 10.13) the correlation of the two is then greatest at the true shift. It is evaluated at the camera's own,
-irregular times, so that only the arm's fast signal is interpolated.
+1934, section 10.13) the correlation of the two is then greatest at the true shift. That function is fitted (isotonic
+regression) and the shift refined, in turn. Correlations are evaluated at the camera's own, irregular times, so that only
+the arm's fast signal is interpolated.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize_scalar
+from scipy.optimize import isotonic_regression, minimize_scalar
 
 from tacsim.interface import FloatArray
 
@@ -21,6 +23,8 @@ MAX_RIVAL = 0.95  # a second peak as high as this part of the best one: which of
 MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
 BLOCKS = 8  # of the jackknife
 STEP = 1e-3  # of the coarse search [s]
+NEAR = 40e-3  # the fine search looks so far to both sides; peaks beyond are rivals [s]
+ROUNDS = 5  # of fitting the response and the shift in turn
 
 
 class NoLatency(ValueError):
@@ -64,25 +68,51 @@ def estimate_latency(
             f"{MIN_SAMPLES} are needed; record longer, with a pause before and after the taps"
         )
 
-    def correlation(shift: float, part: slice | FloatArray = slice(None)) -> float:
-        return _correlation(np.interp(times[part] - shift, arm_times, arm), seen[part])
-
     shifts = np.arange(low, high + 0.5 * STEP, STEP)
-    curve = np.array([correlation(shift) for shift in shifts])
+    curve = np.array([_correlation(np.interp(times - shift, arm_times, arm), seen) for shift in shifts])
     best = int(np.argmax(curve))
     _check_peak(shifts, curve, best)
 
-    def peak(part: slice | FloatArray) -> float:
-        around = (float(shifts[best]) - 20 * STEP, float(shifts[best]) + 20 * STEP)
-        found = minimize_scalar(lambda shift: -correlation(shift, part), bounds=around, method="bounded")
-        return float(found.x)
+    fit = partial(_fit, float(shifts[best]), arm_times, arm)
+    shift, likeness = fit(times, seen)
+    parts = np.array_split(np.arange(len(times)), BLOCKS)
+    without = np.array([fit(np.delete(times, gone), np.delete(seen, gone))[0] for gone in parts])
+    spread = (BLOCKS - 1) / BLOCKS * float(((without - without.mean()) ** 2).sum())
+    return Latency(seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=likeness, samples=len(times))
 
-    shift = peak(slice(None))
-    without = np.array([peak(np.delete(np.arange(len(times)), gone)) for gone in _stretches(len(times))])
-    spread = (len(without) - 1) / len(without) * float(((without - without.mean()) ** 2).sum())
-    return Latency(
-        seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=correlation(shift), samples=len(times)
+
+def _fit(
+    shift: float, arm_times: FloatArray, arm: FloatArray, times: FloatArray, seen: FloatArray
+) -> tuple[float, float]:
+    """Response and shift in turn, from the coarse `shift` on: the shift [s], and the correlation there."""
+    likeness = 0.0
+    for _ in range(ROUNDS):
+        response = _response(np.interp(times - shift, arm_times, arm), seen)
+        expected = np.interp(arm, *response)  # the touch that a camera without latency would show
+        shift, likeness = _refine(shift, arm_times, expected, times, seen)
+    return shift, likeness
+
+
+def _response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The growing function of depth that fits the touch best: its abscissae, growing, and its values."""
+    order = np.argsort(depth, kind="stable")
+    fitted = np.asarray(isotonic_regression(touch[order]).x, dtype=np.float64)
+    abscissae, first = np.unique(depth[order], return_index=True)
+    counts = np.diff([*first, len(depth)])
+    return abscissae, np.add.reduceat(fitted, first) / counts
+
+
+def _refine(
+    shift: float, arm_times: FloatArray, expected: FloatArray, times: FloatArray, seen: FloatArray
+) -> tuple[float, float]:
+    """The shift near `shift` at which `expected` fits `seen` best [s], and the correlation there."""
+    found = minimize_scalar(
+        lambda tried: -_correlation(np.interp(times - tried, arm_times, expected), seen),
+        bounds=(shift - NEAR, shift + NEAR),
+        method="bounded",
+        options={"xatol": 1e-6},
     )
+    return float(found.x), -float(found.fun)
 
 
 def _signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[FloatArray, FloatArray]:
@@ -116,13 +146,8 @@ def _check_peak(shifts: FloatArray, curve: FloatArray, best: int) -> None:
         raise NoLatency(f"the best latency is at the edge of the search, {shifts[best]:.3f} s; widen the search")
     inner = curve[1:-1]
     peaks = np.flatnonzero((inner >= curve[:-2]) & (inner >= curve[2:])) + 1
-    rivals = [k for k in peaks if abs(k - best) * STEP > 20 * STEP and curve[k] > MAX_RIVAL * curve[best]]
+    rivals = [k for k in peaks if abs(k - best) * STEP > NEAR and curve[k] > MAX_RIVAL * curve[best]]
     if rivals:
         raise NoLatency(
             f"latencies of {shifts[best]:.3f} s and {shifts[rivals[0]]:.3f} s fit alike; tap at uneven intervals"
         )
-
-
-def _stretches(count: int) -> list[FloatArray]:
-    """Numbers of the samples of BLOCKS stretches of the record: neighbours are not independent, stretches nearly are."""
-    return np.array_split(np.arange(count), BLOCKS)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
 
-from robot import stamp
+from robot import stamp as strip
 from robot.capture import Capture, DamagedFrame, Picture, WrongSource, frame_size, open_capture, source_kind
 from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
 from tacsim.hardware import CameraSensorFacts
@@ -71,7 +71,7 @@ class Camera:
         self._changed = threading.Condition()  # guards all that follows
         self._capture: Capture | None = None
         self._frame: TactileFrame | None = None
-        self._stamp: stamp.Stamp | None = None  # of _frame
+        self._stamp: strip.Stamp | None = None  # of _frame
         self._clock: ClockSource | None = None
         self._arrivals: deque[float] = deque(maxlen=FPS_WINDOW)
         self._received = self._dropped = self._damaged = self._openings = 0
@@ -103,6 +103,12 @@ class Camera:
         if not self._facts.stamped:
             raise ValueError(f"sensor '{self._name}': wait_for needs a stamped source; this one has no picture numbers")
         return self._wait_until(timeout, image=image_number)
+
+    @property
+    def stamp(self) -> strip.Stamp | None:
+        """What the strip of the newest frame says; None without stamps."""
+        with self._changed:
+            return self._stamp
 
     @property
     def image_number(self) -> int | None:
@@ -230,7 +236,7 @@ class Camera:
     def _take(self, picture: Picture) -> None:
         image, mark = picture.image, None
         if self._facts.stamped:
-            image, mark = stamp.split(image)
+            image, mark = strip.split(image)
             if mark is None:
                 raise DamagedFrame(
                     f"sensor '{self._name}': a frame of {self._facts.source} without a readable stamp; it is damaged, or "
@@ -262,7 +268,7 @@ class Camera:
             self._refusal = self._error = None
             self._changed.notify_all()
 
-    def _lost(self, mark: stamp.Stamp | None, exposure: float, clock: ClockSource) -> int:
+    def _lost(self, mark: strip.Stamp | None, exposure: float, clock: ClockSource) -> int:
         """Frames that are missing before this one."""
         if self._frame is None:
             return 0

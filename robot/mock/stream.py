@@ -53,7 +53,8 @@ class FrameSource:
         self._picture: NDArray[np.uint8] | None = None  # the one pushed last
         self._fresh = False  # it was not exposed yet
         self._delayed: deque[tuple[float, int, bytes]] = deque(maxlen=MAX_DELAYED)  # when to send, number, JPEG
-        self._newest: tuple[int, bytes] = (0, b"")
+        self._newest: tuple[int, bytes] = (0, b"")  # how many were sent so far; JPEG
+        self._number = 0  # of the newest
         self._closed = False
         self._random = random.Random(0)
         self.counts = {"frames": 0, "images": 0, "dropped": 0, "sent": 0, "skipped": 0}
@@ -82,8 +83,8 @@ class FrameSource:
             self._changed.notify_all()
 
     def newer(self, than: int) -> tuple[int, bytes] | None:
-        """Number and JPEG of the newest frame, once it is newer; None when the camera is closed. Counts what a client
-        that asks late has missed."""
+        """The newest frame, once it is newer than number `than` of those that were sent: its number among them, and its
+        JPEG; None when the camera is closed. Counts what a client that asks late has missed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._newest[0] > than)
             if self._closed:
@@ -94,7 +95,7 @@ class FrameSource:
 
     @property
     def newest(self) -> tuple[int, bytes]:
-        """Number and JPEG of the newest frame; number 0 before the first."""
+        """Number of the newest frame among those that were sent, 0 before the first, and its JPEG."""
         with self._changed:
             return self._newest
 
@@ -134,8 +135,8 @@ class FrameSource:
     def _send_delayed(self, now: float) -> None:
         while self._delayed and self._delayed[0][0] <= now and not self._faults.stall:
             _, number, jpeg = self._delayed.popleft()
-            if number > self._newest[0]:
-                self._newest = (number, jpeg)
+            if number > self._number:  # a shorter delay lets later frames pass
+                self._number, self._newest = number, (self._newest[0] + 1, jpeg)
                 self._changed.notify_all()
 
     def _expose(self, picture: NDArray[np.uint8] | None, mark: stamp.Stamp, faults: Faults) -> bytes:
@@ -257,9 +258,9 @@ class _Handler(BaseHTTPRequestHandler):
     def _stream(self) -> None:
         # A small buffer: what lies in it is old when a slow client gets to it.
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+        last = self.server.listener.source.newest[0]  # what is over is not sent; what comes after the header is
         self._head(f"multipart/x-mixed-replace;boundary={BOUNDARY}")
         self.wfile.write(f"--{BOUNDARY}\r\n".encode())
-        last = self.server.listener.source.newest[0]  # a frame that is over is not sent again
         while (frame := self.server.listener.source.newer(last)) is not None:
             last, jpeg = frame
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp: {time.time():.6f}\r\n\r\n"

@@ -205,11 +205,11 @@ class MjpegCapture:
 
     def _line(self) -> bytes:
         start = 0
-        while (end := self._buffer.find(b"\n", start)) < 0:
-            if len(self._buffer) > _MAX_LINE:
-                raise WrongSource(f"{self._what}: a line of more than {_MAX_LINE} bytes; is that an MJPEG camera?")
+        while (end := self._buffer.find(b"\n", start)) < 0 and len(self._buffer) <= _MAX_LINE:
             start = len(self._buffer)
             self._receive()
+        if not 0 <= end <= _MAX_LINE:
+            raise WrongSource(f"{self._what}: a line of more than {_MAX_LINE} bytes; is that an MJPEG camera?")
         return self._take(end + 1).rstrip(b"\r\n")
 
     def _receive(self) -> None:
@@ -233,6 +233,8 @@ class MjpegCapture:
                 return np.array(picture.convert("RGB"))
         except WrongSource:
             raise
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+            raise WrongSource(f"{self._what}: {error}; expected are {self._size[1]} x {self._size[0]} px") from error
         except Exception as error:  # a decoder that is fed damaged bytes may raise anything
             raise DamagedFrame(f"{self._what}: no readable JPEG: {error}") from error
 

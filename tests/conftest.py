@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-DEVICES = ("/dev/tty", "/dev/video", "/dev/serial")
+DEVICES = ("/dev/tty", "/dev/video", "/dev/v4l", "/dev/serial")
 
 
 class RealHardware(AssertionError):

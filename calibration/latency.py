@@ -1,0 +1,153 @@
+"""How much later a camera's picture arrives than an arm's state, from a few taps on something firm.
+
+The arm goes down and up; how deep it is, and how much touch the picture shows, are two signals over arrival times. The
+touch is some growing function of the depth, whatever it is: by the rearrangement inequality (Hardy, Littlewood, Polya
+1934, section 10.13) the correlation of the two is then greatest at the true shift. That function is fitted (isotonic
+regression) and the shift refined, in turn. Correlations are evaluated at the camera's own, irregular times, so that only
+the arm's fast signal is interpolated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import isotonic_regression, minimize_scalar
+
+from tacsim.interface import FloatArray
+
+MIN_CORRELATION = 0.7  # below it the two signals are not of one motion
+MAX_RIVAL = 0.95  # a second peak as high as this part of the best one: which of them is it?
+MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
+BLOCKS = 8  # of the jackknife
+STEP = 1e-3  # of the coarse search [s]
+NEAR = 40e-3  # the fine search looks so far to both sides; peaks beyond are rivals [s]
+ROUNDS = 5  # of fitting the response and the shift in turn
+
+
+class NoLatency(ValueError):
+    """The two signals do not determine a latency."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """How much later the second signal arrives than the first."""
+
+    seconds: float  # latency of the camera minus that of the arm [s]
+    uncertainty: float  # one standard deviation: jackknife over stretches of the record [s]
+    correlation: float  # at the best shift [-]
+    samples: int  # pictures that took part
+
+
+def estimate_latency(
+    depth_times: ArrayLike,
+    depth: ArrayLike,
+    touch_times: ArrayLike,
+    touch: ArrayLike,
+    search: tuple[float, float] = (-0.1, 0.5),
+) -> Latency:
+    """Latency of `touch` (m,) at `touch_times` (m,) [s] behind `depth` (n,) at `depth_times` (n,) [s].
+
+    `depth` grows towards contact, in any unit (of a sensor that presses down: minus z); rates may be irregular. The
+    record begins and ends without contact and has three taps or more, at uneven intervals. `search`: bounds of the
+    latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays that
+    are no signals.
+    """
+    arm_times, arm = _signal(depth_times, depth, "depth")
+    times, seen = _signal(touch_times, touch, "touch")
+    low, high = search
+    if not low < high:
+        raise ValueError(f"search must be two growing bounds [s], got {search}")
+    covered = (times - high >= arm_times[0]) & (times - low <= arm_times[-1])
+    times, seen = times[covered], seen[covered]
+    if len(times) < MIN_SAMPLES:
+        raise NoLatency(
+            f"only {len(times)} pictures lie where the arm's record covers latencies of {low:g} to {high:g} s, "
+            f"{MIN_SAMPLES} are needed; record longer, with a pause before and after the taps"
+        )
+
+    shifts = np.arange(low, high + 0.5 * STEP, STEP)
+    curve = np.array([_correlation(np.interp(times - shift, arm_times, arm), seen) for shift in shifts])
+    best = int(np.argmax(curve))
+    _check_peak(shifts, curve, best)
+
+    fit = partial(_fit, float(shifts[best]), arm_times, arm)
+    shift, likeness = fit(times, seen)
+    parts = np.array_split(np.arange(len(times)), BLOCKS)
+    without = np.array([fit(np.delete(times, gone), np.delete(seen, gone))[0] for gone in parts])
+    spread = (BLOCKS - 1) / BLOCKS * float(((without - without.mean()) ** 2).sum())
+    return Latency(seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=likeness, samples=len(times))
+
+
+def _fit(
+    shift: float, arm_times: FloatArray, arm: FloatArray, times: FloatArray, seen: FloatArray
+) -> tuple[float, float]:
+    """Response and shift in turn, from the coarse `shift` on: the shift [s], and the correlation there."""
+    likeness = 0.0
+    for _ in range(ROUNDS):
+        response = _response(np.interp(times - shift, arm_times, arm), seen)
+        expected = np.interp(arm, *response)  # the touch that a camera without latency would show
+        shift, likeness = _refine(shift, arm_times, expected, times, seen)
+    return shift, likeness
+
+
+def _response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The growing function of depth that fits the touch best: its abscissae, growing, and its values."""
+    order = np.argsort(depth, kind="stable")
+    fitted = np.asarray(isotonic_regression(touch[order]).x, dtype=np.float64)
+    abscissae, first = np.unique(depth[order], return_index=True)
+    counts = np.diff([*first, len(depth)])
+    return abscissae, np.add.reduceat(fitted, first) / counts
+
+
+def _refine(
+    shift: float, arm_times: FloatArray, expected: FloatArray, times: FloatArray, seen: FloatArray
+) -> tuple[float, float]:
+    """The shift near `shift` at which `expected` fits `seen` best [s], and the correlation there."""
+    found = minimize_scalar(
+        lambda tried: -_correlation(np.interp(times - tried, arm_times, expected), seen),
+        bounds=(shift - NEAR, shift + NEAR),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    return float(found.x), -float(found.fun)
+
+
+def _signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[FloatArray, FloatArray]:
+    t, x = np.array(times, dtype=np.float64), np.array(values, dtype=np.float64)
+    if t.ndim != 1 or t.shape != x.shape or len(t) < 2:
+        raise ValueError(f"{what}: needs as many times as values, two at least, got shapes {t.shape} and {x.shape}")
+    if not (np.isfinite(t).all() and np.isfinite(x).all()):
+        raise ValueError(f"{what}: times and values must be finite")
+    if not (np.diff(t) > 0.0).all():
+        raise ValueError(f"{what}: times must grow from sample to sample")
+    if float(np.ptp(x)) <= 1e-12 * max(1.0, float(np.abs(x).max())):
+        raise NoLatency(f"{what}: the signal never changes; tap so that the gel is touched and left")
+    return t, x
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    """Pearson's; 0 where one of them is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size > 0.0 else 0.0
+
+
+def _check_peak(shifts: FloatArray, curve: FloatArray, best: int) -> None:
+    """Raises NoLatency unless the peak is high, inside the range and the only one."""
+    if curve[best] < MIN_CORRELATION:
+        raise NoLatency(
+            f"the signals do not correlate: {curve[best]:.2f} at best, {MIN_CORRELATION} is needed. Does the sensor see "
+            "this arm's taps, and does `depth` grow towards contact?"
+        )
+    if best in (0, len(curve) - 1):
+        raise NoLatency(f"the best latency is at the edge of the search, {shifts[best]:.3f} s; widen the search")
+    inner = curve[1:-1]
+    peaks = np.flatnonzero((inner >= curve[:-2]) & (inner >= curve[2:])) + 1
+    rivals = [k for k in peaks if abs(k - best) * STEP > NEAR and curve[k] > MAX_RIVAL * curve[best]]
+    if rivals:
+        raise NoLatency(
+            f"latencies of {shifts[best]:.3f} s and {shifts[rivals[0]]:.3f} s fit alike; tap at uneven intervals"
+        )

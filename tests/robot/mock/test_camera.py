@@ -1,0 +1,381 @@
+"""The mock camera's process: what it serves, how it is broken, how it ends."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from robot import stamp
+from robot.errors import DeviceError, DeviceNotConnectedError
+from robot.mock.camera import MockCamera
+
+HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # parallel sessions stay apart
+WAIT = 20.0  # for what must come, however slow the machine [s]
+
+
+@pytest.fixture
+def camera() -> Iterator[MockCamera]:
+    with MockCamera(host=HOST, fps=60.0) as camera:
+        yield camera
+
+
+def until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT
+    while not holds():
+        assert time.monotonic() < deadline, "it never came"
+        time.sleep(0.005)
+
+
+def running(pid: int) -> bool:
+    """False for a zombie, too: who reaps an orphan is not this project's matter."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def get(camera: MockCamera, path: str) -> tuple[int, str, bytes]:
+    connection = http.client.HTTPConnection(camera.host, camera.port, timeout=WAIT)
+    try:
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        return answer.status, answer.headers["Content-Type"], answer.read()
+    finally:
+        connection.close()
+
+
+class Client:
+    """A plain reader of the stream."""
+
+    def __init__(self, camera: MockCamera) -> None:
+        self._socket = socket.create_connection((camera.host, camera.port), timeout=WAIT)
+        self._socket.sendall(b"GET /?action=stream HTTP/1.0\r\n\r\n")
+        self._file = self._socket.makefile("rb")
+        self.head = self._lines()
+
+    def _lines(self) -> list[str]:
+        lines = []
+        while (line := self._file.readline()) != b"\r\n":
+            if not line:
+                raise ConnectionError("cut")
+            lines.append(line.decode().strip())
+        return lines
+
+    def jpeg(self) -> bytes:
+        head = self._lines()
+        while not any(line.startswith("Content-Length") for line in head):
+            head = self._lines()
+        (length,) = (int(line.split(":")[1]) for line in head if line.startswith("Content-Length"))
+        data = self._file.read(length)
+        assert self._file.readline() == b"\r\n"
+        return data
+
+    def frame(self) -> tuple[np.ndarray, stamp.Stamp]:
+        picture, mark = stamp.split(np.array(Image.open(io.BytesIO(self.jpeg())).convert("RGB")))
+        assert mark is not None
+        return picture, mark
+
+    def close(self) -> None:
+        self._file.close()
+        self._socket.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def test_streams_as_mjpg_streamer_does(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        assert client.head[0].endswith("200 OK")
+        assert "Content-Type: multipart/x-mixed-replace;boundary=boundarydonotcross" in client.head
+        before = time.monotonic_ns() // 1000
+        marks = [client.frame()[1] for _ in range(5)]
+    numbers = [mark.frame for mark in marks]
+    assert numbers == sorted(set(numbers))
+    clocks = [mark.clock for mark in marks]
+    assert clocks == sorted(clocks) and before - 10**6 < clocks[0] and clocks[-1] <= time.monotonic_ns() // 1000
+    assert camera.url == f"http://{HOST}:{camera.port}/?action=stream"
+
+
+def test_snapshot_and_other_paths(camera: MockCamera) -> None:
+    until(lambda: camera.state().frames > 1)
+    status, kind, data = get(camera, "/?action=snapshot")
+    assert (status, kind) == (200, "image/jpeg") and Image.open(io.BytesIO(data)).size == (320, 256)
+    assert get(camera, "/nothing")[0] == 404
+
+
+def test_a_pushed_picture_is_shown_under_its_number(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        for value in (10, 200, 90):
+            number = camera.push(np.full((240, 320, 3), (value, 20, 30), dtype=np.uint8))
+            picture, mark = client.frame()
+            while mark.image < number:
+                picture, mark = client.frame()
+            assert mark.image == number
+            assert np.abs(picture.reshape(-1, 3).mean(axis=0) - (value, 20, 30)).max() < 3
+    assert camera.state().images == 3
+
+
+def test_a_pushed_picture_does_not_wait_for_the_next_tick() -> None:
+    with MockCamera(host=HOST, fps=0.1) as camera, Client(camera) as client:
+        for value in range(5):
+            number = camera.push(np.full((240, 320, 3), value, dtype=np.uint8))
+            while client.frame()[1].image != number:
+                pass
+        assert camera.state().frames <= 6  # at the rate it would take 50 s
+
+
+def test_keeps_its_rate(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        marks = [client.frame()[1] for _ in range(60)]
+    rate = 1e6 * (marks[-1].frame - marks[0].frame) / (marks[-1].clock - marks[0].clock)
+    assert 20.0 < rate < 66.0  # 60; a loaded machine may be slower, none is faster
+
+
+def test_without_stamp() -> None:
+    with MockCamera(host=HOST, width=64, height=48, stamped=False, quality=100) as camera:
+        camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
+        with Client(camera) as client:
+            image = np.array(Image.open(io.BytesIO(client.jpeg())))
+    assert image.shape == (48, 64, 3) and np.abs(image.astype(int) - 77).max() <= 1
+
+
+def test_clients_do_not_disturb_each_other(camera: MockCamera) -> None:
+    with Client(camera) as slow, Client(camera) as quick:
+        first = slow.frame()[1].frame
+        for _ in range(120):
+            quick.frame()
+        assert camera.state().clients == 2
+        assert slow.frame()[1].frame > first
+
+
+def test_a_slow_client_loses_frames_instead_of_filling_memory() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (768, 1024, 3), dtype=np.uint8)
+    with MockCamera(host=HOST, width=1024, height=768, fps=60, quality=100) as camera, Client(camera):
+        camera.push(noise)
+        camera.push(noise)
+
+        def sent() -> int:
+            return camera.state().sent
+
+        until(lambda: camera.state().clients == 1 and camera.state().frames > 60)
+        stuck = sent()
+        frames = camera.state().frames
+        until(lambda: camera.state().frames > frames + 30)
+        assert sent() <= stuck + 1  # one frame hangs in the socket; no other was handed out
+
+
+def test_stall(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        client.frame()
+        camera.stall(True)
+        frames = camera.state().frames
+        number = camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
+        time.sleep(0.1)
+        assert camera.state().frames == frames and camera.state().stall
+        camera.stall(False)
+        while client.frame()[1].image != number:
+            pass
+
+
+def test_drop(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        camera.drop(0.5)
+        numbers = [client.frame()[1].frame for _ in range(40)]
+        state = camera.state()
+    missing = numbers[-1] - numbers[0] - 39
+    assert missing >= 5 and state.dropped + state.skipped >= missing
+    assert np.all(np.diff(numbers) > 0)
+
+
+def test_delay(camera: MockCamera) -> None:
+    camera.delay(0.25)
+    with Client(camera) as client:
+        for _ in range(40):  # those of before the delay are through
+            _, mark = client.frame()
+        assert time.monotonic_ns() // 1000 - mark.clock > 249_000
+
+
+def test_corrupt(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        camera.corrupt(True)
+        broken = 0
+        for _ in range(30):
+            try:
+                image = np.array(Image.open(io.BytesIO(client.jpeg())).convert("RGB"))
+                broken += stamp.read(image) is None
+            except Exception:
+                broken += 1
+        assert broken >= 20
+        camera.corrupt(False)
+        for _ in range(3):
+            client.jpeg()
+        client.frame()
+
+
+def test_resize_and_brightness(camera: MockCamera) -> None:
+    camera.push(np.full((240, 320, 3), 100, dtype=np.uint8))
+    with Client(camera) as client:
+        camera.resize(160, 120)
+        camera.brightness(1.5)
+        for _ in range(5):
+            picture, _ = client.frame()
+        assert picture.shape == (120, 160, 3) and abs(picture.mean() - 150) < 3
+        camera.resize(320, 240)
+        for _ in range(5):
+            picture, _ = client.frame()
+        assert picture.shape == (240, 320, 3) and camera.state().size is None
+
+
+def test_disconnect_cuts_clients(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        client.frame()
+        assert camera.disconnect() == 1
+        with pytest.raises(OSError):
+            for _ in range(1000):
+                client.frame()
+    until(lambda: camera.state().clients == 0)
+    with Client(camera) as client:
+        client.frame()
+
+
+def test_refuse_closes_the_port_and_opens_it_again(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        client.frame()
+        camera.refuse(True)
+        camera.refuse(True)
+        with pytest.raises(ConnectionRefusedError):
+            Client(camera)
+        client.frame()  # who is there stays
+    camera.refuse(False)
+    with Client(camera) as client:
+        client.frame()
+
+
+def test_too_many_clients_are_told_so(camera: MockCamera) -> None:
+    clients = [Client(camera) for _ in range(16)]
+    try:
+        until(lambda: camera.state().clients == 16)
+        assert get(camera, "/?action=stream")[0] == 503
+    finally:
+        for client in clients:
+            client.close()
+
+
+def test_pushes_of_several_threads_keep_their_numbers(camera: MockCamera) -> None:
+    numbers: list[int] = []
+
+    def push() -> None:
+        for _ in range(20):
+            numbers.append(camera.push(np.zeros((240, 320, 3), dtype=np.uint8)))
+
+    threads = [threading.Thread(target=push) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(numbers) == list(range(1, 61))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((240, 321, 3), np.uint8), np.zeros((240, 320), np.uint8), np.zeros((0, 0, 3), np.uint8)]
+    + [np.zeros((240, 320, 3), np.float32)],
+)
+def test_pushes_of_another_shape_are_refused(camera: MockCamera, image: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"push needs \(240, 320, 3\) uint8"):
+        camera.push(image)
+    assert camera.state().images == 0
+
+
+def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
+    for ask in (
+        lambda: camera.drop(1.5),
+        lambda: camera.drop(float("nan")),
+        lambda: camera.delay(-1.0),
+        lambda: camera.resize(0, 10),
+        lambda: camera.brightness(-1.0),
+    ):
+        with pytest.raises(ValueError, match="must lie within"):
+            ask()
+
+
+@pytest.mark.parametrize(
+    "options", [{"width": 0}, {"height": 5000}, {"fps": 0.0}, {"fps": float("nan")}, {"quality": 10}, {"port": 70000}]
+)
+def test_options_beyond_reason_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must lie within"):
+        MockCamera(host=HOST, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.5", "camera.example", ""])
+def test_serves_loopback_only(host: str) -> None:
+    with pytest.raises(ValueError, match="no loopback address"):
+        MockCamera(host=host)
+
+
+def test_a_port_that_is_taken_is_said(camera: MockCamera) -> None:
+    with pytest.raises(DeviceError, match="cannot serve"):
+        MockCamera(host=HOST, port=camera.port)
+
+
+def test_close_is_idempotent_and_leaves_nothing() -> None:
+    camera = MockCamera(host=HOST)
+    with Client(camera):
+        camera.close()
+        camera.close()
+    assert not running(camera.pid)
+    with pytest.raises(DeviceNotConnectedError, match="closed"):
+        camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
+
+
+def test_a_killed_process_is_said(camera: MockCamera) -> None:
+    os.kill(camera.pid, signal.SIGKILL)
+    with pytest.raises(DeviceNotConnectedError, match="it has ended, exit status -9"):
+        for _ in range(3):
+            camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
+
+
+def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("robot.mock.camera.ANSWER_TIMEOUT", 0.5)
+    with MockCamera(host=HOST) as camera:
+        os.kill(camera.pid, signal.SIGSTOP)
+        with pytest.raises(DeviceNotConnectedError, match="it has ended"):
+            camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
+
+
+def test_ends_with_its_parent() -> None:
+    code = (
+        "import time; from robot.mock.camera import MockCamera\n"
+        f"camera = MockCamera(host={HOST!r}); print(camera.pid, flush=True); time.sleep(100)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        assert running(pid)
+        parent.kill()
+    until(lambda: not running(pid))
+
+
+def test_nonsense_on_standard_input_gets_an_answer() -> None:
+    command = [sys.executable, "-m", "robot.mock.camera", "--host", HOST]
+    lines = b'nonsense\n{"fly": 1}\n{"push": 3}\nabc{}\n{"state": true}\n'
+    done = subprocess.run(command, input=lines, capture_output=True, timeout=WAIT)
+    answers = done.stdout.decode().splitlines()
+    assert done.returncode == 0 and done.stderr == b""
+    assert ['"error"' in answer for answer in answers] == [False, True, True, True, True, False]

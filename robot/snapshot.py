@@ -36,7 +36,7 @@ Record = NDArray[np.void]  # one record (shape ()) or several (n,)
 class Ring:
     """The last `slots` records of type `record` in `memory`, which is zeroed when it is new."""
 
-    def __init__(self, memory: mmap.mmap, record: np.dtype[np.void], slots: int) -> None:
+    def __init__(self, memory: memoryview | mmap.mmap, record: np.dtype[np.void], slots: int) -> None:
         self._count: NDArray[np.uint64] = np.ndarray((1,), np.uint64, memory)
         self._slots: Record = np.ndarray((slots,), record, memory, offset=_HEAD)
 

@@ -210,3 +210,20 @@ def joint_step_excess(before: ArrayLike, after: ArrayLike, speed: float, period:
     step = np.abs(np.asarray(after, dtype=np.float64) - np.asarray(before, dtype=np.float64))
     share = float(step.max()) / (speed * period)
     return share if np.isfinite(share) else float("inf")
+
+
+def segments_apart(a0: ArrayLike, a1: ArrayLike, b0: ArrayLike, b1: ArrayLike) -> float:
+    """The least distance of two straight pieces, from `a0` to `a1` and from `b0` to `b1` (3,) [m].
+
+    Ericson, Real-Time Collision Detection (2005), 5.1.9.
+    """
+    start, other = np.asarray(a0, dtype=np.float64), np.asarray(b0, dtype=np.float64)
+    along, across, between = np.asarray(a1) - start, np.asarray(b1) - other, start - other
+    aa, bb, ab = float(along @ along), float(across @ across), float(along @ across)
+    ac, bc = float(along @ between), float(across @ between)
+    parallel = aa * bb - ab * ab
+    s = min(1.0, max(0.0, (ab * bc - ac * bb) / parallel)) if parallel > 1e-12 * aa * bb and parallel > 0.0 else 0.0
+    t = (ab * s + bc) / bb if bb > 0.0 else 0.0
+    t = min(1.0, max(0.0, t))
+    s = min(1.0, max(0.0, (ab * t - ac) / aa)) if aa > 0.0 else 0.0
+    return float(np.linalg.norm(between + s * along - t * across))

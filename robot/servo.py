@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from robot.frames import ArmFrames
-from robot.kinematics import Kinematics, rotation, rotation_vector
+from robot.frames import ArmFrames, Measured
+from robot.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
 from robot.link import ArmStatus, Kind, Orders
 from robot.snapshot import Record
 from robot.trajectory import PERIOD, Motion, braking, resting, stopping_point, towards
@@ -40,30 +39,14 @@ HARD = 5.0  # least deceleration after a fault [m/s^2]
 HARD_TURN = 50.0  # the same of rotations [rad/s^2]
 BARRIER = 0.5e-3  # so far beyond a wall the arm itself may come to rest; the target never goes beyond [m]
 LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches: nearer to a singularity it only may move away
+RESTING, RESTING_TURN = 1e-3, 10e-3  # slower than this an arm stands [m/s, rad/s]
+MOVED, MOVED_TURN = 0.2e-3, 2e-3  # farther than this from where it was held, something moved it [m, rad]
 SKEW = 2 * PERIOD  # between the loops of two arms [s]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """One package, and where that puts the sensor."""
-
-    joints: FloatArray  # (6,) [rad]
-    flange: FloatArray  # base_from_flange (4, 4) as the controller has it
-    sensor: FloatArray  # world_from_sensor (4, 4)
-    twist: FloatArray  # (6,) of the sensor, world axes [m/s, rad/s]
-    wrench: FloatArray  # (6,) on the sensor, its axes [N, N m]
 
 
 def measured(record: Record, frames: ArmFrames) -> Measured:
     """What a state record says of the sensor."""
-    pose = record["tcp_pose"]
-    return Measured(
-        joints=record["joints"].copy(),
-        flange=frames.measured_flange(pose),
-        sensor=frames.sensor(pose),
-        twist=frames.twist(pose, record["tcp_speed"]),
-        wrench=frames.wrench(pose, record["tcp_force"]),
-    )
+    return frames.measure(record["joints"].copy(), record["tcp_pose"], record["tcp_speed"], record["tcp_force"])
 
 
 def frames_of(orders: Orders) -> ArmFrames:
@@ -152,8 +135,7 @@ class Servo:
             if not self.status.is_fault and self.status != ArmStatus.WAITING:
                 self.status = ArmStatus.HOLD
             return self._slow_down(now)
-        if self.motion is None or (self.motion.at_rest and self.status == ArmStatus.HOLD):
-            # Out of a rest: from where the arm is, not from where it once was asked to be.
+        if self.motion is None or (self.status == ArmStatus.HOLD and self._was_moved(self.motion, now)):
             self.motion, self._sent = resting(now.sensor[:3, 3], now.sensor[:3, :3]), now.joints
             goal = self._cut_at_walls(self.motion) or goal
         gaps = self._gaps(self.motion, partners, 0.0)
@@ -175,6 +157,15 @@ class Servo:
             return self._send(wanted, joints)
         self.status = ArmStatus.OUT_OF_REACH
         return self._slow_down(now)
+
+    def _was_moved(self, held: Motion, now: Measured) -> bool:
+        """True if the arm stands elsewhere than it was held: it goes on from where it is, not from where it once was
+        asked to be. What the servo has not settled yet, or gives way to a contact, is no reason for a jump."""
+        if not held.at_rest or np.abs(now.twist[:3]).max() > RESTING or np.abs(now.twist[3:]).max() > RESTING_TURN:
+            return False
+        away = np.abs(now.sensor[:3, 3] - held.position).max()
+        turned = np.abs(rotation_vector(now.sensor[:3, :3] @ held.rotation.T)).max()
+        return bool(away > MOVED or turned > MOVED_TURN)
 
     def _slow_down(self, now: Measured) -> FloatArray | None:
         """A period of braking; the same joints again where even that finds none."""
@@ -200,7 +191,7 @@ class Servo:
         sensor = np.eye(4)
         sensor[:3, :3], sensor[:3, 3] = motion.rotation, motion.position
         wanted = self.frames.flange(sensor)
-        nominal = np.linalg.solve(now.flange, self.kinematics.forward(now.joints))  # controller's to our own flange
+        nominal = inverse_frame(now.flange) @ self.kinematics.forward(now.joints)  # controller's to our own flange
         joints = self.kinematics.inverse(wanted @ nominal, self._sent)
         if joints is None or joint_step_excess(self._sent, joints, self.orders.joint_speed, PERIOD) > 1.0:
             return None

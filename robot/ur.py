@@ -30,6 +30,7 @@ from robot.errors import (
     DeviceNotConnectedError,
     StaleObservationError,
 )
+from robot.frames import pose_of
 from robot.kinematics import Kinematics, pose
 from robot.link import HISTORY, ArmStatus, Kind, Link, Orders, Partner, command
 from robot.mock import MOCK_SERIAL
@@ -371,7 +372,7 @@ class URArm:
     def _state(self, record: snapshot.Record) -> ArmState:
         now = measured(record, self._frames)
         return ArmState(
-            pose=se3.from_matrix(now.sensor),
+            pose=pose_of(now.sensor),
             twist=now.twist,
             wrench=now.wrench,
             joints=now.joints,

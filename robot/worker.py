@@ -68,6 +68,7 @@ class Worker:
         self._periods = np.full(WINDOW, PERIOD)
         self._last, self._looks = time.monotonic(), 0
         self._words = (0, 0)  # runtime_state, safety_status_bits
+        self.state = measured(self.record, self.frames)
         self._publish(ArmStatus.CONNECTING)
 
     # -- connecting ----------------------------------------------------------------------------------------------
@@ -132,7 +133,7 @@ class Worker:
         while True:
             if self._read():
                 expected = kinematics.forward(self.record["joints"], tool)
-                difference = motion(expected, self.frames.measured_flange(self.record["tcp_pose"]) @ tool)
+                difference = motion(expected, self.state.flange @ tool)
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
                 if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
                     return
@@ -159,31 +160,31 @@ class Worker:
             if self._looks > 5 and now - float(self.record["time"]) > self.orders.link_timeout:
                 self._publish(ArmStatus.LINK_LOST)
                 self._leave(orphan)
-            state, partners = measured(self.record, self.frames), self._look_at_partners(now)
+            partners = self._look_at_partners(now)
             before = self.servo.status
             stopped = self._controller_stop()
             if stopped is not None:
                 self.servo.fault(stopped, None)
-            self.servo.watch(state, partners)
+            self.servo.watch(self.state, partners)
             if self.servo.status != before:
                 self._publish(self.servo.status)
             self.servo.hear(self.link.commands.latest(), self.link.commands.count)
             if ending is None and (orphan or self.servo.close_asked):
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:
-                    self.servo.fault(ArmStatus.CLOSED, state)
-            if self.servo.status in _CONTROLLER_STOPS:
+                    self.servo.fault(ArmStatus.CLOSED, self.state)
+            if stopped is not None or self.servo.status in _CONTROLLER_STOPS:
                 if ending is not None:
                     self._leave(orphan)
             else:
-                self._act(now, state, partners)
+                self._act(now, partners)
                 if ending is not None and (self.servo.resting or now > ending):
                     self._end_program()
                     self._leave(orphan)
             deadline = self._sleep(deadline)
 
-    def _act(self, now: float, state: Any, partners: list[Any]) -> None:
-        joints = self.servo.step(now, state, partners)
+    def _act(self, now: float, partners: list[Any]) -> None:
+        joints = self.servo.step(now, self.state, partners)
         orders, control = self.orders, self.control
         if joints is None:
             alive = control.kickWatchdog()
@@ -219,7 +220,8 @@ class Worker:
             return False
         record["joints"], record["joint_speeds"], record["tcp_pose"], record["tcp_speed"], record["tcp_force"] = fields
         record["stamp"], record["time"] = stamp, time.monotonic()
-        record["position"] = self.frames.sensor(record["tcp_pose"])[:3, 3]
+        self.state = measured(record, self.frames)
+        record["position"] = self.state.sensor[:3, 3]
         self._words = words
         return True
 

@@ -334,7 +334,7 @@ def test_limits_have_no_default_workspace() -> None:
 
 def test_an_arm_outside_its_workspace_does_not_connect(mock: MockUR) -> None:
     elsewhere = {"workspace": Workspace(lower=(2.0, 2.0, 2.0), upper=(3.0, 3.0, 3.0))}
-    with pytest.raises(SafetyViolation, match="outside its workspace.*mm beyond the workspace's lower"):
+    with pytest.raises(SafetyViolation, match=r"outside its workspace.*mm beyond the workspace's lower"):
         URArm(facts(limits=elsewhere), "left")
     assert leftovers("left") == []
 
@@ -760,7 +760,7 @@ def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
     assert leftovers("left") == []
 
 
-def test_close_while_it_connects(mock: MockUR) -> None:
+def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle of connecting: no worker and no memory stay behind."""
     mock.door.black_hole(True)
     workers: list[subprocess.Popen[bytes]] = []
@@ -770,8 +770,8 @@ def test_close_while_it_connects(mock: MockUR) -> None:
         threading.Timer(0.5, lambda: (workers.append(self._process), os.kill(os.getpid(), signal.SIGINT))).start()  # type: ignore[arg-type,func-returns-value]
         true_start(self)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(URArm, "_start", interrupted)
+    monkeypatch.setattr(URArm, "_start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
         URArm(facts(), "left", timeout=PATIENCE)
     assert workers[0].poll() is not None
     assert leftovers("left") == []

@@ -10,6 +10,7 @@ from robot.cli.bench import bench
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
 from robot.cli.look import doctor, schema
+from robot.cli.mock import mock
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce
 
@@ -23,7 +24,7 @@ app = typer.Typer(
     epilog="Example: [bold]tacsim run --task squeeze --out runs/first[/]   "
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
 )
-for command in (run, press, reproduce, replay, bench, debug, schema, doctor):
+for command in (run, press, reproduce, replay, mock, bench, debug, schema, doctor):
     # typer takes the first line of help from the docstring, and the example from the epilog
     text, _, example = (command.__doc__ or "").partition("Example:")
     app.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)

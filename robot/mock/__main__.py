@@ -1,0 +1,110 @@
+"""The process of mock controllers: `python -m robot.mock 127.0.0.2 127.0.0.3`.
+
+One loop serves all hosts of a process, with absolute deadlines 2 ms apart. With --with-parent it ends when its standard
+input ends or its parent is gone, so that no mock outlives who started it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import selectors
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from typing import get_args
+
+from robot.mock.arm import HOME, PERIOD
+from robot.mock.controller import SERIAL, Controller, Facts
+from robot.mock.door import DOOR_PORT
+from robot.mock.faults import FaultDoor
+from robot.mock.ur import VERSION, check_hosts
+from tacsim.hardware import Model
+
+CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
+
+
+def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> None:
+    """Runs controllers until the input ends (`with_parent`) or SIGTERM or SIGINT comes. Raises OSError for ports."""
+    ended: list[str] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.append("signal"))
+    with selectors.DefaultSelector() as selector:
+        controllers: list[Controller] = []
+        doors: list[FaultDoor] = []
+        try:
+            for facts in all_facts:
+                controllers.append(Controller(facts, selector))
+                doors.append(FaultDoor(controllers[-1], selector, door_port))
+            if with_parent:
+                selector.register(sys.stdin, selectors.EVENT_READ, lambda: ended.append("input"))
+            sys.stdout.write(json.dumps({"ready": [facts.host for facts in all_facts]}) + "\n")
+            sys.stdout.flush()
+            _loop(selector, controllers, doors, ended, os.getppid() if with_parent else None)
+        finally:
+            for door in doors:
+                door.close()
+            for controller in controllers:
+                controller.close()
+
+
+def _loop(
+    selector: selectors.BaseSelector,
+    controllers: list[Controller],
+    doors: list[FaultDoor],
+    ended: list[str],
+    parent: int | None,
+) -> None:
+    deadline = time.perf_counter() + PERIOD
+    while not ended:
+        # What has arrived is served before the tick, also after a pause: fresh commands before the watchdog.
+        for key, _ in selector.select(max(0.0, deadline - time.perf_counter())):
+            if key.fileobj in selector.get_map():
+                key.data()
+        late = time.perf_counter() - deadline
+        if late < 0:
+            continue
+        behind = int(late / PERIOD)
+        if behind > CATCH_UP:
+            for controller in controllers:
+                controller.overruns += behind - CATCH_UP
+            deadline += (behind - CATCH_UP) * PERIOD
+        deadline += PERIOD
+        for controller in controllers:
+            controller.tick()
+        for door in doors:
+            door.flush()
+        if parent is not None and os.getppid() != parent:
+            return
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the process. Says on standard output, as one line of JSON, that it is ready or why not."""
+    parser = argparse.ArgumentParser(prog="python -m robot.mock", description=__doc__)
+    parser.add_argument("hosts", nargs="+")
+    parser.add_argument("--model", choices=get_args(Model), default="ur5e")
+    parser.add_argument("--joints", default=",".join(map(repr, HOME)))
+    parser.add_argument("--version", default=".".join(map(str, VERSION)))
+    parser.add_argument("--door-port", type=int, default=DOOR_PORT)
+    parser.add_argument("--serial", default=SERIAL)
+    parser.add_argument("--allow-network", action="store_true")
+    parser.add_argument("--with-parent", action="store_true", help="end when standard input ends")
+    given = parser.parse_args(arguments)
+    try:
+        check_hosts(given.hosts, given.allow_network)
+        major, minor, bugfix, build = map(int, given.version.split("."))
+        joints = tuple(float(angle) for angle in given.joints.split(","))
+        facts = [Facts(host, given.model, joints, (major, minor, bugfix, build), given.serial) for host in given.hosts]
+        serve(facts, given.door_port, with_parent=given.with_parent)
+    except (OSError, ValueError) as error:
+        message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        sys.stdout.write(json.dumps({"error": message}) + "\n")
+        sys.stdout.flush()
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

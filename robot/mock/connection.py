@@ -1,0 +1,87 @@
+"""One client of the mock: what it has sent and is not yet read, what is still to be sent to it."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+
+RECEIVE = 1 << 16  # bytes read at a time
+BACKLOG = 1 << 20  # replies that a client does not fetch, before it is cut [bytes]
+
+
+class Connection:
+    """A non-blocking socket with buffers.
+
+    Replies wait until the client takes them. Stream packages are dropped, whole, while anything waits: a slow reader
+    loses packages, but never sees half of one.
+    """
+
+    def __init__(self, sock: socket.socket, port: int) -> None:
+        self.socket, self.port = sock, port
+        self.received = bytearray()
+        self.sent = self.dropped = 0  # stream packages
+        self._late: deque[tuple[float, bytes, bool, bool]] = deque()  # (due, bytes, droppable, halved): a slow line
+        self._waiting = bytearray()
+        self._half = b""  # what is left of a package that is sent in two parts
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self) -> bool:
+        """Takes what has arrived; False when the client is gone."""
+        try:
+            data = self.socket.recv(RECEIVE)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        self.received += data
+        return bool(data)
+
+    def send(self, data: bytes, *, droppable: bool = False, due: float = 0.0, halved: bool = False) -> None:
+        """Sends now, or at the time `due` [s]: see `flush`. `halved`: the second half comes with the next flush."""
+        if due > 0.0 or self._late:
+            self._late.append((due, data, droppable, halved))
+            return
+        self._push(data, droppable, halved)
+
+    def flush(self, now: float) -> bool:
+        """Sends what is due; False when the client is gone or has let too much pile up."""
+        self._push(b"", False, False)
+        while self._late and self._late[0][0] <= now:
+            _, data, droppable, halved = self._late.popleft()
+            self._push(data, droppable, halved)
+        return self._drain() and len(self._waiting) <= BACKLOG
+
+    def close(self, *, reset: bool = False) -> None:
+        """Ends the connection: with FIN, or with RST."""
+        if reset:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # on, 0 s
+        self.socket.close()
+
+    def _push(self, data: bytes, droppable: bool, halved: bool) -> None:
+        self._waiting += self._half
+        self._half = b""
+        if droppable:
+            if self._waiting:
+                self._drain()
+            if self._waiting:
+                self.dropped += 1
+                return
+            self.sent += 1
+        if halved:
+            data, self._half = data[: len(data) // 2], data[len(data) // 2 :]
+        self._waiting += data
+        self._drain()
+
+    def _drain(self) -> bool:
+        if not self._waiting:
+            return True
+        try:
+            count = self.socket.send(self._waiting)
+        except BlockingIOError:
+            return True
+        except OSError:
+            self._waiting.clear()
+            return False
+        del self._waiting[:count]
+        return True

@@ -11,7 +11,21 @@ from hypothesis import strategies as st
 
 from tacsim import pose as se3
 from tacsim.interface import Action, Pose
-from tacsim.limits import ActionError, check_action, check_workspace, shorten
+from tacsim.limits import (
+    ActionError,
+    admit,
+    braking_end,
+    check_action,
+    check_workspace,
+    finite_targets,
+    joint_step_excess,
+    overload,
+    region,
+    shorten,
+    stopping_distance,
+    way_clear,
+    way_inside,
+)
 
 START = se3.from_rotation_vector([0.1, -0.2, 0.3], [0.4, 0.0, 0.0])
 ARMS = ("lower", "upper")
@@ -103,3 +117,103 @@ def test_workspace_names_the_axis_that_leaves_it() -> None:
         check_workspace(Pose(np.array([0.0, 0.25, 0.1])), lower, upper, "lower")
     with pytest.raises(ValueError, match="lower to an upper corner"):
         check_workspace(START, upper, lower, "upper")
+
+
+BOX = ([-0.1, -0.2, 0.0], [0.1, 0.2, 0.3])
+SLOPE = region(*BOX, planes=[([0.0, 0.0, 0.1], [1.0, 0.0, 1.0])])  # keeps x + z >= 0.1
+points = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)).map(np.array)
+
+
+def hostile(number: int, seed: int = 0) -> np.ndarray:
+    """(number, 7) rows in the shape of poses: sound ones, NaN, infinities, huge numbers, lengths that are wrong."""
+    rng = np.random.default_rng(seed)
+    rows = np.concatenate([rng.uniform(-2, 2, (number, 3)), rng.normal(size=(number, 4))], axis=1)
+    rows[:, 3:] /= np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    poison = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 1e200, 1e4, 5e-324])
+    bad = rng.random(number) < 0.5
+    rows[bad, rng.integers(0, 7, number)[bad]] = rng.choice(poison, number)[bad]
+    return rows
+
+
+def test_a_million_hostile_targets_none_passes_that_is_no_pose() -> None:
+    rows = hostile(1_000_000)
+    passed = rows[finite_targets(rows)]
+    assert 0.4e6 < len(passed) < 0.7e6  # the sound half, and those poisoned with a number so small that it does no harm
+    assert np.isfinite(passed).all()
+    assert np.abs(passed[:, :3]).max() <= 1e3
+    assert np.abs(np.linalg.norm(passed[:, 3:], axis=1) - 1.0).max() <= 1e-3
+    for row in passed[:1000]:
+        Pose(row[:3], row[3:])  # raises for what is no pose
+
+
+@pytest.mark.parametrize("bad", [None, "up", [1, 2, 3], np.zeros(6), [[0.0] * 7, [0.0] * 6], 3.0, [], [1j] * 7])
+def test_what_has_the_wrong_shape_is_no_target(bad: object) -> None:
+    assert not finite_targets(bad).any()  # type: ignore[arg-type]
+
+
+def test_many_hostile_targets_are_refused_or_shortened_into_the_box() -> None:
+    """What is admitted ends in the box, on the straight way."""
+    now = Pose(np.array([0.05, 0.0, 0.15]))
+    rows = hostile(5_000, seed=1)
+    shortened = 0
+    for row in rows[finite_targets(rows)]:
+        wanted = Pose(row[:3], row[3:])
+        sent, share = admit(wanted, now, SLOPE)
+        assert SLOPE.excess(sent.position) <= 1e-9
+        assert (sent is wanted) == (share == 1.0)
+        shortened += share < 1.0
+        way, whole = sent.position - now.position, wanted.position - now.position
+        assert np.allclose(way, share * whole, atol=1e-9)
+    assert shortened > 1_000
+
+
+@given(points, points)
+def test_the_way_inside_is_as_long_as_can_be(start: np.ndarray, end: np.ndarray) -> None:
+    share = way_inside(start, end, SLOPE)
+    if SLOPE.excess(start) <= 0:
+        last = start + share * (end - start)
+        assert SLOPE.excess(last) <= 1e-8
+        if share < 1.0:
+            assert SLOPE.excess(start + min(1.0, share + 1e-3) * (end - start)) > 0
+    else:  # from outside, only a way in
+        assert share == (1.0 if SLOPE.excess(end) <= 1e-9 else share)
+        if SLOPE.excess(end) > SLOPE.excess(start) + 1e-6:
+            assert share < 1.0
+
+
+@given(points, points, points, st.floats(0.01, 0.3))
+def test_the_way_keeps_clear_of_a_sphere(
+    start: np.ndarray, end: np.ndarray, centre: np.ndarray, distance: float
+) -> None:
+    share = way_clear(start, end, centre, distance)
+    begin = float(np.linalg.norm(start - centre))
+    for s in np.linspace(0.0, share, 20):
+        assert np.linalg.norm(start + s * (end - start) - centre) >= min(distance, begin) - 1e-7
+    if share < 1.0 and begin > distance:
+        beyond = start + min(1.0, share + 1e-3) * (end - start)
+        assert np.linalg.norm(beyond - centre) < distance + 1e-6
+
+
+def test_a_region_says_which_wall_is_broken() -> None:
+    assert SLOPE.broken([0.05, 0.0, 0.15]) == ""
+    assert "2 mm beyond the workspace's upper x = 0.1 m" in SLOPE.broken([0.102, 0.0, 0.15])
+    assert "beyond plane 0" in SLOPE.broken([-0.05, 0.0, 0.05])
+    with pytest.raises(ValueError, match="plane 0 has no normal"):
+        region(*BOX, planes=[([0, 0, 0], [0, 0, 0])])
+    with pytest.raises(ValueError, match="lower to an upper corner"):
+        region(BOX[1], BOX[0])
+
+
+def test_stopping_needs_room() -> None:
+    assert stopping_distance(0.1, 0.5) == pytest.approx(0.01)
+    assert np.allclose(braking_end([0, 0, 0.1], [0, 0, -0.1], 0.5), [0, 0, 0.09])
+    assert np.allclose(braking_end([0, 0, 0.1], [0, 0, 0], 0.5), [0, 0, 0.1])
+
+
+def test_loads_and_steps_that_are_too_large_or_no_numbers() -> None:
+    assert not overload([3.0, 0, 4.0, 0, 0, 1.0], 5.0, 1.0)
+    assert overload([3.0, 0, 4.1, 0, 0, 0.0], 5.0, 1.0)
+    assert overload([0, 0, 0, 0.8, 0, 0.8], 5.0, 1.0)
+    assert overload([math.nan, 0, 0, 0, 0, 0], 5.0, 1.0) and overload([0, 0, 0, 0, math.nan, 0], 5.0, 1.0)
+    assert joint_step_excess(np.zeros(6), [0, 0, -0.002, 0, 0, 0.001], 1.0, 2e-3) == pytest.approx(1.0)
+    assert joint_step_excess(np.zeros(6), [0, 0, math.nan, 0, 0, 0], 1.0, 2e-3) == math.inf

@@ -1,0 +1,147 @@
+"""What two processes tell each other through shared memory: a :class:`Ring` of records, one writer, many readers.
+
+A record is written into the next slot, and only then counted. A reader copies the newest counted slot and counts again:
+as long as the writer has not come round to that slot meanwhile, the copy is whole. It is a sequence lock whose writer
+never waits and whose readers all but never repeat, and it keeps the past for those who want to look back.
+
+This relies on the order in which others see the writes of one processor: x86-64 keeps the order of stores, and of
+loads (Intel SDM 3A, 8.2.2), and an aligned 8-byte store is never seen half done. ur_rtde has wheels for nothing else;
+on other processors :func:`create` refuses.
+
+A segment is a mapped file in the system's memory folder. It belongs to the process that made it and carries that
+process's number in its name. multiprocessing.shared_memory is not used: before Python 3.13 its resource tracker also
+takes charge of segments that a process only attached, and removes them when that process dies. Here the owner removes
+its segments when it closes, a worker those of an owner that died, and :func:`sweep` what both left behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import platform
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+PREFIX = "tacsim"
+FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
+_HEAD = 64  # bytes before the slots: the count, on a cache line of its own
+
+Record = NDArray[np.void]  # one record (shape ()) or several (n,)
+
+
+class Ring:
+    """The last `slots` records of type `record` in `memory`, which is zeroed when it is new."""
+
+    def __init__(self, memory: memoryview | mmap.mmap, record: np.dtype[np.void], slots: int) -> None:
+        self._count: NDArray[np.uint64] = np.ndarray((1,), np.uint64, memory)
+        self._slots: Record = np.ndarray((slots,), record, memory, offset=_HEAD)
+
+    @staticmethod
+    def size(record: np.dtype[np.void], slots: int) -> int:
+        """Bytes of memory that such a ring takes; a multiple of a cache line."""
+        return _HEAD + -(-record.itemsize * slots // _HEAD) * _HEAD
+
+    @property
+    def count(self) -> int:
+        """How many records were ever written."""
+        return int(self._count[0])
+
+    def write(self, record: Record) -> None:
+        """Adds a record; from one thread of one process only."""
+        count = int(self._count[0])
+        self._slots[count % len(self._slots)] = record
+        self._count[0] = count + 1  # only now it can be read
+
+    def latest(self) -> Record | None:
+        """A copy of the newest record, None before the first."""
+        while count := int(self._count[0]):
+            copy = self._slots[(count - 1) % len(self._slots)].copy()
+            if int(self._count[0]) - count < len(self._slots) - 1:  # else the writer may be in this slot by now
+                return np.asarray(copy)
+        return None
+
+    def recent(self, number: int) -> Record:
+        """Copies of the newest records (n,), at most `number`, oldest first."""
+        slots = len(self._slots)
+        count = int(self._count[0])
+        first = max(0, count - min(number, slots - 1))
+        index = np.arange(first, count)
+        copies = self._slots[index % slots]
+        whole = index > int(self._count[0]) - slots
+        kept: Record = copies[whole]
+        return kept
+
+
+class Segment:
+    """A piece of shared memory. Who made it (:func:`create`) removes it in `close`; who attached only looks."""
+
+    def __init__(self, path: Path, memory: mmap.mmap, *, owned: bool) -> None:
+        self.name, self.memory = path.name, memory
+        self._path, self._owned = path, owned
+
+    def close(self) -> None:
+        """Lets go of the memory, and removes it if it is owned. Drop the rings on it first: as long as one is held, so
+        is the memory."""
+        if self._owned:
+            self.remove()
+        with contextlib.suppress(BufferError):  # a ring still looks at it; it goes with the ring
+            self.memory.close()
+
+    def remove(self) -> None:
+        """Takes the name away; who is attached stays so."""
+        self._path.unlink(missing_ok=True)
+
+
+def segment_name(owner: int, arm: str) -> str:
+    """The name of the segment that process `owner` makes for `arm`."""
+    return f"{PREFIX}-{owner}-{arm}"
+
+
+def create(name: str, size: int) -> Segment:
+    """A new zeroed segment. Raises FileExistsError if the name is taken, OSError on a processor other than x86-64."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        raise OSError(f"records in shared memory need the store order of x86-64; this is {platform.machine()}")
+    path = FOLDER / name
+    with path.open("x+b") as file:
+        try:
+            path.chmod(0o600)
+            file.truncate(size)
+            if hasattr(os, "posix_fallocate"):  # a full folder is an error here, not a bus error later
+                os.posix_fallocate(file.fileno(), 0, size)
+            return Segment(path, mmap.mmap(file.fileno(), size), owned=True)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+
+
+def attach(name: str) -> Segment:
+    """A segment that another process made. Raises FileNotFoundError."""
+    path = FOLDER / name
+    with path.open("r+b") as file:
+        return Segment(path, mmap.mmap(file.fileno(), 0), owned=False)
+
+
+def sweep() -> list[str]:
+    """Removes segments whose owner is gone; returns their names. Processes in other containers that share the memory,
+    but not the process numbers, are taken for gone: give such containers memory of their own."""
+    removed = []
+    for path in FOLDER.glob(f"{PREFIX}-*-*"):
+        owner = path.name.split("-")[1]
+        if owner.isdigit() and not _alive(int(owner)):
+            path.unlink(missing_ok=True)
+            removed.append(path.name)
+    return removed
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

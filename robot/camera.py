@@ -185,11 +185,15 @@ class Camera:
                 self._changed.wait(deadline - now)
 
     def _late(self, now: float, timeout: float, image: int | None) -> str:
-        what = f"sensor '{self._name}': no frame {'' if image is None else f'of picture {image} '}within {timeout:.3g} s"
+        what = (
+            f"sensor '{self._name}': no frame {'' if image is None else f'of picture {image} '}within {timeout:.3g} s"
+        )
         if self._frame is None:
             newest = "none came yet"
         else:
-            newest = f"the newest is {1e3 * (now - self._frame.time):.0f} ms old, limit {1e3 * self._facts.max_age:.0f} ms"
+            newest = (
+                f"the newest is {1e3 * (now - self._frame.time):.0f} ms old, limit {1e3 * self._facts.max_age:.0f} ms"
+            )
             if image is not None and self._stamp is not None:
                 newest += f", and shows picture {self._stamp.image}"
         return f"{what}: {newest}; {self._error or 'the source is open'} ({self._facts.source})"

@@ -87,7 +87,7 @@ def open_capture(facts: CameraSensorFacts, name: str, stop: threading.Event) -> 
 
 
 def source_kind(facts: CameraSensorFacts, name: str) -> str:
-    """"stream", "uvc", "folder" or "video". Raises WrongSource for what none of them reads, or a setting that this kind
+    """ "stream", "uvc", "folder" or "video". Raises WrongSource for what none of them reads, or a setting that this kind
     cannot keep."""
     source, where = facts.source, f"sensor '{name}': source '{facts.source}'"
     if source.startswith("http://"):
@@ -183,7 +183,9 @@ class MjpegCapture:
             if key.strip().lower() == b"content-length" and value.strip().isdigit() and len(value) < 20:
                 length = int(value)
         else:
-            raise WrongSource(f"{self._what}: a part with more than {_MAX_LINES} header lines; is that an MJPEG camera?")
+            raise WrongSource(
+                f"{self._what}: a part with more than {_MAX_LINES} header lines; is that an MJPEG camera?"
+            )
         if length is None:
             return self._until_boundary()
         if length > self._limit:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -29,15 +29,28 @@ class CannotOpen(ValueError):
     """A rig file that is sound in itself describes no rig that can be opened."""
 
 
-def open_rig(rig: str | Path | LoadedRig | RigFacts, *, task: str | None = None, overrides: Sequence[str] = ()) -> Rig:
-    """Opens a rig by its name ("sim", "replay"), by the path of its file, or from facts already loaded.
+# Which drivers can go by which clock. A simulated sensor on hardware shows what the gel at the arm's pose would look like.
+ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
+SENSOR_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"camera", "sim"}}
+
+
+def open_rig(
+    rig: str | Path | LoadedRig | RigFacts,
+    *,
+    task: str | None = None,
+    overrides: Sequence[str] = (),
+    confirm: Callable[[str], bool] | None = None,
+) -> Rig:
+    """Opens a rig by its name ("sim", "mock", "ur5e", "replay"), by the path of its file, or from facts already loaded.
 
     Use it as a context manager: ``with open_rig("sim") as rig: observation = rig.reset()``. `task` and `overrides` are
-    as for tacsim.config.load_rig; facts that are loaded have theirs already. Opening moves nothing.
+    as for tacsim.config.load_rig; facts that are loaded have theirs already. Opening moves nothing. `confirm` asks a
+    person a question, and has the answer: a rig with real arms approaches nothing without a yes.
 
     Raises:
         ConfigError: the file is wrong.
         CannotOpen: its parts don't make a rig, e.g. a recording is not named.
+        DeviceError: an arm, a camera or a mock of them cannot be opened (robot.errors).
         EpisodeError: a recording cannot be read.
     """
     if isinstance(rig, (LoadedRig, RigFacts)):
@@ -47,6 +60,10 @@ def open_rig(rig: str | Path | LoadedRig | RigFacts, *, task: str | None = None,
     else:
         facts = load_rig(rig, task=task, overrides=overrides).facts
     _check_parts(facts)
+    if facts.clock == "wall":
+        from robot.wall import open_wall
+
+        return open_wall(facts, confirm)
     return _open_sim(facts) if facts.clock == "sim" else _open_replay(facts)
 
 
@@ -73,13 +90,15 @@ def make_env(
 
 def _check_parts(facts: RigFacts) -> None:
     """All parts of a rig go by one clock, and every recorded sensor names its recording."""
-    parts: dict[str, str] = {f"arms.{name}": arm.driver for name, arm in facts.arms.items()}
-    parts |= {f"sensors.{name}": sensor.driver for name, sensor in facts.sensors.items()}
-    for key, driver in parts.items():
-        if driver != facts.clock:
+    parts: dict[str, tuple[str, set[str]]] = {
+        f"arms.{name}": (arm.driver, ARM_DRIVERS[facts.clock]) for name, arm in facts.arms.items()
+    }
+    parts |= {f"sensors.{name}": (sensor.driver, SENSOR_DRIVERS[facts.clock]) for name, sensor in facts.sensors.items()}
+    for key, (driver, allowed) in parts.items():
+        if driver not in allowed:
             raise CannotOpen(
                 f"rig '{facts.name}': {key} has driver '{driver}', which cannot go by clock '{facts.clock}'; "
-                f"give it driver '{facts.clock}', or change the clock"
+                f"give it driver '{' or '.join(sorted(allowed))}', or change the clock"
             )
     for name, sensor in facts.sensors.items():
         if isinstance(sensor, ReplaySensorFacts) and sensor.source is None:

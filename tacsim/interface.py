@@ -185,7 +185,10 @@ class TactileSource(Protocol):
 class Arm(Protocol):
     """One arm that carries a sensor: simulated, UR or recorded."""
 
-    def state(self) -> ArmState: ...
+    def state(self, at: float | None = None) -> ArmState:
+        """The newest state; or that at a past moment of the rig's clock [s], such as the exposure of a picture."""
+        ...
+
     def command(self, target: Pose | None) -> Pose | None:
         """Asks for `target` (None holds); returns what is really sent after the limits, None if nothing is executed."""
         ...

@@ -46,6 +46,7 @@ class Rig:
         truth: the body as only a simulation knows it; None on rigs without.
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
         read_timeout: how long to wait for a frame [s].
+        beside: closes what the rig needs besides sensors and arms, after them.
     """
 
     def __init__(
@@ -60,13 +61,14 @@ class Rig:
         truth: Callable[[], Truth | None] | None = None,
         diagnostics: Callable[[], Mapping[str, float]] = dict,
         read_timeout: float = 1.0,
+        beside: Callable[[], None] | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
         self.name = name
         self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
         self._normalisers, self._start, self._truth = dict(normalisers), start, truth
-        self._diagnostics, self._timeout = diagnostics, read_timeout
+        self._diagnostics, self._timeout, self._beside = diagnostics, read_timeout, beside
         self._frames: Mapping[str, TactileFrame] = {}
         self._references: Mapping[str, TactileFrame] = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
@@ -100,9 +102,13 @@ class Rig:
         return self.observe()
 
     def observe(self) -> Observation:
-        """What the sensors and arms say now. Raises TimeoutError without a frame, EndOfEpisode after a recording."""
+        """What the sensors say now, and what the arms that carry them said when the pictures were exposed.
+
+        Raises TimeoutError without a frame, EndOfEpisode after a recording.
+        """
         frames = {name: sensor.read(self._timeout) for name, sensor in self._sensors.items()}
-        arms: dict[str, ArmState] = {name: arm.state() for name, arm in self._arms.items()}
+        exposed = {self._sensors[name].spec.arm: frame.time for name, frame in frames.items()}
+        arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self._arms.items()}
         now = self._clock.now()
         tactile = {name: self._normalisers[name](frame, now) for name, frame in frames.items()}
         self._frames = frames
@@ -134,7 +140,8 @@ class Rig:
     def close(self) -> None:
         """Stops the arms and closes everything, each even when another fails."""
         arms = [step for arm in self._arms.values() for step in (arm.stop, arm.close)]
-        _each([*arms, *(sensor.close for sensor in self._sensors.values())])
+        beside = [] if self._beside is None else [self._beside]
+        _each([*arms, *(sensor.close for sensor in self._sensors.values()), *beside])
 
     def __enter__(self) -> Self:
         return self

@@ -109,7 +109,8 @@ class SimArm:
         self._world, self._clock, self._frame = world, clock, frame
         self._longest, self._widest = longest, widest
 
-    def state(self) -> ArmState:
+    def state(self, at: float | None = None) -> ArmState:
+        """Pictures and arms are of one instant in simulation, so `at` makes no difference."""
         return ArmState(
             pose=self._world.pose(self._frame),
             twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),

@@ -216,7 +216,9 @@ def _check_options(
     except ValueError:
         loopback = False  # a name: who knows where it leads
     if not (loopback or allow_network):
-        raise ValueError(f"mock camera: '{host}' is no loopback address; use 127.x.y.z, or allow the network explicitly")
+        raise ValueError(
+            f"mock camera: '{host}' is no loopback address; use 127.x.y.z, or allow the network explicitly"
+        )
     _within(port, 0, 65535, "port")
     _within(width, 16, MAX_SIDE, "width [px]")
     _within(height, 16, MAX_SIDE, "height [px]")

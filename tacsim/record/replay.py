@@ -141,7 +141,7 @@ class ReplayArm:
         self._states = Cursor(self._open(), str(self._path))
         _first(self._states, self._path)
 
-    def state(self) -> ArmState:
+    def state(self, at: float | None = None) -> ArmState:
         """The state of this tick. Raises EndOfEpisode after the last."""
         state, age = self._states.at(self._clock.index)
         return replace(state, time=self._clock.now() - age)

@@ -44,7 +44,9 @@ def test_between_two_states_all_of_it_is_exact() -> None:
         np.testing.assert_allclose(aligned.state.twist, state(time).twist, atol=1e-12)
         np.testing.assert_allclose(aligned.state.joints, state(time).joints, atol=1e-12)
         assert aligned.state.time == time
-        assert aligned.error == pytest.approx(min(time % 0.02, 0.02 - time % 0.02)) and aligned.gap == pytest.approx(0.02)
+        assert aligned.error == pytest.approx(min(time % 0.02, 0.02 - time % 0.02)) and aligned.gap == pytest.approx(
+            0.02
+        )
 
 
 def test_at_a_state_it_is_that_state() -> None:

@@ -123,7 +123,10 @@ def chunked(data: bytes) -> bytes:
 
 WHOLE = jpeg()
 STREAMS = {
-    "with lengths": [STREAM, *(part(jpeg(10 * k), b"Content-Type: image/jpeg", length(jpeg(10 * k))) for k in range(4))],
+    "with lengths": [
+        STREAM,
+        *(part(jpeg(10 * k), b"Content-Type: image/jpeg", length(jpeg(10 * k))) for k in range(4)),
+    ],
     "without lengths": [STREAM, *(part(jpeg(10 * k), b"Content-Type: image/jpeg") for k in range(4)), b"--here\r\n"],
     "byte by byte": [bytes([byte]) for k in range(4) for byte in (STREAM if k == 0 else b"") + part(jpeg(10 * k))]
     + [b"--here\r\n"],

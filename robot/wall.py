@@ -1,0 +1,198 @@
+"""Rigs that go by the wall clock: UR arms and cameras, real or mock, and simulated sensors on them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from robot.align import ArmHistory
+from robot.camera import Camera
+from robot.clock import Driven, LockStep, WallClock
+from robot.errors import DeviceError
+from robot.mock.bench import MockBench
+from robot.start import GuidedStart
+from robot.trajectory import PERIOD
+from robot.twin_sensor import TwinSensor
+from robot.ur import URArm
+from tacsim.hardware import CameraSensorFacts, UrArmFacts
+from tacsim.interface import ArmState, Normaliser, Pose, TactileSource
+from tacsim.rig import Rig
+from tacsim.rigfile import RigFacts, SimSensorFacts
+from tacsim.touch import contact_signal
+
+if TYPE_CHECKING:
+    from calibration.normaliser import FrameNormaliser
+
+Confirm = Callable[[str], bool]
+QUESTION = "Is the body in its place between the sensors, and everybody out of reach of the arms?"
+
+
+class RigArm:
+    """One UR arm as the rig has it: it remembers where it was asked to go, for the clock to wait for."""
+
+    def __init__(self, driven: Driven) -> None:
+        self._driven = driven
+        self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
+
+    def state(self, at: float | None = None) -> ArmState:
+        """Raises NotAligned for a moment of which no package tells."""
+        arm = self._driven.arm
+        if at is None:
+            return arm.state()
+        packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
+        history = ArmHistory(arm.name)
+        for state in arm.history(packages):
+            history.append(state)
+        aligned = history.at(at)
+        self.alignment = aligned.error
+        return aligned.state
+
+    def command(self, target: Pose | None) -> Pose | None:
+        self._driven.target = self._driven.arm.command(target)
+        return self._driven.target
+
+    def stop(self) -> None:
+        self._driven.target = None
+        self._driven.arm.stop()
+
+    def recover(self) -> None:
+        self._driven.target = None
+        self._driven.arm.recover()
+
+    def close(self) -> None:
+        self._driven.arm.close()
+
+
+def open_wall(facts: RigFacts, confirm: Confirm | None) -> Rig:
+    """Opens a rig of hardware. Starts the mocks that its file asks for. Connects; moves nothing.
+
+    confirm: asks a person a question before anything approaches the body; not needed where all arms are mocks.
+
+    Raises DeviceError for what cannot be opened, ValueError for a rig that makes no sense.
+    """
+    real = [name for name, arm in facts.arms.items() if isinstance(arm, UrArmFacts) and arm.mock is None]
+    with ExitStack() as stack:
+        bench = stack.enter_context(MockBench(facts))
+        sensors: dict[str, TactileSource] = {}
+        for name, sensor in facts.sensors.items():
+            sensors[name] = _sensor(name, sensor, bench)
+            stack.callback(sensors[name].close)
+        arms: dict[str, Driven] = {}
+        for name, arm in facts.arms.items():
+            assert isinstance(arm, UrArmFacts)
+            opened = URArm(arm, name, keep_out=_keep_out(facts, name))
+            stack.callback(opened.close)
+            arms[name] = Driven(opened)
+        cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
+        fed = {name: camera for name, camera in cameras.items() if name in bench.cameras}
+        lock_step = facts.lock_step and not real and bench.simulated
+        clock = LockStep(facts.period, arms, fed, bench) if lock_step else WallClock(facts.period)
+        if bench.simulated and not lock_step:
+            bench.run_free()
+        normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
+        task = facts.task
+        start = GuidedStart(
+            arms=arms,
+            sensors=sensors,
+            start=_starts(facts, bench),
+            clock=clock,
+            facts=facts.start,
+            feel=_feel(facts, arms, sensors, normalisers),
+            confirm=_confirmed(facts, bench, confirm if real else None, bool(real)),
+            placement=0.0 if task is None else task.placement,
+        )
+
+        behind = {name: RigArm(driven) for name, driven in arms.items()}
+
+        def diagnostics() -> Mapping[str, float]:
+            alignment = {f"alignment_{name}": arm.alignment for name, arm in behind.items()}
+            return {**bench.diagnostics(), **clock.diagnostics(), **alignment}
+
+        rig = Rig(
+            name=facts.name,
+            sensors=sensors,
+            arms=behind,
+            clock=clock,
+            normalisers=normalisers,
+            start=start,
+            truth=bench.truth if bench.simulated and facts.scene is not None and facts.scene.body is not None else None,
+            diagnostics=diagnostics,
+            beside=bench.close,
+        )
+        stack.pop_all()
+        return rig
+
+
+def _sensor(name: str, facts: object, bench: MockBench) -> TactileSource:
+    if isinstance(facts, CameraSensorFacts):
+        return Camera(facts, name)
+    assert isinstance(facts, SimSensorFacts)
+    return TwinSensor(bench, name, facts)
+
+
+def _keep_out(facts: RigFacts, name: str) -> dict[str, float]:
+    """Least distances to the other arms [m]."""
+    found: dict[str, float] = {}
+    for apart in facts.keep_out:
+        if name in apart.arms:
+            other = apart.arms[1 - apart.arms.index(name)]
+            found[other] = max(apart.distance, found.get(other, 0.0))
+    return found
+
+
+def _starts(facts: RigFacts, bench: MockBench) -> dict[str, Pose]:
+    starts = dict(bench.start)
+    for name, arm in facts.arms.items():
+        assert isinstance(arm, UrArmFacts)
+        if arm.start is not None:
+            starts[name] = arm.start.pose
+        elif name not in starts:
+            raise DeviceError(f"arms.{name}.start is missing: world_from_sensor where an episode begins, clear of all")
+    return starts
+
+
+def _feel(
+    facts: RigFacts,
+    arms: Mapping[str, Driven],
+    sensors: Mapping[str, TactileSource],
+    normalisers: Mapping[str, Normaliser],
+) -> Callable[[], float] | None:
+    """How hard the gels touch over what counts as touch: by the picture where `touch_signal` is given, else by force."""
+    signal = facts.start.touch_signal
+    if signal is not None:
+
+        def seen() -> float:
+            found = [contact_signal(normalisers[name](sensor.read(1.0), 0.0)) for name, sensor in sensors.items()]
+            return min(found) / signal
+
+        return seen
+    force = None if facts.task is None else facts.task.touch_force
+    carrying = [sensor.arm for sensor in facts.sensors.values() if sensor.arm is not None]
+    if force is None or not carrying:
+        return None
+
+    def felt() -> float:
+        return min(-float(arms[name].arm.state().wrench[2]) for name in carrying) / force
+
+    return felt
+
+
+def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, real: bool) -> Callable[[], bool]:
+    def ask() -> bool:
+        if real:
+            return confirm is not None and confirm(f"Rig '{facts.name}': {QUESTION}")
+        bench.place()
+        return True
+
+    return ask
+
+
+def _normaliser(name: str, facts: object, rig: RigFacts) -> FrameNormaliser:
+    from calibration.normaliser import for_simulated
+
+    assert isinstance(facts, CameraSensorFacts | SimSensorFacts)
+    assert facts.model is not None and rig.scene is not None
+    return for_simulated(facts.model, rig.scene.gel.size[:2], rig.canonical)

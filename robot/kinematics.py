@@ -13,11 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacsim.hardware import Model
 from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from tacsim.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
 TOLERANCE = 1e-10  # of the inverse [m, rad]

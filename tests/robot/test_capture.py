@@ -16,8 +16,10 @@ from PIL import Image
 
 from robot import capture
 from robot.camera import Camera
-from robot.capture import MjpegCapture, PlayedCapture, UvcCapture, WrongSource, source_kind
+from robot.capture import PlayedCapture, UvcCapture, source_kind
 from robot.errors import DeviceNotConnectedError
+from robot.mjpeg import MjpegCapture
+from robot.picture import WrongSource
 from tacsim.hardware import CameraSensorFacts
 
 HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
@@ -123,7 +125,10 @@ def chunked(data: bytes) -> bytes:
 
 WHOLE = jpeg()
 STREAMS = {
-    "with lengths": [STREAM, *(part(jpeg(10 * k), b"Content-Type: image/jpeg", length(jpeg(10 * k))) for k in range(4))],
+    "with lengths": [
+        STREAM,
+        *(part(jpeg(10 * k), b"Content-Type: image/jpeg", length(jpeg(10 * k))) for k in range(4)),
+    ],
     "without lengths": [STREAM, *(part(jpeg(10 * k), b"Content-Type: image/jpeg") for k in range(4)), b"--here\r\n"],
     "byte by byte": [bytes([byte]) for k in range(4) for byte in (STREAM if k == 0 else b"") + part(jpeg(10 * k))]
     + [b"--here\r\n"],

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,8 +42,7 @@ def until(holds: Callable[[], bool]) -> None:
 def running(pid: int) -> bool:
     """False for a zombie, too: who reaps an orphan is not this project's matter."""
     try:
-        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
 
@@ -247,8 +247,7 @@ def test_disconnect_cuts_clients(camera: MockCamera) -> None:
         client.frame()
         assert camera.disconnect() == 1
         with pytest.raises(OSError):
-            for _ in range(1000):
-                client.frame()
+            [client.frame() for _ in range(1000)]
     until(lambda: camera.state().clients == 0)
     with Client(camera) as client:
         client.frame()
@@ -347,8 +346,7 @@ def test_close_is_idempotent_and_leaves_nothing() -> None:
 def test_a_killed_process_is_said(camera: MockCamera) -> None:
     os.kill(camera.pid, signal.SIGKILL)
     with pytest.raises(DeviceNotConnectedError, match="it has ended, exit status -9"):
-        for _ in range(3):
-            camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
+        camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
 def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -281,7 +281,7 @@ class Camera:
         numbered = -1
         if mark is not None and self._stamp is not None:
             numbered = mark.frame - self._stamp.frame - 1
-        if self._arrivals and (clock != "device"):
+        if self._arrivals and clock != "device":
             return max(numbered, 0) if mark is not None else self._unread
         # After an interruption numbers may have begun anew: a restarted camera counts from 1.
         return max(numbered, self._unread, round((exposure - self._frame.time) * self._facts.fps) - 1)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot import capture
+from robot import capture, stamp
 from robot.camera import Camera
 from robot.capture import PlayedCapture, UvcCapture, source_kind
 from robot.errors import DeviceNotConnectedError
@@ -248,6 +248,21 @@ def test_pictures_that_are_none_are_passed_over(server: Server) -> None:
     with Camera(facts(server.url), "left", connect_timeout=20.0) as camera:
         assert abs(float(camera.read(20.0).image.mean()) - 100) < 2
         assert camera.status.damaged == 4 and camera.status.reopened == 0
+
+
+def test_a_frame_that_is_sent_again_is_no_new_one(server: Server) -> None:
+    """Some servers greet a new client with the last frame they have: after a stall it is old news."""
+    mark = stamp.Stamp(frame=7, image=0, clock=time.monotonic_ns() // 1000)
+    image = stamp.draw(np.full((48, 64, 3), 100, dtype=np.uint8), mark)
+    data = io.BytesIO()
+    Image.fromarray(image).save(data, "JPEG", quality=95)
+    server.talk = says(STREAM, part(data.getvalue(), length(data.getvalue())) * 3)
+    with Camera(facts(server.url, stamped=True, max_age=60.0), "left", connect_timeout=20.0) as camera:
+        first = camera.read(20.0)
+        deadline = time.monotonic() + 20.0
+        while camera.status.reopened < 2 and time.monotonic() < deadline:
+            time.sleep(0.005)
+        assert camera.status.reopened >= 2 and camera.status.frames == 1 and camera.read(1.0) is first
 
 
 @pytest.mark.parametrize(

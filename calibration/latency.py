@@ -3,8 +3,8 @@
 The arm goes down and up; how deep it is, and how much touch the picture shows, are two signals over arrival times. The
 touch is some growing function of the depth, whatever it is: by the rearrangement inequality (Hardy, Littlewood, Polya
 1934, section 10.13) the correlation of the two is then greatest at the true shift. That function is fitted (isotonic
-regression) and the shift refined, in turn. Correlations are evaluated at the camera's own, irregular times, so that only
-the arm's fast signal is interpolated.
+regression) and the shift refined, in turn. Correlations are evaluated at the camera's own, irregular times: only the
+arm's fast signal is interpolated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.optimize import isotonic_regression, minimize_scalar
 from tacsim.interface import FloatArray
 
 MIN_CORRELATION = 0.7  # below it the two signals are not of one motion
-MAX_RIVAL = 0.95  # a second peak as high as this part of the best one: which of them is it?
+MAX_RIVAL = 0.85  # a second peak as high as this part of the best one: which of them is it?
 MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
 BLOCKS = 8  # of the jackknife
 STEP = 1e-3  # of the coarse search [s]
@@ -52,8 +52,8 @@ def estimate_latency(
 
     `depth` grows towards contact, in any unit (of a sensor that presses down: minus z); rates may be irregular. The
     record begins and ends without contact and has three taps or more, at uneven intervals. `search`: bounds of the
-    latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays that
-    are no signals.
+    latency [s]. Raises NoLatency when the signals do not correlate, or fit several latencies, ValueError for arrays
+    that are no signals.
     """
     arm_times, arm = _signal(depth_times, depth, "depth")
     times, seen = _signal(touch_times, touch, "touch")
@@ -139,8 +139,8 @@ def _check_peak(shifts: FloatArray, curve: FloatArray, best: int) -> None:
     """Raises NoLatency unless the peak is high, inside the range and the only one."""
     if curve[best] < MIN_CORRELATION:
         raise NoLatency(
-            f"the signals do not correlate: {curve[best]:.2f} at best, {MIN_CORRELATION} is needed. Does the sensor see "
-            "this arm's taps, and does `depth` grow towards contact?"
+            f"the signals do not correlate: {curve[best]:.2f} at best, {MIN_CORRELATION} is needed. Does the sensor "
+            "see this arm's taps, and does `depth` grow towards contact?"
         )
     if best in (0, len(curve) - 1):
         raise NoLatency(f"the best latency is at the edge of the search, {shifts[best]:.3f} s; widen the search")

@@ -56,8 +56,8 @@ class ArmHistory:
     """The last states of one arm. One thread may append while others ask."""
 
     def __init__(self, name: str, length: int = 1000, max_gap: float = 50e-3, reach: float = 10e-3) -> None:
-        """Keeps `length` states (1000: two seconds at 500 Hz). Two states further apart than `max_gap` [s] say nothing
-        of the time between them. Beyond the newest a state is carried on with its twist for at most `reach` [s]."""
+        """Keeps `length` states (1000: two seconds at 500 Hz). Two states further apart than `max_gap` [s] say
+        nothing of the time between them. Beyond the newest, a state is carried on with its twist for `reach` [s]."""
         if length < 2 or not max_gap > 0.0 or not reach >= 0.0:
             raise ValueError(
                 f"history of arm '{name}': needs at least 2 states, a gap above 0 s and a reach of 0 s or more, got "
@@ -79,8 +79,8 @@ class ArmHistory:
                 return
             if state.time < last.time:
                 raise ValueError(
-                    f"history of arm '{self._name}': a state at {state.time:.6f} s after one at {last.time:.6f} s; times "
-                    "must grow (after a new connection, start a new history)"
+                    f"history of arm '{self._name}': a state at {state.time:.6f} s after one at {last.time:.6f} s; "
+                    "times must grow (after a new connection, start a new history)"
                 )
             if _joints(state) != _joints(last):
                 raise ValueError(f"history of arm '{self._name}': {_joints(state)} joints after {_joints(last)}")

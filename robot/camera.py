@@ -15,8 +15,9 @@ from types import TracebackType
 from typing import Literal, Self
 
 from robot import stamp as strip
-from robot.capture import Capture, DamagedFrame, Picture, WrongSource, frame_size, open_capture, source_kind
+from robot.capture import Capture, open_capture, source_kind
 from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
+from robot.picture import DamagedFrame, Picture, WrongSource
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import EndOfEpisode, SensorSpec, TactileFrame
 
@@ -54,7 +55,8 @@ class Camera:
     again, with the same `index`: compare it to tell a new one from one that was seen.
 
     `index` grows by one a frame and by one more for each that was lost: by the numbers of the stamps; without them by
-    the device's clock; without that (arrival says too little) only damaged frames and the time of an interruption count.
+    the device's clock; without that (arrival says too little) only damaged frames count. The time of an interruption
+    counts with all of them, at the rate of the facts.
     Safe to use from several threads.
     """
 
@@ -177,9 +179,9 @@ class Camera:
                 if self._over:
                     raise EndOfEpisode(self._error)
                 frame = self._frame
-                if frame is not None and now - frame.time <= self._facts.max_age:
-                    if image is None or (self._stamp is not None and self._stamp.image >= image):
-                        return frame
+                shown = image is None or (self._stamp is not None and self._stamp.image >= image)
+                if frame is not None and shown and now - frame.time <= self._facts.max_age:
+                    return frame
                 if now >= deadline:
                     raise StaleFrame(self._late(now, timeout, image))
                 self._changed.wait(deadline - now)
@@ -243,8 +245,8 @@ class Camera:
             image, mark = strip.split(image)
             if mark is None:
                 raise DamagedFrame(
-                    f"sensor '{self._name}': a frame of {self._facts.source} without a readable stamp; it is damaged, or "
-                    "the source burns none in (stamped: false)"
+                    f"sensor '{self._name}': a frame of {self._facts.source} without a readable stamp; it is damaged, "
+                    "or the source burns none in (stamped: false)"
                 )
         clock: ClockSource
         if mark is not None:
@@ -276,11 +278,13 @@ class Camera:
         """Frames that are missing before this one."""
         if self._frame is None:
             return 0
-        if mark is not None and self._stamp is not None and mark.frame > self._stamp.frame:
-            return mark.frame - self._stamp.frame - 1
-        if mark is None and clock == "arrival" and self._arrivals:
-            return self._unread
-        return max(self._unread, round((exposure - self._frame.time) * self._facts.fps) - 1)
+        numbered = -1
+        if mark is not None and self._stamp is not None:
+            numbered = mark.frame - self._stamp.frame - 1
+        if self._arrivals and clock != "device":
+            return max(numbered, 0) if mark is not None else self._unread
+        # After an interruption numbers may have begun anew: a restarted camera counts from 1.
+        return max(numbered, self._unread, round((exposure - self._frame.time) * self._facts.fps) - 1)
 
     def _count_damaged(self, error: str) -> None:
         with self._changed:
@@ -302,6 +306,3 @@ class Camera:
             self._over, self._error = True, text
             self._changed.notify_all()
         return False
-
-
-__all__ = ["Camera", "CameraStatus", "StaleFrame", "WrongSource", "frame_size"]

@@ -1,13 +1,14 @@
 """A camera without a camera: MJPEG over HTTP from a process of its own, with faults on request.
 
-``python -m robot.mock.camera --help`` starts one by hand; :class:`MockCamera` starts one for a rig or a test. The driver
-in `robot.camera` reads it as it reads a real camera behind mjpg-streamer. Commands come as lines of JSON on standard
-input, answers go to standard output; the process ends with its standard input, so it never outlives its parent.
+``python -m robot.mock.camera --help`` starts one by hand; :class:`MockCamera` starts one for a rig or a test. The
+driver in `robot.camera` reads it as it reads a real camera behind mjpg-streamer. Commands come as lines of JSON on
+standard input, answers go to standard output; the process ends with its standard input, so it outlives no parent.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ipaddress
 import json
 import signal
@@ -67,11 +68,11 @@ class MockCamera:
         DeviceError when the process does not start (the port is taken, say)."""
         self.width, self.height = width, height
         self._lock = threading.Lock()
+        _check_options(host, port, width, height, fps, quality, allow_network)
         options = {"host": host, "port": port, "width": width, "height": height, "fps": fps, "quality": quality}
         command = [sys.executable, "-m", "robot.mock.camera"]
         command += [part for name, value in options.items() for part in (f"--{name}", str(value))]
         command += ["--stamped"] * stamped + ["--allow-network"] * allow_network
-        _check_options(**options, allow_network=allow_network)
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self.pid = self._process.pid
         try:
@@ -138,10 +139,8 @@ class MockCamera:
         with self._lock:
             for pipe in (self._process.stdin, self._process.stdout):
                 if pipe is not None and not pipe.closed:
-                    try:
+                    with contextlib.suppress(OSError):  # the process has gone first
                         pipe.close()
-                    except OSError:
-                        pass  # the process has gone first
             try:
                 self._process.wait(2.0)
             except subprocess.TimeoutExpired:

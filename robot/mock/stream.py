@@ -183,13 +183,12 @@ class Listener:
         self._server: _Server | None = None
         self.port = port
         self.listen()
-        assert self._server is not None
-        self.port = self._server.server_address[1]
 
     def listen(self) -> None:
         """Takes clients from now on. Raises OSError when the port is taken."""
         if self._server is None:
             self._server = _Server((self._host, self.port), self)
+            self.port = self._server.server_address[1]  # given by the system where 0 was asked for; then kept
             threading.Thread(target=self._server.serve_forever, args=(0.02,), name="listener", daemon=True).start()
 
     def refuse(self) -> None:
@@ -247,9 +246,11 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         action = {"/?action=stream": self._stream, "/?action=snapshot": self._snapshot}.get(self.path)
         if action is None:
-            return self.send_error(404, "use /?action=stream or /?action=snapshot")
+            self.send_error(404, "use /?action=stream or /?action=snapshot")
+            return
         if not self.server.listener.enter(self.connection):
-            return self.send_error(503, f"{MAX_CLIENTS} clients are there already")
+            self.send_error(503, f"{MAX_CLIENTS} clients are there already")
+            return
         try:
             action()
         finally:
@@ -269,7 +270,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _snapshot(self) -> None:
         number, jpeg = self.server.listener.source.newest
         if number == 0:
-            return self.send_error(503, "no frame yet")
+            self.send_error(503, "no frame yet")
+            return
         self._head("image/jpeg")
         self.wfile.write(jpeg)
 

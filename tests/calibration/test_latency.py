@@ -77,7 +77,7 @@ def test_signals_that_do_not_correlate_are_refused() -> None:
         estimate_latency(times, depth, seen_at, rng.normal(size=seen_at.shape))
     with pytest.raises(NoLatency, match="do not correlate"):
         estimate_latency(times, -depth, seen_at, touch)
-    with pytest.raises(NoLatency, match="do not correlate|fit alike|edge"):
+    with pytest.raises(NoLatency, match=r"do not correlate|fit alike|edge"):
         estimate_latency(*record(0)[:2], *record(7)[2:])  # taps of another record
 
 
@@ -90,14 +90,14 @@ def test_regular_taps_fit_several_latencies() -> None:
 
 
 def test_a_latency_outside_the_search_is_refused() -> None:
-    with pytest.raises(NoLatency, match="at the edge of the search|do not correlate"):
+    with pytest.raises(NoLatency, match=r"at the edge of the search|do not correlate"):
         estimate_latency(*record(0), search=(-0.05, 0.08))
 
 
 def test_too_short_a_record_is_refused() -> None:
     times, depth, seen_at, touch = record(0)
     few = seen_at < 1.4
-    with pytest.raises(NoLatency, match="only .* pictures lie where"):
+    with pytest.raises(NoLatency, match=r"only .* pictures lie where"):
         estimate_latency(times, depth, seen_at[few], touch[few])
 
 

@@ -81,7 +81,7 @@ def test_refuses_what_it_cannot_know() -> None:
     with pytest.raises(NotAligned, match="no state yet"):
         ArmHistory("left").at(0.0)
     made = history(np.array([1.0, 1.01, 1.2]))
-    with pytest.raises(NotAligned, match="'left'.* before the oldest of 3 states"):
+    with pytest.raises(NotAligned, match=r"'left'.* before the oldest of 3 states"):
         made.at(0.99)
     with pytest.raises(NotAligned, match=r"no state for 190\.0 ms .* limit 50\.0 ms; was the link lost"):
         made.at(1.1)
@@ -104,8 +104,9 @@ def test_what_is_no_next_state_is_refused() -> None:
         made.append(state(0.005))
     with pytest.raises(ValueError, match="0 joints after 6"):
         made.append(state(0.02, joints=False))
+    still = np.zeros(6)
     with pytest.raises(ValueError, match="at time nan"):
-        made.append(state(float("nan")))
+        made.append(ArmState(Pose(), still, still, still, float("nan")))
     for options in ({"length": 1}, {"max_gap": 0.0}, {"reach": -1.0}):
         with pytest.raises(ValueError, match="needs at least 2 states"):
             ArmHistory("left", **options)  # type: ignore[arg-type]

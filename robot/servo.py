@@ -109,11 +109,11 @@ class Servo:
                 if approach > 0.0 and not self.resting:
                     self.fault(ArmStatus.KEEP_OUT, now)
 
-    def hear(self, command: Record | None, count: int) -> None:
+    def hear(self, number: int, command: Record | None) -> None:
         """Takes the newest command, once; what is no pose, or too late to be followed, is not."""
-        if command is None or count == self.taken:
+        if command is None or number == self.taken:
             return
-        self.taken, kind = count, int(command["kind"])
+        self.taken, kind = number, int(command["kind"])
         if kind == Kind.TARGET and not bool(finite_targets(command["pose"])):
             self.rejected += 1
             self._goal = None

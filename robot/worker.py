@@ -173,7 +173,7 @@ class Worker:
             self.servo.watch(self.state, partners)
             if self.servo.status != before:
                 self._publish(self.servo.status)
-            self.servo.hear(self.link.commands.latest(), self.link.commands.count)
+            self.servo.hear(*self.link.commands.newest())
             if ending is None and (orphan or self.servo.close_asked):
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:

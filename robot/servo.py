@@ -109,11 +109,11 @@ class Servo:
                 if approach > 0.0 and not self.resting:
                     self.fault(ArmStatus.KEEP_OUT, now)
 
-    def hear(self, command: Record | None, count: int) -> None:
+    def hear(self, number: int, command: Record | None) -> None:
         """Takes the newest command, once; what is no pose, or too late to be followed, is not."""
-        if command is None or count == self.taken:
+        if command is None or number == self.taken:
             return
-        self.taken, kind = count, int(command["kind"])
+        self.taken, kind = number, int(command["kind"])
         if kind == Kind.TARGET and not bool(finite_targets(command["pose"])):
             self.rejected += 1
             self._goal = None
@@ -138,7 +138,7 @@ class Servo:
         if self.motion is None or (self.status == ArmStatus.HOLD and self._was_moved(self.motion, now)):
             self.motion, self._sent = resting(now.sensor[:3, 3], now.sensor[:3, :3]), now.joints
             goal = self._cut_at_walls(self.motion) or goal
-        gaps = self._gaps(self.motion, partners, 0.0)
+        gaps = self._gaps(self.motion, partners)
 
         def admissible(motion: Motion) -> bool:
             """It still could be stopped inside the walls and clear of the other arms; or at least it leads away."""
@@ -146,9 +146,7 @@ class Servo:
             reach = self.region.excess(stopping_point(motion, self.orders.acceleration))
             if reach > max(1e-9, float(self.region.excess(self.motion.position))):
                 return False
-            return all(
-                new >= 0.0 or new >= old for new, old in zip(self._gaps(motion, partners, SKEW), gaps, strict=True)
-            )
+            return all(new >= 0.0 or new >= old for new, old in zip(self._gaps(motion, partners), gaps, strict=True))
 
         wanted = towards(self.motion, *goal, self.orders, admissible)
         joints = self._joints(wanted, now)
@@ -200,15 +198,15 @@ class Servo:
             return None
         return joints
 
-    def _gaps(self, motion: Motion, partners: Sequence[Record | None], skew: float) -> list[float]:
+    def _gaps(self, motion: Motion, partners: Sequence[Record | None]) -> list[float]:
         """Room [m] between the braking way of `motion` and that of each other arm, beyond what is to be kept. What the
-        other may do within `skew` [s] is taken off: the end of a braking way moves at most twice as fast as the arm."""
+        other may do within SKEW is taken off: the end of a braking way moves at most twice as fast as the arm."""
         end = stopping_point(motion, self.orders.acceleration)
         gaps = []
         for partner, other in zip(self.orders.partners, partners, strict=True):
             assert other is not None  # else the arm waits
             gap = segments_apart(motion.position, end, other["position"], other["stop"])
-            gaps.append(gap - partner.distance - 2.0 * float(other["top_speed"]) * skew)
+            gaps.append(gap - partner.distance - 2.0 * float(other["top_speed"]) * SKEW)
         return gaps
 
     def _cut_at_walls(self, start: Motion) -> tuple[FloatArray, FloatArray] | None:

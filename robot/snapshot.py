@@ -58,11 +58,16 @@ class Ring:
 
     def latest(self) -> Record | None:
         """A copy of the newest record, None before the first."""
+        return self.newest()[1]
+
+    def newest(self) -> tuple[int, Record | None]:
+        """The newest record with its number, which counts from 1; 0 and None before the first. (Asking for `count`
+        besides would be a second look: a record may come in between.)"""
         while count := int(self._count[0]):
             copy = self._slots[(count - 1) % len(self._slots)].copy()
             if int(self._count[0]) - count < len(self._slots) - 1:  # else the writer may be in this slot by now
-                return np.asarray(copy)
-        return None
+                return count, np.asarray(copy)
+        return 0, None
 
     def recent(self, number: int) -> Record:
         """Copies of the newest records (n,), at most `number`, oldest first."""

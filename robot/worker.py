@@ -49,6 +49,7 @@ MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controll
 CLOSING = 0.6  # longest ramp when the driver closes [s]
 PARENTLESS = 0.5  # the same when it is gone [s]
 LIBRARY_PATIENCE = 4.5  # after so long the library gives a call up by itself [s]
+GRACE = 5  # periods in which a package may tell why the controller takes no more commands
 FAILED = 3  # exit status: the reason stands on stdout as JSON
 WINDOW = 500  # periods in the statistics
 
@@ -66,7 +67,9 @@ class Worker:
         self.partners: list[Link | None] = [None] * len(orders.partners)
         self.servo = Servo(orders, taken=self.link.commands.count)
         self._periods = np.full(WINDOW, PERIOD)
-        self._last, self._looks = time.monotonic(), 0
+        self._last = time.monotonic()
+        self._looks = 0  # at one package
+        self._refused = 0  # periods since the controller took no more commands
         self._words = (0, 0)  # runtime_state, safety_status_bits
         self.state = measured(self.record, self.frames)
         self._publish(ArmStatus.CONNECTING)
@@ -163,12 +166,14 @@ class Worker:
             partners = self._look_at_partners(now)
             before = self.servo.status
             stopped = self._controller_stop()
+            if stopped is None and self._refused > GRACE:
+                stopped = ArmStatus.PROGRAM_STOPPED
             if stopped is not None:
                 self.servo.fault(stopped, None)
             self.servo.watch(self.state, partners)
             if self.servo.status != before:
                 self._publish(self.servo.status)
-            self.servo.hear(self.link.commands.latest(), self.link.commands.count)
+            self.servo.hear(*self.link.commands.newest())
             if ending is None and (orphan or self.servo.close_asked):
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:
@@ -184,6 +189,9 @@ class Worker:
             deadline = self._sleep(deadline)
 
     def _act(self, now: float, partners: list[Any]) -> None:
+        if self._refused:  # the next packages tell why
+            self._refused += 1
+            return
         joints = self.servo.step(now, self.state, partners)
         orders, control = self.orders, self.control
         if joints is None:
@@ -191,7 +199,7 @@ class Worker:
         else:
             alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, orders.lookahead, orders.gain)
         if not alive:
-            self.servo.fault(ArmStatus.PROGRAM_STOPPED, None)  # a later package may tell why
+            self._refused = 1
         elif self.servo.zero_asked and self.servo.resting:
             self.servo.zero_asked = False
             self.record["busy_until"] = time.monotonic() + LIBRARY_PATIENCE

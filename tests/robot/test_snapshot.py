@@ -79,8 +79,9 @@ def test_no_torn_read_in_a_hundred_thousand(segment: snapshot.Segment) -> None:
         reads = 0
         while reads < 100_000 or len(seen) < 200:  # both processes had their turns
             reads += 1
-            copy = ring.latest()
+            number, copy = ring.newest()
             assert copy is not None
+            assert number == copy["b"]  # the number is that of this record, not of a later one
             value = int(copy["b"])
             torn += not (copy["a"] == value).all()
             backwards += value < last

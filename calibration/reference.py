@@ -24,12 +24,8 @@ class Reference:
 
     image: Float32  # (H, W, 3) rectified, 0..255
     mean: Float32  # (3,) over the gel
+    relative: Float32  # (H, W, 3) I0 / mean(I0) [-]
     valid: NDArray[np.bool_]  # (H, W)
-
-    @property
-    def relative(self) -> Float32:
-        """(H, W, 3) I0 / mean(I0)"""
-        return self.image / self.mean
 
     def difference(self, image: Float32) -> Float32:
         """(H, W, 3) relative change (I - I0) / mean(I0) of a rectified image [-]; 0 where not valid.
@@ -69,7 +65,8 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
             f"reference is saturated on {saturated:.1%} of the gel, at most {MOST_SATURATED:.0%}: shorten the exposure "
             "or dim the lights"
         )
-    return Reference(image.astype(np.float32), mean.astype(np.float32), valid)
+    mean = mean.astype(np.float32)
+    return Reference(image.astype(np.float32), mean, image / mean, valid)
 
 
 def _levels(colour: Float32) -> str:

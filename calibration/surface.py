@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 INK = 0.6  # a pixel darker than this in all channels, relative to the mean of the gel, shows a printed dot
 DOT_RIM = 1  # pixels round a dot that its blurred edge reaches
-BRIDGE = 3.0  # slopes under a dot are those around it, within this [px]
+BRIDGE = 1.5  # slopes under a dot are those around it, weighted by a Gaussian so wide [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,12 +52,17 @@ class SurfaceFinder:
     def __call__(self, change: Float32, reference: Float32) -> FoundSurface:
         """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3)."""
         change, reference = change[self._box], reference[self._box]
-        gradient, beyond = self._slopes(change)
-        gradient[self._unseen] = 0.0  # what is not seen is taken as flat
-        beyond &= ~self._unseen
+        hidden = self._unseen
         if self._dots:
-            ink = _ink(reference) | _ink(reference + change)
-            gradient, beyond = _bridged(gradient, ink | self._unseen), beyond & ~ink
+            before = _ink(reference) | hidden
+            clear = reference[~before].mean(axis=0)  # the light that is known is that of the gel, not of its dots
+            change, reference = change / clear, reference / clear
+            hidden = before | _ink(reference + change)
+        gradient, beyond = self._slopes(change)
+        if self._dots:
+            gradient = _bridged(gradient, hidden)
+        gradient[self._unseen] = 0.0  # what is not seen is taken as flat
+        beyond &= ~hidden
         height = self._integrate(gradient)
         return FoundSurface(
             height=self._cells(height[..., None])[..., 0],
@@ -100,7 +105,8 @@ def _ink(relative: Float32) -> Mask:
     """(H, W) where an image relative to the mean of the gel shows a printed dot."""
     import cv2
 
-    dark = (relative.max(axis=2) < INK).astype(np.uint8)
+    red, green, blue = relative[..., 0], relative[..., 1], relative[..., 2]
+    dark = (np.maximum(np.maximum(red, green), blue) < INK).astype(np.uint8)
     side = 2 * DOT_RIM + 1
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8)), dtype=np.bool_)
 
@@ -109,8 +115,10 @@ def _bridged(gradient: Float32, hidden: Mask) -> Float32:
     """`gradient` (H, W, 2), with a weighted mean of what surrounds them in the hidden pixels."""
     import cv2
 
-    weight = (~hidden).astype(np.float32)
-    weighted = np.dstack([gradient * weight[..., None], weight])
-    around = np.asarray(cv2.GaussianBlur(weighted, (0, 0), BRIDGE), dtype=np.float32)
-    bridge = around[..., :2] / np.maximum(around[..., 2:], 1e-6)
-    return np.where(hidden[..., None], bridge, gradient)
+    weighted = np.empty((*hidden.shape, 3), dtype=np.float32)
+    weighted[..., 2] = ~hidden
+    np.multiply(gradient, weighted[..., 2:], out=weighted[..., :2])
+    around = np.asarray(cv2.GaussianBlur(weighted, (0, 0), BRIDGE), dtype=np.float32)[hidden]
+    bridged = gradient.copy()
+    bridged[hidden] = around[:, :2] / np.maximum(around[:, 2:], np.float32(1e-6))
+    return bridged

@@ -10,7 +10,7 @@ from calibration.normaliser import FrameNormaliser, for_camera, for_pictures, fo
 from calibration.surface import view
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame, TactileObservation
-from tacsim.optics.geometry import CanonicalGrid, SensorGeometry, SensorModel
+from tacsim.optics.geometry import CanonicalGrid, Markers, SensorGeometry, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.scene import GelSurface
@@ -104,6 +104,16 @@ def test_contact_is_where_it_is_deep_also_in_its_flat_middle() -> None:
     known, seen = both(box(0.3e-3))
     assert seen.contact[32, 32]
     assert (known.contact & seen.contact).sum() / (known.contact | seen.contact).sum() > 0.95
+
+
+@pytest.mark.parametrize("surface", [s for _, s in cases()], ids=[n for n, _ in cases()])
+def test_printed_dots_are_no_dents(surface: GelSurface) -> None:
+    """They move with the gel, and darken the mean of the reference."""
+    known, seen = both(surface, SensorModel(markers=Markers()), sent=jpeg)
+    deepest = [float(o.height[o.valid].max()) for o in (known, seen)]
+    assert deepest[1] == pytest.approx(deepest[0], abs=max(15e-6, 0.03 * deepest[0]))
+    assert np.sqrt(((known.height - seen.height)[known.valid] ** 2).mean()) < 12e-6
+    assert angles(known, seen).mean() < 0.6
 
 
 def test_a_frame_that_knows_its_surface_is_believed() -> None:

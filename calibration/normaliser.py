@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.gradient import from_model
 from calibration.lens import Rectification, from_corners, from_geometry
 from calibration.reference import Reference, make_reference
+from calibration.surface import SurfaceFinder, view, window
+from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
 from tacsim.optics.grid import canonical_image
@@ -23,47 +26,83 @@ class NoReference(RuntimeError):
 class FrameNormaliser:
     """Rectifies a frame, compares it with the reference, and finds where there is contact.
 
-    Height, gradient and flow are those of the source where it knows them (simulation), otherwise None.
+    Height, gradient and flow are those of the source where it knows them (simulation). Otherwise height and gradient
+    are found in the picture, if there is a `find` for that, and None if there is not; flow is None.
     """
 
-    def __init__(self, rectify: Rectification, grid: CanonicalGrid) -> None:
+    def __init__(self, rectify: Rectification, grid: CanonicalGrid, find: SurfaceFinder | None = None) -> None:
+        """`rectify` gives the canonical image, or for a `find` its wider view."""
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
-        if rectify.valid.shape != shape:
+        spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
+        if min(spare) < 0 or any(extra % (2 * grid.image_scale) for extra in spare) or (find is None and any(spare)):
             raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
-        self._rectify, self._grid = rectify, grid
-        self._valid: NDArray[np.bool_] = np.asarray(_cells(rectify.valid, grid).all(axis=(1, 3)), dtype=np.bool_)
+        self._rectify, self._grid, self._find = rectify, grid, find
+        self._on_image: NDArray[np.bool_] = window(rectify.valid, grid)
+        self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
         self._valid.flags.writeable = False
         self._reference: Reference | None = None
+        self._beyond = 0.0
 
     @property
     def reference(self) -> Reference | None:
         """The present reference; None before the first."""
         return self._reference
 
+    @property
+    def finds_height(self) -> bool:
+        """True when height and gradient are found in pictures of sources that don't know their surface."""
+        return self._find is not None
+
+    @property
+    def beyond(self) -> float:
+        """Share of the pixels of the last picture whose colour lies beyond the calibrated slopes; their height and
+        gradient are only the nearest that the calibration knows. 0 where nothing had to be found."""
+        return self._beyond
+
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0. Raises UnusableReference (the old one then stays), or
         ValueError for a frame of another shape."""
-        self._reference = make_reference(self._rectify(frame.image), self._rectify.valid)
+        self._reference = make_reference(self._rectify(frame.image), self._rectify.valid, self._measured())
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
         """The observation of `frame` at time `now` [s]. Raises NoReference; ValueError for a frame of another shape."""
         if self._reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
-        change = self._reference.difference(self._rectify(frame.image))
-        surface = frame.surface
-        if surface is not None:
-            self._check(surface)
-        height = None if surface is None else surface.height
+        seen = self._reference.difference(self._rectify(frame.image))
+        change: NDArray[np.float32] = window(seen, self._grid)
+        height, gradient, flow = self._surface(frame.surface, seen)
         return TactileObservation(
             image=_byte_image(change),
-            gradient=None if surface is None else surface.gradient,
+            gradient=gradient,
             height=height,
             contact=self._contact(change) if height is None else (height > CONTACT_HEIGHT) & self._valid,
             valid=self._valid,
-            flow=None if surface is None else surface.flow,
+            flow=flow,
             time=frame.time,
             age=now - frame.time,
         )
+
+    def _measured(self) -> NDArray[np.bool_]:
+        """Pixels of the view whose mean is mean(I0): those of the canonical image, so that what a policy sees does not
+        depend on whether height is found."""
+        inside = np.zeros_like(self._rectify.valid)
+        window(inside, self._grid)[...] = self._on_image
+        return inside
+
+    def _surface(
+        self, known: SurfaceMap | None, change: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, NDArray[np.float32] | None]:
+        """Height, gradient and flow, from the source or from the picture."""
+        self._beyond = 0.0
+        if known is not None:
+            self._check(known)
+            return known.height, known.gradient, known.flow
+        if self._find is None:
+            return None, None, None
+        assert self._reference is not None
+        found = self._find(change, self._reference.relative)
+        self._beyond = found.beyond
+        return found.height, found.gradient, None
 
     def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference. It misses the
@@ -88,12 +127,31 @@ def for_simulated(model: SensorModel, gel_size: tuple[float, float], grid: Canon
     return FrameNormaliser(from_geometry(model.geometry, gel_size, canonical_image(grid)), grid)
 
 
+def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+    """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
+    gradient are found by the inverse of the model's own light. Raises ValueError for a light without inverse."""
+    rectify = from_geometry(model.geometry, gel_size, view(grid, gel_size))
+    find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None)
+    return FrameNormaliser(rectify, grid, find)
+
+
 def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of recorded frames of `image_shape` (rows, columns), through the four corners of the gel.
 
     Raises calibration.lens.BadCorners.
     """
     return FrameNormaliser(from_corners(facts.corners, facts.size, image_shape, canonical_image(grid)), grid)
+
+
+def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+    """The normaliser of a sensor that a camera sees: by its model, or through the four corners of the gel.
+
+    Raises ValueError for a model without inverse, calibration.lens.BadCorners.
+    """
+    if facts.model is not None:
+        return for_pictures(facts.model, gel_size, grid)
+    shape = (facts.height, facts.width)
+    return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid)
 
 
 def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:

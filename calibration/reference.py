@@ -24,6 +24,7 @@ class Reference:
 
     image: Float32  # (H, W, 3) rectified, 0..255
     mean: Float32  # (3,) over the gel
+    relative: Float32  # (H, W, 3) I0 / mean(I0) [-]
     valid: NDArray[np.bool_]  # (H, W)
 
     def difference(self, image: Float32) -> Float32:
@@ -38,14 +39,16 @@ class Reference:
         return change
 
 
-def make_reference(image: Float32, valid: NDArray[np.bool_]) -> Reference:
+def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[np.bool_] | None = None) -> Reference:
     """Checks a rectified contact-free image (H, W, 3), 0..255, on the gel (`valid`, (H, W)).
+
+    `measured` (H, W): the part of it that is checked, and over which the mean is taken; None: all.
 
     Raises UnusableReference when the gel is not in the image, too dark or saturated, or when shapes differ.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.shape[:2] != valid.shape:
         raise UnusableReference(f"reference is {image.shape}, expected {(*valid.shape, 3)}")
-    gel = image[valid]
+    gel = image[valid if measured is None else measured & valid]
     if len(gel) == 0:
         raise UnusableReference("reference shows no gel: no canonical pixel lies on the gel and in the image")
     if not np.isfinite(gel).all():
@@ -62,7 +65,8 @@ def make_reference(image: Float32, valid: NDArray[np.bool_]) -> Reference:
             f"reference is saturated on {saturated:.1%} of the gel, at most {MOST_SATURATED:.0%}: shorten the exposure "
             "or dim the lights"
         )
-    return Reference(image.astype(np.float32), mean.astype(np.float32), valid)
+    mean = mean.astype(np.float32)
+    return Reference(image.astype(np.float32), mean, image / mean, valid)
 
 
 def _levels(colour: Float32) -> str:

@@ -51,6 +51,16 @@ class PixelGrid:
         shift = (pitch - self.pitch) / 2
         return PixelGrid(self.rows * factor, self.columns * factor, pitch, self.x0 + shift, self.y0 + shift)
 
+    def extended(self, rows: int, columns: int) -> PixelGrid:
+        """The same points, with so many more rows and columns on each side."""
+        return PixelGrid(
+            self.rows + 2 * rows,
+            self.columns + 2 * columns,
+            self.pitch,
+            self.x0 - columns * self.pitch,
+            self.y0 - rows * self.pitch,
+        )
+
 
 def strips(rows: int, height: int = 32) -> list[slice]:
     """`rows` image rows cut into strips: work on one strip stays in the processor's cache, which is twice as fast."""

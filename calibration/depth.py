@@ -1,0 +1,57 @@
+"""Slopes -> height, by Poisson's equation; the untouched rim of the view is zero."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+RIM = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
+
+
+class Integrator:
+    """Integrates slopes on a rectangle of pixels: the surface whose slopes are nearest to those given, in the sense of
+    least squares, with a free border (cosine transform; Frankot and Chellappa 1988, Poisson with natural boundary)."""
+
+    def __init__(self, shape: tuple[int, int], pitch: float) -> None:
+        """`shape`: rows, columns; `pitch`: distance of two pixels [m]."""
+        rows, columns = shape
+        if min(shape) < 2 or not pitch > 0:
+            raise ValueError(f"cannot integrate over {rows} x {columns} pixels of {pitch} m; at least 2 x 2")
+        along_y = 2.0 * np.cos(np.pi * np.arange(rows) / rows) - 2.0
+        along_x = 2.0 * np.cos(np.pi * np.arange(columns) / columns) - 2.0
+        eigenvalue = along_y[:, None] + along_x[None, :]
+        eigenvalue[0, 0] = 1.0
+        inverse = pitch / eigenvalue
+        inverse[0, 0] = 0.0  # slopes know no constant
+        self._inverse = inverse.astype(np.float32)
+        self._rim = _border(shape, max(1, round(RIM / pitch)))
+
+    def __call__(self, gradient: Float32) -> Float32:
+        """(rows, columns) height [m] of slopes (rows, columns, 2) along x, y [-].
+
+        Slopes say nothing of the constant: it is chosen so that the median along the border of the view is zero. The
+        median, not the least: one bulge, or a contact that reaches the border on one side, does not move it.
+        """
+        from scipy.fft import dctn, idctn
+
+        by_x, by_y = gradient[..., 0], gradient[..., 1]
+        across = 0.5 * (by_x[:, 1:] + by_x[:, :-1])  # slopes half-way between two pixels
+        down = 0.5 * (by_y[1:] + by_y[:-1])
+        divergence = np.zeros(self._inverse.shape, dtype=np.float32)
+        divergence[:, :-1] += across
+        divergence[:, 1:] -= across
+        divergence[:-1] += down
+        divergence[1:] -= down
+        spectrum = dctn(divergence, norm="ortho", overwrite_x=True)
+        spectrum *= self._inverse
+        height: Float32 = idctn(spectrum, norm="ortho", overwrite_x=True)
+        height -= np.median(height[self._rim])
+        return height
+
+
+def _border(shape: tuple[int, int], width: int) -> NDArray[np.bool_]:
+    rim = np.ones(shape, dtype=np.bool_)
+    rim[width:-width, width:-width] = False
+    return rim

@@ -1,0 +1,124 @@
+"""Change of colour over a sensor's view -> height and gradient on the canonical grid.
+
+The view is wider than the canonical image: all of the gel that the camera sees. Slopes are integrated over all of it,
+because its border, farther from the contact, is the best zero there is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.depth import Integrator
+from calibration.gradient import GradientModel
+from tacsim.optics.geometry import CanonicalGrid
+from tacsim.optics.grid import PixelGrid, canonical_image
+
+Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+INK = 0.6  # a pixel darker than this in all channels, relative to the mean of the gel, shows a printed dot
+DOT_RIM = 1  # pixels round a dot that its blurred edge reaches
+BRIDGE = 1.5  # slopes under a dot are those around it, weighted by a Gaussian so wide [px]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundSurface:
+    """What a picture tells of the gel surface, on the canonical grid."""
+
+    height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
+    gradient: Float32  # (h, w, 2) [-]
+    beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
+
+
+class SurfaceFinder:
+    """Finds the surface of one sensor. `valid`: (H, W) of :func:`view`, as the rectification gives it."""
+
+    def __init__(self, slopes: GradientModel, valid: Mask, grid: CanonicalGrid, *, dots: bool) -> None:
+        rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
+        if len(rows) < 2 or len(columns) < 2:
+            raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")
+        self._slopes, self._grid, self._dots = slopes, grid, dots
+        self._box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        self._unseen = ~valid[self._box]
+        pitch = grid.pitch / grid.image_scale
+        self._integrate = Integrator(self._unseen.shape, pitch)
+        self._shape = valid.shape
+
+    def __call__(self, change: Float32, reference: Float32) -> FoundSurface:
+        """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3)."""
+        change, reference = change[self._box], reference[self._box]
+        hidden = self._unseen
+        if self._dots:
+            before = _ink(reference) | hidden
+            clear = reference[~before].mean(axis=0)  # the light that is known is that of the gel, not of its dots
+            change, reference = change / clear, reference / clear
+            hidden = before | _ink(reference + change)
+        gradient, beyond = self._slopes(change)
+        if self._dots:
+            gradient = _bridged(gradient, hidden)
+        gradient[self._unseen] = 0.0  # what is not seen is taken as flat
+        beyond &= ~hidden
+        height = self._integrate(gradient)
+        return FoundSurface(
+            height=self._cells(height[..., None])[..., 0],
+            gradient=self._cells(gradient),
+            beyond=float(beyond.mean()),
+        )
+
+    def _cells(self, pixels: Float32) -> Float32:
+        """(h, w, n) means over the cells of the canonical grid, of pixels (., ., n) of the seen box; 0 beyond it."""
+        view = np.zeros((*self._shape, pixels.shape[2]), dtype=np.float32)
+        view[self._box] = pixels
+        scale = self._grid.image_scale
+        cut = window(view, self._grid)
+        parts = cut.reshape(self._grid.rows, scale, self._grid.columns, scale, -1)
+        total = parts[:, 0, :, 0].copy()
+        for row in range(scale):
+            for column in range(1 if row == 0 else 0, scale):
+                total += parts[:, row, :, column]
+        total /= scale * scale
+        return total
+
+
+def view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
+    """The canonical image, extended by whole cells on each side until it covers a gel of `gel_size` (x, y) [m]."""
+    extra_y, extra_x = (
+        max(0, math.ceil((length / grid.pitch - cells) / 2 - 1e-6))
+        for length, cells in ((gel_size[1], grid.rows), (gel_size[0], grid.columns))
+    )
+    return canonical_image(grid).extended(extra_y * grid.image_scale, extra_x * grid.image_scale)
+
+
+def window(view: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
+    """The canonical image in the middle of a view (H, W, ...); it shares the view's memory."""
+    rows, columns = grid.rows * grid.image_scale, grid.columns * grid.image_scale
+    top, left = (view.shape[0] - rows) // 2, (view.shape[1] - columns) // 2
+    return view[top : top + rows, left : left + columns]
+
+
+def _ink(relative: Float32) -> Mask:
+    """(H, W) where an image relative to the mean of the gel shows a printed dot."""
+    import cv2
+
+    red, green, blue = relative[..., 0], relative[..., 1], relative[..., 2]
+    dark = (np.maximum(np.maximum(red, green), blue) < INK).astype(np.uint8)
+    side = 2 * DOT_RIM + 1
+    return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8)), dtype=np.bool_)
+
+
+def _bridged(gradient: Float32, hidden: Mask) -> Float32:
+    """`gradient` (H, W, 2), with a weighted mean of what surrounds them in the hidden pixels."""
+    import cv2
+
+    weighted = np.empty((*hidden.shape, 3), dtype=np.float32)
+    weighted[..., 2] = ~hidden
+    np.multiply(gradient, weighted[..., 2:], out=weighted[..., :2])
+    around = np.asarray(cv2.GaussianBlur(weighted, (0, 0), BRIDGE), dtype=np.float32)[hidden]
+    bridged = gradient.copy()
+    bridged[hidden] = around[:, :2] / np.maximum(around[:, 2:], np.float32(1e-6))
+    return bridged

@@ -29,7 +29,7 @@ class CannotOpen(ValueError):
     """A rig file that is sound in itself describes no rig that can be opened."""
 
 
-# Which drivers can go by which clock. A simulated sensor on hardware shows what the gel at the arm's pose would look like.
+# Which drivers go by which clock. A simulated sensor on hardware shows what the gel at the arm's pose would look like.
 ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
 SENSOR_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"camera", "sim"}}
 

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from robot.align import ArmHistory
@@ -128,7 +129,10 @@ def open_wall(facts: RigFacts, confirm: Confirm | None) -> Rig:
 
 def _sensor(name: str, facts: object, bench: MockBench) -> TactileSource:
     if isinstance(facts, CameraSensorFacts):
-        return Camera(facts, name)
+        camera = Camera(facts, name)
+        # With a model of the light, the normaliser finds the surface in the picture.
+        camera.spec = replace(camera.spec, height=facts.model is not None)
+        return camera
     assert isinstance(facts, SimSensorFacts)
     return TwinSensor(bench, name, facts)
 
@@ -160,7 +164,7 @@ def _feel(
     sensors: Mapping[str, TactileSource],
     normalisers: Mapping[str, Normaliser],
 ) -> Callable[[], float] | None:
-    """How hard the gels touch over what counts as touch: by the picture where `touch_signal` is given, else by force."""
+    """How hard the gels touch over what counts as touch: by the picture if `touch_signal` is given, else by force."""
     signal = facts.start.touch_signal
     if signal is not None:
 
@@ -191,8 +195,10 @@ def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, real:
 
 
 def _normaliser(name: str, facts: object, rig: RigFacts) -> FrameNormaliser:
-    from calibration.normaliser import for_simulated
+    from calibration.normaliser import for_camera, for_simulated
 
     assert isinstance(facts, CameraSensorFacts | SimSensorFacts)
-    assert facts.model is not None and rig.scene is not None
+    if isinstance(facts, CameraSensorFacts):
+        return for_camera(facts, facts.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical)
+    assert rig.scene is not None
     return for_simulated(facts.model, rig.scene.gel.size[:2], rig.canonical)

@@ -16,6 +16,8 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Vector = tuple[Length, Length, Length]
 Corner = tuple[float, float]
 
+SLOWEST_WATCHDOG = 10.0  # of a real arm [Hz]
+
 Model = Literal["ur3e", "ur5e", "ur10e"]
 
 
@@ -104,11 +106,20 @@ class UrArmFacts(Facts):
     start: Placement | None = None  # world_from_sensor, clear of everything; None: where the scene of a mock rig says
     link_timeout: Annotated[Time, Field(ge=0.01, le=1.0)] = 50e-3  # no package for so long: the link is lost [s]
     action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # no action for so long: the arm holds [s]
-    watchdog: Annotated[float, Field(ge=10.0, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
+    watchdog: Annotated[float, Field(ge=1.0, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
     latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]
     mock: MockArmFacts | None = None
+
+    @model_validator(mode="after")
+    def _real_arms_are_watched(self) -> Self:
+        if self.mock is None and self.watchdog < SLOWEST_WATCHDOG:
+            raise ValueError(
+                f"watchdog {self.watchdog:g} Hz: a real arm would go on for {1 / self.watchdog:.2g} s after its driver "
+                f"died; at least {SLOWEST_WATCHDOG:g} Hz (only a mock may be slower)"
+            )
+        return self
 
 
 class MockCameraFacts(Facts):

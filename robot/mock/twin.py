@@ -9,6 +9,7 @@ On the wire: a length, a line of JSON, and the arrays that the line announces.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -143,10 +144,8 @@ class Twin:
         """Ends the process; again does nothing."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
-                try:
+                with contextlib.suppress(BrokenPipeError):
                     pipe.close()
-                except BrokenPipeError:
-                    pass
         try:
             self._process.wait(1.0)
         except subprocess.TimeoutExpired:

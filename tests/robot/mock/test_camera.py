@@ -153,6 +153,7 @@ def test_without_stamp() -> None:
     with MockCamera(host=HOST, width=64, height=48, stamped=False, quality=100) as camera:
         camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
         with Client(camera) as client:
+            client.jpeg()  # perhaps exposed just before the push
             image = np.array(Image.open(io.BytesIO(client.jpeg())))
     assert image.shape == (48, 64, 3) and np.abs(image.astype(int) - 77).max() <= 1
 
@@ -352,8 +353,8 @@ def test_a_killed_process_is_said(camera: MockCamera) -> None:
 
 
 def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("robot.mock.camera.ANSWER_TIMEOUT", 0.5)
     with MockCamera(host=HOST) as camera:
+        monkeypatch.setattr("robot.mock.camera.ANSWER_TIMEOUT", 0.5)  # not before: to start takes longer
         os.kill(camera.pid, signal.SIGSTOP)
         with pytest.raises(DeviceNotConnectedError, match="it has ended"):
             camera.push(np.zeros((240, 320, 3), dtype=np.uint8))

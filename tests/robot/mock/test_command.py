@@ -1,0 +1,43 @@
+"""`tacsim mock` as a person starts it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from robot.mock import Door
+from robot.mock.fixtures import TIMEOUT, loopback_host
+
+START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
+
+
+def test_it_serves_until_ctrl_c() -> None:
+    hosts = [loopback_host(40), loopback_host(41)]
+    options = [word for host in hosts for word in ("--host", host)]
+    process = subprocess.Popen([*START, *options, "--model", "ur3e"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    with process, process.stdout:
+        said = [process.stdout.readline() for _ in range(3)]
+        assert all(host in line for host, line in zip(hosts, said, strict=False))
+        for host in hosts:
+            door = Door(host)
+            assert door.state().mode == "RUNNING"
+            door.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT) == 128 + signal.SIGINT
+
+
+@pytest.mark.parametrize(
+    ("options", "words", "code"),
+    [
+        (["--model", "ur7"], "--model", 2),
+        (["--host", "192.168.0.9"], "not a loopback", 1),
+        (["--arms", "0"], "--arms", 2),
+    ],
+)
+def test_what_it_refuses(options: list[str], words: str, code: int) -> None:
+    done = subprocess.run([*START, *options], capture_output=True, text=True, timeout=TIMEOUT)
+    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr

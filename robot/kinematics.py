@@ -19,8 +19,8 @@ import numpy as np
 
 from tacsim.interface import FloatArray
 
-if TYPE_CHECKING:  # loading it takes half a second, which the process that drives an arm does not have
-    from tacsim.hardware import Model
+if TYPE_CHECKING:
+    from tacsim.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 JOINT_RANGE = 2 * math.pi  # joints turn from -JOINT_RANGE to +JOINT_RANGE (all e-Series user manuals)
 TOLERANCE = 1e-10  # of the inverse [m, rad]

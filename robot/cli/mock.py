@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 
@@ -28,22 +28,21 @@ def mock(
 
     Example: tacsim mock --arms 2
     """
-    from typing import get_args
-
+    from robot.kinematics import MODELS
     from robot.mock import MockArms
     from robot.mock.controller import PORTS
     from robot.mock.door import DOOR_PORT
-    from tacsim.hardware import Model
 
-    if model not in get_args(Model):
-        raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(get_args(Model))}", param_hint="--model")
+    if model not in MODELS:
+        raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(MODELS)}", param_hint="--model")
     hosts = host or [f"127.0.0.{2 + index}" for index in range(arms)]
-    with Interrupt() as interrupt, MockArms(hosts, model=cast(Model, model), allow_network=allow_network) as running:
+    with Interrupt() as interrupt, MockArms(hosts, model=model, allow_network=allow_network) as running:
         ports = ", ".join(map(str, sorted(PORTS)))
         for each in hosts:
             results.print(f"{model} at {each}: ports {ports}; fault door {DOOR_PORT}")
         results.print("Ctrl-C ends them.")
         while not interrupt() and running.running:
             time.sleep(0.1)
-        if not interrupt():
-            raise RuntimeError("the process of the mock controllers has ended by itself; its reason stands above")
+        if interrupt():
+            raise typer.Exit(interrupt.exit_code)
+        raise RuntimeError("the process of the mock controllers has ended by itself; its reason stands above")

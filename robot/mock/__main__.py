@@ -13,15 +13,14 @@ import selectors
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from typing import get_args
+from collections.abc import Callable, Sequence
 
+from robot.kinematics import MODELS
 from robot.mock.arm import HOME, PERIOD
 from robot.mock.controller import SERIAL, Controller, Facts
 from robot.mock.door import DOOR_PORT
 from robot.mock.faults import FaultDoor
 from robot.mock.ur import VERSION, check_hosts
-from tacsim.hardware import Model
 
 CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
 
@@ -39,7 +38,7 @@ def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> N
                 controllers.append(Controller(facts, selector))
                 doors.append(FaultDoor(controllers[-1], selector, door_port))
             if with_parent:
-                selector.register(sys.stdin, selectors.EVENT_READ, lambda: ended.append("input"))
+                _watch_input(selector, lambda: ended.append("input"))
             sys.stdout.write(json.dumps({"ready": [facts.host for facts in all_facts]}) + "\n")
             sys.stdout.flush()
             _loop(selector, controllers, doors, ended, os.getppid() if with_parent else None)
@@ -48,6 +47,13 @@ def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> N
                 door.close()
             for controller in controllers:
                 controller.close()
+
+
+def _watch_input(selector: selectors.BaseSelector, work: Callable[[], None]) -> None:
+    try:
+        selector.register(sys.stdin, selectors.EVENT_READ, work)
+    except OSError as error:
+        raise OSError(error.errno, "--with-parent needs a pipe as standard input, not a file") from None
 
 
 def _loop(
@@ -84,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the process. Says on standard output, as one line of JSON, that it is ready or why not."""
     parser = argparse.ArgumentParser(prog="python -m robot.mock", description=__doc__)
     parser.add_argument("hosts", nargs="+")
-    parser.add_argument("--model", choices=get_args(Model), default="ur5e")
+    parser.add_argument("--model", choices=list(MODELS), default="ur5e")
     parser.add_argument("--joints", default=",".join(map(repr, HOME)))
     parser.add_argument("--version", default=".".join(map(str, VERSION)))
     parser.add_argument("--door-port", type=int, default=DOOR_PORT)

@@ -10,12 +10,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robot.kinematics import JOINT_RANGE, Kinematics, pose
-from tacsim.hardware import Model
 from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from tacsim.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 PERIOD = 0.002  # one control period [s]
 SERVO_RATE = 500.0  # of the joint servos [rad/s]

@@ -6,6 +6,7 @@ import socket
 from collections import deque
 
 RECEIVE = 1 << 16  # bytes read at a time
+SEND_BUFFER = 1 << 16  # of the system: a slow reader gets packages that are old, but not seconds old [bytes]
 BACKLOG = 1 << 20  # replies that a client does not fetch, before it is cut [bytes]
 
 
@@ -25,6 +26,7 @@ class Connection:
         self._half = b""  # what is left of a package that is sent in two parts
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
     def read(self) -> bool:
         """Takes what has arrived; False when the client is gone."""

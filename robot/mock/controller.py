@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from robot.mock.connection import Connection
 from robot.mock.fields import Value, apply
 from robot.mock.machine import Machine, Version
 from robot.mock.rtde import BadPackage, Session, packages
-from tacsim.hardware import Model
+
+if TYPE_CHECKING:
+    from tacsim.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from robot.mock.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
 from robot.mock.load import GRAVITY, Load, cross
 from robot.mock.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, admit
 from robot.mock.script import Program
-from tacsim.hardware import Model
 from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from tacsim.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 REGISTERS = 48  # of each kind and direction
 POWER_UP = 50  # periods from power on to idle

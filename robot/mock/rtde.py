@@ -157,11 +157,15 @@ class Session:
         recipe = self.recipes.get(payload[0]) if payload else None
         if recipe is None:
             self.machine().say(f"RTDE: data for a recipe that was never set up ignored: {payload[:1].hex() or 'none'}")
-        elif len(payload) != 1 + recipe.layout.size:
-            sizes = f"{len(payload) - 1} bytes, recipe {payload[0]} has {recipe.layout.size}"
-            self.machine().say(f"RTDE: data package ignored: {sizes}")
         else:
-            self.write(recipe.unpack(payload[1:]))
+            # What a controller does with a wrong size is not known. Too much is read as far as the recipe goes (ur_rtde
+            # 1.6.5 sends command 44 so), too little is ignored (command 55).
+            given, size = len(payload) - 1, recipe.layout.size
+            if given != size:
+                done = "ignored" if given < size else "cut"
+                self.machine().say(f"RTDE: data package {done}: {given} bytes, recipe {payload[0]} has {size}")
+            if given >= size:
+                self.write(recipe.unpack(payload[1 : 1 + size]))
 
     def _message(self, payload: bytes) -> None:
         self.machine().say(f"RTDE: message of a client: {payload[:200]!r}")

@@ -11,12 +11,14 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from robot.mock.controller import SERIAL
 from robot.mock.door import DOOR_PORT, Door
 from robot.mock.machine import Version
-from tacsim.hardware import Model
+
+if TYPE_CHECKING:
+    from tacsim.hardware import Model  # pydantic and SciPy: half a second of start-up
 
 VERSION: Version = (5, 11, 0, 108150)
 
@@ -57,6 +59,7 @@ class MockArms:
             [sys.executable, "-m", "robot.mock", *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the parent; the mock ends with it
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))},
         )
         self.pid = self._process.pid

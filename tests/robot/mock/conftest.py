@@ -1,0 +1,28 @@
+"""One mock controller for a module; each test finds it as at power-on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from robot.mock import Door, MockUR
+from robot.mock.fixtures import loopback_host
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[MockUR]:
+    with MockUR(loopback_host(2), ready_timeout=60) as mock:
+        yield mock
+
+
+@pytest.fixture
+def mock(running: MockUR) -> Iterator[MockUR]:
+    running.door.reset()
+    yield running
+    assert running.running, "the process of the mock has ended"
+
+
+@pytest.fixture
+def door(mock: MockUR) -> Door:
+    return mock.door

@@ -1,0 +1,163 @@
+"""The process of the mock: it starts, it says why it cannot, and it never outlives who started it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import pytest
+
+from robot.mock import DoorError, MockArms, MockError, MockUR
+from robot.mock.fixtures import TIMEOUT, ControlClient, loopback_host
+
+
+def until(done: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + TIMEOUT
+    while not done():
+        assert time.monotonic() < deadline, f"never: {what}"
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_close_leaves_nothing_and_may_be_repeated() -> None:
+    mock = MockUR(loopback_host(10), ready_timeout=60)
+    assert mock.running and mock.door.state().tick >= 0
+    mock.close()
+    mock.close()
+    assert not alive(mock.pid) and not mock.running
+    with pytest.raises(DoorError):
+        mock.door.state()
+    with MockUR(loopback_host(10), ready_timeout=60):
+        pass  # the ports are free again at once
+
+
+def test_options_arrive() -> None:
+    joints = [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
+    with MockUR(loopback_host(11), model="ur3e", joints=joints, door_port=30555, ready_timeout=60) as mock:
+        assert mock.door.port == 30555
+        assert mock.door.state().joints == pytest.approx(joints)
+
+
+def test_two_arms_in_one_process_do_not_touch() -> None:
+    hosts = [loopback_host(12), loopback_host(13)]
+    with MockArms(hosts, ready_timeout=60) as arms, ControlClient(hosts[0]) as client:
+        client.call(9, [0, 0, 0, 0, 0, 0.5, 2.0, 0])
+        until(lambda: arms.doors[0].state().joint_speeds[5] > 0.4, "the first moves")
+        arms.doors[1].protective_stop()
+        assert arms.doors[0].state().safety == "NORMAL" and arms.doors[0].state().program
+        assert arms.doors[1].state().rests and arms.doors[1].state().safety == "PROTECTIVE_STOP"
+
+
+def test_a_port_in_use_is_named() -> None:
+    host = loopback_host(14)
+    with MockUR(host, ready_timeout=60) as first:
+        with pytest.raises(MockError, match=rf"cannot listen on {host}:\d+: .*in use"):
+            MockUR(host, ready_timeout=60)
+        assert first.door.state().safety == "NORMAL"
+
+
+@pytest.mark.parametrize(
+    ("hosts", "words"),
+    [
+        (["10.0.0.1"], "not a loopback address"),
+        (["0.0.0.0"], "not a loopback address"),
+        (["localhost"], "is no address"),
+        ([], "at least one"),
+        (["127.0.0.9", "127.0.0.9"], "different hosts"),
+    ],
+)
+def test_addresses_that_are_refused(hosts: list[str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        MockArms(hosts)
+
+
+def test_joints_that_are_refused() -> None:
+    with pytest.raises(MockError, match=r"within \+-2 pi"):
+        MockUR(loopback_host(15), joints=[7, 0, 0, 0, 0, 0], ready_timeout=60)
+    with pytest.raises(MockError, match="6 finite"):
+        MockUR(loopback_host(15), joints=[0, 0], ready_timeout=60)
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_it_dies_with_its_parent(end: signal.Signals) -> None:
+    code = (
+        "import sys, time; from robot.mock import MockUR\n"
+        f"mock = MockUR({loopback_host(16)!r}, ready_timeout=60); print(mock.pid, flush=True); time.sleep(600)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    with parent, parent.stdout:
+        pid = int(parent.stdout.readline())
+        assert alive(pid)
+        parent.send_signal(end)
+        parent.wait(TIMEOUT)
+        until(lambda: not alive(pid), "the mock is gone")
+
+
+def test_a_stopped_process_is_ended_too() -> None:
+    with MockUR(loopback_host(17), ready_timeout=60) as mock:
+        mock.door.timeout = 0.2
+        os.kill(mock.pid, signal.SIGSTOP)
+        with pytest.raises(DoorError, match="no answer in time"):
+            mock.door.state()
+    assert not alive(mock.pid)
+
+
+def test_it_goes_on_after_a_pause_of_its_process() -> None:
+    with MockUR(loopback_host(18), ready_timeout=60) as mock:
+        before = mock.door.state()
+        os.kill(mock.pid, signal.SIGSTOP)
+        time.sleep(0.3)
+        os.kill(mock.pid, signal.SIGCONT)
+        after = mock.door.state()
+        assert after.overruns > before.overruns + 50
+        until(lambda: mock.door.state().tick > after.tick + 100, "it ticks")
+
+
+def test_without_a_parent_it_runs_until_it_is_told() -> None:
+    command = [sys.executable, "-m", "robot.mock", loopback_host(19)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
+    assert process.stdout is not None
+    with process, process.stdout:
+        assert json.loads(process.stdout.readline()) == {"ready": [loopback_host(19)]}
+        process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT) == 0
+
+
+def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
+    """Without the watchdog the arm goes on for ever, as a real one does; with it, the program ends."""
+    with MockUR(loopback_host(20), ready_timeout=60) as mock:
+        for watchdog in (False, True):
+            code = (
+                "import sys, time; from robot.mock.fixtures import ControlClient\n"
+                f"client = ControlClient({mock.host!r})\n"
+                f"if {watchdog}: client.call(35, [10.0])\n"
+                "client.write(10, [0, 0, -0.01, 0, 0, 0, 0.5, 0]); print('moves', flush=True); \n"
+                "while True: client.write(10, [0, 0, -0.01, 0, 0, 0, 0.5, 0]); time.sleep(0.01)"
+            )
+            client = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+            assert client.stdout is not None
+            with client, client.stdout:
+                assert client.stdout.readline() == "moves\n"
+                until(lambda: mock.door.state().tcp_speed[2] < -0.0099, "it moves")
+                client.kill()
+            if watchdog:
+                until(lambda: mock.door.state().rests, "it rests")
+                assert "watchdog" in mock.door.state().stop_reason
+            else:
+                end = mock.door.state().tick + 500
+                until(lambda end=end: mock.door.state().tick > end, "a second has passed")
+                assert mock.door.state().tcp_speed[2] < -0.0099
+                mock.door.reset()

@@ -102,8 +102,8 @@ class Bench:
         return np.array([frame[:3, 3] for frame in frames])
 
 
-def shifted(start: Pose, *shift: float) -> Pose:
-    return Pose(start.position + np.array(shift), start.quaternion)
+def shifted(start: Pose, x: float, y: float = 0.0, z: float = 0.0) -> Pose:
+    return Pose(start.position + [x, y, z], start.quaternion)
 
 
 def test_nothing_is_sent_before_the_first_command() -> None:

@@ -403,12 +403,12 @@ def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR) -> N
 
 
 def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR) -> None:
-    with URArm(facts(link_timeout=0.05), "left") as arm:
+    with URArm(facts(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.1))
         mock.door.silence(True)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
-        with pytest.raises(StaleObservationError, match="more than link_timeout = 50 ms"):
+        with pytest.raises(StaleObservationError, match="more than link_timeout = 500 ms"):
             arm.state()
         with pytest.raises(LinkLost, match="sends no packages"):
             arm.command(start)
@@ -424,7 +424,7 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR) ->
 
 @pytest.mark.parametrize("reset", [False, True])
 def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, reset: bool) -> None:
-    with URArm(facts(link_timeout=0.05), "left") as arm:
+    with URArm(facts(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.1))
         mock.door.cut([30004], reset=reset)
@@ -437,7 +437,7 @@ def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, reset: bool) ->
 
 
 def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
-    with URArm(facts(link_timeout=0.05), "left") as arm:
+    with URArm(facts(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         os.kill(mock.pid, signal.SIGSTOP)
         try:
@@ -454,7 +454,7 @@ def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
 
 
 def test_numbers_that_are_none_are_no_package(mock: MockUR) -> None:
-    with URArm(facts(link_timeout=0.05), "left") as arm:
+    with URArm(facts(link_timeout=0.5), "left") as arm:
         in_motion(arm, moved(arm.state().pose, x=0.1))
         mock.door.nan_state(True)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
@@ -579,7 +579,7 @@ def test_a_killed_worker_is_told_and_replaced(mock: MockUR) -> None:
 
 
 def test_a_stopped_worker_is_a_lost_link_and_can_be_replaced(mock: MockUR) -> None:
-    with URArm(facts(watchdog=10.0, link_timeout=0.05), "left") as arm:
+    with URArm(facts(watchdog=10.0, link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         assert arm._process is not None
         os.kill(arm._process.pid, signal.SIGSTOP)
@@ -834,7 +834,7 @@ def test_both_arms_stop_when_one_does(pair: tuple[URArm, URArm, MockUR]) -> None
     in_motion(left, moved(a, x=-0.1))
     other.door.protective_stop()
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "the other arm's stop")
-    assert right.status() == ArmStatus.PROTECTIVE_STOP
+    until(lambda: right.status() == ArmStatus.PROTECTIVE_STOP, "protective stop")
     with pytest.raises(SafetyViolation, match="stopped because the other arm did"):
         left.command(a)
     # Within two periods of the stop's publication: the loops count them.

@@ -1,0 +1,101 @@
+"""The worker process by itself: what it loads, and how it ends when nobody wants it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from robot import snapshot, worker
+from robot.link import ArmStatus, Link, Orders
+from robot.ur import _orders
+from tacsim.hardware import ArmLimits, MockArmFacts, Placement, UrArmFacts, Workspace
+
+ROOT = Path(worker.__file__).parents[1]
+NOBODY = f"127.223.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+
+
+def orders(segment: str, **changes: object) -> Orders:
+    box = Workspace(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
+    facts = UrArmFacts(
+        driver="ur",
+        host=NOBODY,
+        world_from_base=Placement(),
+        limits=ArmLimits(workspace=box),
+        mock=MockArmFacts(),
+    )
+    return dataclasses.replace(_orders(facts, "left", segment, {}), **changes)  # type: ignore[arg-type]
+
+
+def start(text: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "robot.worker"],
+        input=text,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def test_it_starts_light() -> None:
+    """A new worker has half a second; SciPy or pydantic alone take that long."""
+    heavy = {"scipy", "pydantic", "taichi", "cv2", "rtde_control", "rtde_receive"}
+    code = f"import sys, robot.worker; print(*sorted({{name.partition('.')[0] for name in sys.modules}} & {heavy!r}))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.split() == []
+
+
+def test_every_variable_is_in_the_librarys_own_table() -> None:
+    """A name that the library does not know shifts all fields after it, without a word."""
+    receive = pytest.importorskip("rtde_receive", reason="ur_rtde has no wheel for this Python")
+    library = Path(receive.__file__).read_bytes()
+    # The compiled library carries its table's names as text.
+    assert [name for name in worker.VARIABLES if name.encode() not in library] == []
+
+
+def test_nobody_else_imports_the_library() -> None:
+    names = {"rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
+    found = set()
+    for path in (path for package in ("tacsim", "calibration", "robot") for path in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            imported = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                imported = [node.module]
+            if names & {module.partition(".")[0] for module in imported}:
+                found.add(path.relative_to(ROOT).as_posix())
+    assert found == {"robot/worker.py"}
+
+
+def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
+    segment = snapshot.create(snapshot.segment_name(os.getpid(), "failing"), Link.SIZE)
+    try:
+        done = start(orders(segment.name).to_json())
+        assert done.returncode == worker.FAILED
+        told = json.loads(done.stdout)
+        assert told["error"] == "DeviceNotConnectedError"
+        assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["text"]
+        latest = Link(segment).states.latest()
+        assert latest is not None and latest["status"] == ArmStatus.CONNECTING
+    finally:
+        segment.close()
+
+
+def test_without_memory_to_write_to_it_says_so() -> None:
+    done = start(orders("tacsim-0-missing").to_json())
+    assert done.returncode == worker.FAILED
+    assert "No such file" in json.loads(done.stdout)["text"]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rtde_control") is not None, reason="ur_rtde is installed here")
+def test_without_the_library_it_says_which_python_has_it() -> None:
+    assert "has no wheel for this Python" in Path(worker.__file__).read_text(encoding="utf-8")

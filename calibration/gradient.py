@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.optics.geometry import Lighting, SensorModel
-from tacsim.optics.render import shade, unlit_image
+from tacsim.optics.render import shade, untouched_image
 
 Float32 = NDArray[np.float32]
 
@@ -72,9 +72,8 @@ class ColourTable:
 def from_model(model: SensorModel) -> ColourTable:
     """The inverse of a simulated sensor's light, for its mean untouched colour. Raises what :func:`from_lighting`
     raises, and ValueError for a background picture that cannot be read."""
-    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), model.lighting)
-    untouched = unlit_image(model.lighting, (model.geometry.height, model.geometry.width)) + flat
-    red, green, blue = np.clip(untouched, 0.0, 1.0).mean(axis=(0, 1), dtype=np.float64)
+    untouched = untouched_image(model.lighting, (model.geometry.height, model.geometry.width))
+    red, green, blue = untouched.mean(axis=(0, 1), dtype=np.float64)
     return from_lighting(model.lighting, (float(red), float(green), float(blue)))
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from tacsim.optics.photometric import PhotometricModel
 from tacsim.quantity import Facts, Length
 
 Channel = Annotated[float, Field(ge=0, le=4)]
@@ -97,10 +98,18 @@ class SensorModel(Facts):
     name: str = "ideal"
     geometry: SensorGeometry = SensorGeometry()
     lighting: Lighting = Lighting()
+    # Calibrated on a real sensor: takes the place of the lights; the background stays that of `lighting`.
+    photometric: PhotometricModel | None = None
     markers: Markers | None = None
     texture: Annotated[Length, Field(ge=0)] = 2e-6  # standard deviation of the gel's surface texture [m]
     texture_seed: Annotated[int, Field(ge=0)] = 0
     source: str = ""
+
+    @model_validator(mode="after")
+    def _calibrated_change_has_a_base(self) -> Self:
+        if self.photometric is not None and self.lighting.background is None:
+            raise ValueError("photometric tells changes of colour, so it needs lighting.background: the untouched gel")
+        return self
 
 
 class CanonicalGrid(Facts):

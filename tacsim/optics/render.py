@@ -1,4 +1,5 @@
-"""Gel surface -> RGB image by Phong shading, the method of Gomes et al. (RA-L 2021) that the seed paper uses.
+"""Gel surface -> RGB image: by Phong shading, the method of Gomes et al. (RA-L 2021) that the seed paper uses, or by a
+calibrated polynomial (tacsim.optics.photometric) where the sensor has one.
 
 Camera and lights stand behind the gel, on its -z side. There a surface pressed in by `height` has the unit normal
 
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from tacsim.optics.geometry import Light, Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.markers import check_fits, marker_transmission
+from tacsim.optics.photometric import PhotometricLight
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import sample_surface
 from tacsim.scene import GelSurface
@@ -46,7 +48,19 @@ class Renderer:
         if model.markers is not None:
             check_fits(model.markers, gel_size)
         self._texture = texture_gradient(self._grid, gel_size, model.texture, model.texture_seed)
-        self._unlit = unlit_image(model.lighting, self._grid.shape)
+        self._beyond = 0
+        self._light: PhotometricLight | None = None
+        if model.photometric is None:
+            self._unlit = unlit_image(model.lighting, self._grid.shape)
+        else:
+            self._unlit = untouched_image(model.lighting, self._grid.shape)
+            self._mean = self._unlit.mean(axis=(0, 1))
+            self._light = PhotometricLight(model.photometric, self._grid.shape)
+
+    @property
+    def beyond(self) -> float:
+        """Share of the pixels of the last image whose slope was clipped to the calibrated range; 0 for Phong lights."""
+        return self._beyond / (self._grid.rows * self._grid.columns)
 
     def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
@@ -55,14 +69,33 @@ class Renderer:
         gradient = sample_surface(surface, self._grid).gradient
         dots = None if self._markers is None else marker_transmission(surface, self._markers, self.model.geometry)
         image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
+        change = None if self._light is None else self._change(self._light, gradient)
         for strip in strips(self._grid.rows):
-            light = shade(gradient[strip] + self._texture[strip], self.model.lighting)
+            if change is None:
+                light = shade(gradient[strip] + self._texture[strip], self.model.lighting)
+            else:
+                light = change[strip] * self._mean
             light += self._unlit[strip]
             if dots is not None:
                 light *= dots[strip, :, None]
             np.maximum(light, 0.0, out=light)
             image[strip] = cv2.convertScaleAbs(light, alpha=255.0)  # rounds, and saturates at white
         return image
+
+    def _change(self, light: PhotometricLight, gradient: Float32) -> Float32:
+        """(H, W, 3) relative change of colour by the calibrated model, as its camera blurs it."""
+        import cv2
+
+        assert self.model.photometric is not None
+        change = np.empty((*self._grid.shape, 3), dtype=np.float32)
+        self._beyond = 0
+        for strip in strips(self._grid.rows, 16):
+            change[strip], clipped = light.change(gradient[strip] + self._texture[strip], strip)
+            self._beyond += clipped
+        if self.model.photometric.blur > 0:
+            blur = self.model.photometric.blur
+            change = np.asarray(cv2.GaussianBlur(change, (0, 0), blur), dtype=np.float32)
+        return change
 
 
 def shade(gradient: Float32, lighting: Lighting) -> Float32:
@@ -95,6 +128,12 @@ def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
         background = np.broadcast_to(np.array(lighting.background, dtype=np.float32), (*shape, 3))
     flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     return background - flat
+
+
+def untouched_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
+    """(H, W, 3) what the picture shows of the flat gel."""
+    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+    return np.clip(unlit_image(lighting, shape) + flat, 0.0, 1.0)
 
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:

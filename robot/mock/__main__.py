@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, cast
 
 from robot.kinematics import MODELS
 from robot.mock.arm import HOME, PERIOD
@@ -21,6 +22,9 @@ from robot.mock.controller import SERIAL, Controller, Facts
 from robot.mock.door import DOOR_PORT
 from robot.mock.faults import FaultDoor
 from robot.mock.ur import VERSION, check_hosts
+
+if TYPE_CHECKING:
+    from tacsim.hardware import Model
 
 CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
 
@@ -86,12 +90,19 @@ def _loop(
             return
 
 
+def _for_each(given: list[str], hosts: Sequence[str], what: str) -> list[str]:
+    if len(given) not in (1, len(hosts)):
+        raise ValueError(f"{len(given)} {what} for {len(hosts)} hosts; give one for all, or one each")
+    return given if len(given) == len(hosts) else given * len(hosts)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the process. Says on standard output, as one line of JSON, that it is ready or why not."""
     parser = argparse.ArgumentParser(prog="python -m robot.mock", description=__doc__)
     parser.add_argument("hosts", nargs="+")
-    parser.add_argument("--model", choices=list(MODELS), default="ur5e")
-    parser.add_argument("--joints", default=",".join(map(repr, HOME)))
+    each = "once for all, or once for each host in their order"
+    parser.add_argument("--model", choices=list(MODELS), action="append", help=each)
+    parser.add_argument("--joints", action="append", help=f"six angles [rad], with commas; {each}")
     parser.add_argument("--version", default=".".join(map(str, VERSION)))
     parser.add_argument("--door-port", type=int, default=DOOR_PORT)
     parser.add_argument("--serial", default=SERIAL)
@@ -101,8 +112,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         check_hosts(given.hosts, given.allow_network)
         major, minor, bugfix, build = map(int, given.version.split("."))
-        joints = tuple(float(angle) for angle in given.joints.split(","))
-        facts = [Facts(host, given.model, joints, (major, minor, bugfix, build), given.serial) for host in given.hosts]
+        models = _for_each(given.model or ["ur5e"], given.hosts, "models")
+        postures = [
+            tuple(float(angle) for angle in text.split(","))
+            for text in _for_each(given.joints or [",".join(map(repr, HOME))], given.hosts, "postures")
+        ]
+        facts = [
+            Facts(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial)
+            for host, model, joints in zip(given.hosts, models, postures, strict=True)
+        ]
         serve(facts, given.door_port, with_parent=given.with_parent)
     except (OSError, ValueError) as error:
         message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Self
 from urllib.parse import urlsplit
@@ -19,8 +19,9 @@ from robot.errors import DeviceError
 from robot.frames import ArmFrames, pose_of
 from robot.kinematics import Kinematics, matrix
 from robot.mock.camera import MockCamera
+from robot.mock.door import Door
 from robot.mock.twin import Scenery, Twin
-from robot.mock.ur import MockUR
+from robot.mock.ur import MockArms
 from tacsim import pose as se3
 from tacsim.hardware import CameraSensorFacts, UrArmFacts
 from tacsim.interface import FloatArray, Pose, Truth
@@ -35,7 +36,7 @@ class MockBench:
     """Starts the mocks that a rig file asks for. A context manager; `close` ends every process.
 
     Attributes:
-        arms: the controllers, by arm.
+        doors: of the controllers, by arm.
         cameras: by sensor.
         start: world_from_sensor of each mock arm where an episode begins.
     """
@@ -43,7 +44,8 @@ class MockBench:
     def __init__(self, facts: RigFacts) -> None:
         """Raises DeviceError (MockError, TwinError) when a mock cannot be started."""
         self._facts = facts
-        self.arms: dict[str, MockUR] = {}
+        self.doors: dict[str, Door] = {}
+        self._controllers: MockArms | None = None
         self.cameras: dict[str, MockCamera] = {}
         self.start: dict[str, Pose] = {}
         self._twin: Twin | None = None
@@ -64,10 +66,14 @@ class MockBench:
             for name, sensor in facts.sensors.items():
                 if isinstance(sensor, CameraSensorFacts) and sensor.mock is not None:
                     self.cameras[name] = _camera(name, sensor)
-            for name, arm in self._mocked.items():
-                self.start[name] = self._start_of(name, arm)
-                joints = arm.mock.joints if arm.mock is not None and arm.mock.joints is not None else None
-                self.arms[name] = MockUR(arm.host, model=arm.model, joints=joints or self._joints(name, arm))
+            self.start = {name: self._start_of(name, arm) for name, arm in self._mocked.items()}
+            if self._mocked:
+                self._controllers = MockArms(
+                    [arm.host for arm in self._mocked.values()],
+                    model=[arm.model for arm in self._mocked.values()],
+                    joints=[self._joints(name, arm) for name, arm in self._mocked.items()],
+                )
+                self.doors = dict(zip(self._mocked, self._controllers.doors, strict=True))
             stack.pop_all()
 
     def _models(self) -> dict[str, SensorModel]:
@@ -96,8 +102,11 @@ class MockBench:
             )
         return self._twin.initial[sensor]
 
-    def _joints(self, name: str, arm: UrArmFacts) -> list[float]:
-        """Joints that bring the sensor to its start: of all postures the one farthest from a singularity."""
+    def _joints(self, name: str, arm: UrArmFacts) -> Sequence[float]:
+        """Joints at power-on: those of the rig file, else such that the sensor is at its start: of all postures the one
+        farthest from a singularity."""
+        if arm.mock is not None and arm.mock.joints is not None:
+            return arm.mock.joints
         kinematics = Kinematics(arm.model)
         flange = self._frames[name].flange(se3.to_matrix(self.start[name]))
         postures = kinematics.solutions(flange, np.array(POSTURE))
@@ -124,10 +133,10 @@ class MockBench:
     def poses(self) -> dict[str, Pose]:
         """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
         found = {}
-        for name, arm in self.arms.items():
+        for name, door in self.doors.items():
             sensor = self._carried(name)
             if sensor is not None:
-                tool = matrix(np.array(arm.door.state().pose))
+                tool = matrix(np.array(door.state().pose))
                 frames = self._frames[name]
                 found[sensor] = pose_of(frames.world_from_base @ tool @ frames.tool_from_sensor)
         return found
@@ -150,10 +159,10 @@ class MockBench:
 
     def _show(self, scenery: Scenery, pause: float = 0.0) -> Mapping[str, int]:
         self._scenery = scenery
-        for name, arm in self.arms.items():
+        for name, door in self.doors.items():
             sensor = self._carried(name)
             if sensor is not None and sensor in scenery.wrenches:
-                arm.door.wrench(self._at_tool(name, scenery.wrenches[sensor]).tolist())
+                door.wrench(self._at_tool(name, scenery.wrenches[sensor]).tolist())
         time.sleep(pause)
         return {name: camera.push(scenery.images[name]) for name, camera in self.cameras.items()}
 
@@ -162,7 +171,7 @@ class MockBench:
         frames = self._frames[name]
         tool = se3.from_matrix(frames.tool_from_sensor)
         at_tool = se3.transform_wrench(tool, wrench)
-        turn = matrix(np.array(self.arms[name].door.state().pose))[:3, :3]
+        turn = matrix(np.array(self.doors[name].state().pose))[:3, :3]
         return np.concatenate([turn @ at_tool[:3], turn @ at_tool[3:]])
 
     def truth(self) -> Truth | None:
@@ -201,10 +210,10 @@ class MockBench:
         if self._free is not None:
             self._free.join(5.0)
         with ExitStack() as stack:  # each is closed even when another fails
-            for close in (arm.close for arm in self.arms.values()):
-                stack.callback(close)
-            for close in (camera.close for camera in self.cameras.values()):
-                stack.callback(close)
+            for camera in self.cameras.values():
+                stack.callback(camera.close)
+            if self._controllers is not None:
+                stack.callback(self._controllers.close)
             if self._twin is not None:
                 stack.callback(self._twin.close)
 

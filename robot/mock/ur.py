@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
 from robot.mock.controller import SERIAL
 from robot.mock.door import DOOR_PORT, Door
 from robot.mock.machine import Version
@@ -30,16 +32,16 @@ class MockError(RuntimeError):
 class MockArms:
     """Mock controllers in one process of their own, one for each host; a context manager.
 
-    All are of one model and begin at `joints` (6,) [rad]. Raises MockError when they are not ready in time, for
-    example because a port is in use, ValueError for hosts that are not loopback addresses.
+    model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6). Raises MockError when they are
+    not ready in time, for example because a port is in use, ValueError for hosts that are not loopback addresses.
     """
 
     def __init__(
         self,
         hosts: Sequence[str],
         *,
-        model: Model = "ur5e",
-        joints: Sequence[float] | None = None,
+        model: Model | Sequence[Model] = "ur5e",
+        joints: Sequence[float] | Sequence[Sequence[float]] | None = None,
         version: Version = VERSION,
         door_port: int = DOOR_PORT,
         serial: str = SERIAL,
@@ -47,10 +49,11 @@ class MockArms:
         allow_network: bool = False,
     ) -> None:
         self.hosts = tuple(hosts)
-        arguments = [*self.hosts, "--model", model, "--door-port", str(door_port), "--serial", serial]
+        arguments = [*self.hosts, "--door-port", str(door_port), "--serial", serial]
+        arguments += [f"--model={each}" for each in ([model] if isinstance(model, str) else model)]
         arguments += ["--version", ".".join(map(str, version)), "--with-parent"]
-        if joints is not None:
-            arguments.append("--joints=" + ",".join(repr(float(angle)) for angle in joints))
+        for posture in () if joints is None else np.atleast_2d(np.array(joints, dtype=np.float64)):
+            arguments.append("--joints=" + ",".join(repr(float(angle)) for angle in posture))
         if allow_network:
             arguments.append("--allow-network")
         check_hosts(self.hosts, allow_network)

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from robot.mock import Door
-from robot.mock.fixtures import TIMEOUT, loopback_host
+from robot.mock.client import TIMEOUT, loopback_host
 
 START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 

@@ -10,8 +10,8 @@ import pytest
 
 from robot.kinematics import matrix, motion, pose
 from robot.mock.arm import PERIOD, Arm
+from robot.mock.client import control_script
 from robot.mock.commands import REALTIME
-from robot.mock.fixtures import control_script
 from robot.mock.load import GRAVITY, Wall
 from robot.mock.machine import Machine, Mode, Runtime, Safety
 from tacsim.interface import FloatArray

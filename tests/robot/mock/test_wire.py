@@ -16,9 +16,9 @@ import pytest
 from robot.kinematics import Kinematics, matrix
 from robot.mock import MOCK_SERIAL, Door, MockUR
 from robot.mock.arm import HOME
+from robot.mock.client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 from robot.mock.controller import MAX_CLIENTS, PORTS
 from robot.mock.fields import INPUTS, OUTPUTS
-from robot.mock.fixtures import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 from robot.mock.rtde import BadPackage, package, packages
 
 

@@ -40,12 +40,14 @@ def open_rig(
     task: str | None = None,
     overrides: Sequence[str] = (),
     confirm: Callable[[str], bool] | None = None,
+    dry_run: bool = False,
 ) -> Rig:
     """Opens a rig by its name ("sim", "mock", "ur5e", "replay"), by the path of its file, or from facts already loaded.
 
     Use it as a context manager: ``with open_rig("sim") as rig: observation = rig.reset()``. `task` and `overrides` are
     as for tacsim.config.load_rig; facts that are loaded have theirs already. Opening moves nothing. `confirm` asks a
-    person a question, and has the answer: a rig with real arms approaches nothing without a yes.
+    person a question, and has the answer: a rig with real arms approaches nothing without a yes. `dry_run`: a rig of
+    hardware does everything but move.
 
     Raises:
         ConfigError: the file is wrong.
@@ -60,10 +62,12 @@ def open_rig(
     else:
         facts = load_rig(rig, task=task, overrides=overrides).facts
     _check_parts(facts)
+    if dry_run and facts.clock != "wall":
+        raise CannotOpen(f"rig '{facts.name}': a dry run is for hardware; this rig moves no real or mock arm")
     if facts.clock == "wall":
         from robot.wall import open_wall
 
-        return open_wall(facts, confirm)
+        return open_wall(facts, confirm, dry_run=dry_run)
     return _open_sim(facts) if facts.clock == "sim" else _open_replay(facts)
 
 

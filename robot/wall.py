@@ -32,10 +32,13 @@ QUESTION = "Is the body in its place between the sensors, and everybody out of r
 
 
 class RigArm:
-    """One UR arm as the rig has it: it remembers where it was asked to go, for the clock to wait for."""
+    """One UR arm as the rig has it: it remembers where it was asked to go, for the clock to wait for.
 
-    def __init__(self, driven: Driven) -> None:
-        self._driven = driven
+    still: no motion is ever sent (a dry run).
+    """
+
+    def __init__(self, driven: Driven, *, still: bool = False) -> None:
+        self._driven, self._still = driven, still
         self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
 
     def state(self, at: float | None = None) -> ArmState:
@@ -52,6 +55,9 @@ class RigArm:
         return aligned.state
 
     def command(self, target: Pose | None) -> Pose | None:
+        """With `still` nothing is sent, and None says so."""
+        if self._still:
+            return None
         self._driven.target = self._driven.arm.command(target)
         return self._driven.target
 
@@ -67,10 +73,11 @@ class RigArm:
         self._driven.arm.close()
 
 
-def open_wall(facts: RigFacts, confirm: Confirm | None) -> Rig:
+def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False) -> Rig:
     """Opens a rig of hardware. Starts the mocks that its file asks for. Connects; moves nothing.
 
     confirm: asks a person a question before anything approaches the body; not needed where all arms are mocks.
+    dry_run: connects, sees, feels, times and records, but no motion is sent, neither by reset nor by step.
 
     Raises DeviceError for what cannot be opened, ValueError for a rig that makes no sense.
     """
@@ -96,17 +103,17 @@ def open_wall(facts: RigFacts, confirm: Confirm | None) -> Rig:
         normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
         task = facts.task
         start = GuidedStart(
-            arms=arms,
+            arms={} if dry_run else arms,
             sensors=sensors,
             start=_starts(facts, bench),
             clock=clock,
             facts=facts.start,
-            feel=_feel(facts, arms, sensors, normalisers),
-            confirm=_confirmed(facts, bench, confirm if real else None, bool(real)),
+            feel=None if dry_run else _feel(facts, arms, sensors, normalisers),
+            confirm=_confirmed(facts, bench, confirm, real=bool(real) and not dry_run),
             placement=0.0 if task is None else task.placement,
         )
 
-        behind = {name: RigArm(driven) for name, driven in arms.items()}
+        behind = {name: RigArm(driven, still=dry_run) for name, driven in arms.items()}
 
         def diagnostics() -> Mapping[str, float]:
             alignment = {f"alignment_{name}": arm.alignment for name, arm in behind.items()}
@@ -184,7 +191,7 @@ def _feel(
     return felt
 
 
-def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, real: bool) -> Callable[[], bool]:
+def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
     def ask() -> bool:
         if real:
             return confirm is not None and confirm(f"Rig '{facts.name}': {QUESTION}")

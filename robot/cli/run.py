@@ -28,7 +28,7 @@ NO_END = 1_000_000  # steps of a rig without task: its recording ends it
 
 
 def run(
-    rig: Annotated[str, typer.Argument(help="Name of a rig (sim, replay), or the path of its file.")] = "sim",
+    rig: Annotated[str, typer.Argument(help="A rig (sim, mock, ur5e, replay), or the path of its file.")] = "sim",
     task: Annotated[
         str | None, typer.Option(help="squeeze, reposition, or the path of a task file.", show_default="the rig's own")
     ] = None,
@@ -40,6 +40,9 @@ def run(
         int | None, typer.Option(min=0, help="Exactly so many control steps.", show_default="the task's")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episode.")] = 0,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Hardware: connect, look, time and record, but send no motion.")
+    ] = False,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -59,7 +62,7 @@ def run(
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     with Interrupt() as interrupt:
-        failed = _run(loaded, name, steps, seed, folder, interrupt)
+        failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run)
         if interrupt():
             complain("stopped by a signal before the last step; what was done is saved")
             raise typer.Exit(interrupt.exit_code)
@@ -67,7 +70,9 @@ def run(
         raise typer.Exit(FAILED)
 
 
-def _run(loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, interrupt: Interrupt) -> bool:
+def _run(
+    loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, interrupt: Interrupt, dry_run: bool
+) -> bool:
     """Runs and reports the episode; True when it or its recording failed."""
     with busy("loading"):
         from robot.deploy import EpisodeFacts
@@ -79,7 +84,7 @@ def _run(loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, in
         notes.print(STARTING)
     task = None if loaded.facts.task is None else make_task(loaded.facts.task)
     facts = EpisodeFacts(policy, seed, {"rig.yaml": loaded.text.encode()})
-    with dumps_in(folder / "diverged"), open_rig(loaded) as rig:
+    with dumps_in(folder / "diverged"), open_rig(loaded, confirm=ask, dry_run=dry_run) as rig:
         acting = load_policy(policy, task, rig.spec)
         with Recording(folder, loaded.facts.canonical.pitch) as recording:
             episode, failure = _drive(rig, acting, task, steps, facts, recording, interrupt)
@@ -91,6 +96,11 @@ def _run(loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, in
     episode.dropped = recording.dropped
     _report(episode, folder, [folder / "episode.mcap"])
     return bool(failure or recording.problem(len(episode.steps)))
+
+
+def ask(question: str) -> bool:
+    """A person's word; without a terminal there is nobody to give it."""
+    return sys.stdin.isatty() and typer.confirm(question, default=False, err=True)
 
 
 def _drive(

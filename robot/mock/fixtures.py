@@ -1,0 +1,63 @@
+"""pytest fixtures of mock hardware for users: ``pytest_plugins = ["robot.mock.fixtures"]`` in a conftest.py.
+
+Each test process has loopback addresses of its own (127.0.0.0/8; on macOS they must be made first: ifconfig lo0 alias),
+so tests may run side by side.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from robot.mock.camera import MockCamera
+from robot.mock.ur import MockUR
+from tacsim.rig import Rig
+
+ROOM = 31  # second number of the addresses
+
+
+def mock_host(number: int) -> str:
+    """A loopback address of this process's own, number 1 to 254."""
+    return f"127.{ROOM}.{os.getpid() % 250 + 1}.{number}"
+
+
+def rig_addresses() -> list[str]:
+    """Overrides that give the rig `mock` addresses of this process's own."""
+    return [
+        override
+        for number, name in enumerate(("lower", "upper"), start=11)
+        for override in (
+            f"arms.{name}.host={mock_host(number)}",
+            f"sensors.{name}.source=http://{mock_host(number)}:8081/?action=stream",
+        )
+    ]
+
+
+@pytest.fixture
+def mock_ur() -> Iterator[MockUR]:
+    """One mock UR5e controller: connect to `mock_ur.host`, break it by `mock_ur.door`."""
+    with MockUR(mock_host(1)) as running:
+        yield running
+
+
+@pytest.fixture
+def mock_camera() -> Iterator[MockCamera]:
+    """One mock camera of 320 x 240 px with stamps: read `mock_camera.url`, feed it by `mock_camera.push`."""
+    with MockCamera(mock_host(2)) as running:
+        yield running
+
+
+@pytest.fixture
+def mock_rig() -> Iterator[Callable[..., Rig]]:
+    """Opens the whole mock bench: `mock_rig("task=reposition", ...)` takes overrides of configs/rigs/mock.yaml."""
+    from robot.open import open_rig
+
+    with ExitStack() as stack:
+
+        def opened(*overrides: str, rig: str = "mock", task: str | None = None) -> Rig:
+            return stack.enter_context(open_rig(rig, task=task, overrides=[*rig_addresses(), *overrides]))
+
+        yield opened

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from robot.cli.output import Overrides, busy
+
 if TYPE_CHECKING:
     from robot import doctor as machine
 
@@ -36,17 +38,31 @@ def schema(
 
 
 def doctor(
+    rig: Annotated[
+        str | None,
+        typer.Option("--rig", metavar="FILE", help="Look at this rig instead: network, versions, cameras, limits."),
+    ] = None,
+    set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
-    """Check Python, packages, OpenCV, Taichi and the machine; exit code 1 if something must be mended.
+    """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be mended.
 
-    Example: tacsim doctor --json
+    Nothing moves: arms are asked, not commanded.
+
+    Example: tacsim doctor --rig ur5e
     """
     import json
 
     from robot import doctor as machine
 
-    checks = machine.examine()
+    if rig is None:
+        checks = machine.examine()
+    else:
+        from robot.inspect_rig import examine_rig
+        from tacsim.config import load_rig
+
+        with busy("looking at the rig"):
+            checks = examine_rig(load_rig(rig, overrides=set_ or []).facts)
     report = machine.as_json(checks)
     if as_json:
         typer.echo(json.dumps(report, indent=2))

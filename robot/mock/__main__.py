@@ -71,7 +71,7 @@ def _loop(
     while not ended:
         # What has arrived is served before the tick, also after a pause: fresh commands before the watchdog.
         for key, _ in selector.select(max(0.0, deadline - time.perf_counter())):
-            if key.fileobj in selector.get_map():
+            if _registered(selector, key):
                 key.data()
         late = time.perf_counter() - deadline
         if late < 0:
@@ -94,6 +94,14 @@ def _for_each(given: list[str], hosts: Sequence[str], what: str) -> list[str]:
     if len(given) not in (1, len(hosts)):
         raise ValueError(f"{len(given)} {what} for {len(hosts)} hosts; give one for all, or one each")
     return given if len(given) == len(hosts) else given * len(hosts)
+
+
+def _registered(selector: selectors.BaseSelector, key: selectors.SelectorKey) -> bool:
+    """False for a connection that what was served before it in the same round has closed."""
+    try:
+        return key.fileobj in selector.get_map()
+    except ValueError:  # a closed socket has no number any more
+        return False
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,6 +12,7 @@ trajectory, walls, other arms, reach; the servo call.
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -67,7 +68,7 @@ class Worker:
         self.partners: list[Link | None] = [None] * len(orders.partners)
         self.servo = Servo(orders, taken=self.link.commands.count)
         self._periods = np.full(WINDOW, PERIOD)
-        self._last = time.monotonic()
+        self._last = 0.0  # when the last period ended
         self._looks = 0  # at one package
         self._refused = 0  # periods since the controller took no more commands
         self._words = (0, 0)  # runtime_state, safety_status_bits
@@ -152,7 +153,9 @@ class Worker:
     # -- the loop ------------------------------------------------------------------------------------------------
 
     def run(self) -> NoReturn:
-        deadline = time.monotonic() + PERIOD
+        gc.freeze()  # what is loaded stays: the collector need not look at it in the middle of a period
+        self._last = time.monotonic()
+        deadline = self._last + PERIOD
         ending: float | None = None  # when the last ramp is cut off
         while True:
             self._looks = 0 if self._read() else self._looks + 1

@@ -14,6 +14,7 @@ from robot.servo import HARD, Servo, measured
 from robot.snapshot import Record
 from robot.trajectory import PERIOD
 from tacsim.interface import FloatArray, Pose
+from tacsim.limits import region
 
 HOME = np.array([0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0])
 KINEMATICS = Kinematics("ur5e")
@@ -171,6 +172,20 @@ def test_a_target_outside_is_cut_at_the_wall_and_counted() -> None:
     bench.run(1500)
     assert bench.servo.shortened == 1
     assert bench.path()[:, 2].min() == pytest.approx(0.3, abs=1e-8)
+
+
+def test_a_turn_at_full_speed_close_to_a_wall_does_not_bulge_out() -> None:
+    """Each target lies inside; the way between them would not, if the old speed were not braked first."""
+    bench = Bench(action_timeout=60.0, speed=0.2)
+    start = bench.at
+    floor = float(start.position[2]) - 0.1
+    bench.servo.region = region([-1.0, -1.0, floor], [1.0, 1.0, 1.0])
+    bench.ask(shifted(start, 0.0, 0.0, -0.1))
+    bench.run(280)
+    bench.ask(shifted(start, 0.1, 0.1, -0.1))
+    bench.run(1000)
+    assert bench.path()[:, 2].min() >= floor - 1e-8
+    assert np.allclose(bench.at.position, start.position + [0.1, 0.1, -0.1], atol=1e-8)
 
 
 def test_an_old_command_is_not_followed_and_a_late_one_brakes() -> None:

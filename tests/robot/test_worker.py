@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib.util
 import json
 import os
 import subprocess
@@ -94,8 +93,3 @@ def test_without_memory_to_write_to_it_says_so() -> None:
     done = start(orders("tacsim-0-missing").to_json())
     assert done.returncode == worker.FAILED
     assert "No such file" in json.loads(done.stdout)["text"]
-
-
-@pytest.mark.skipif(importlib.util.find_spec("rtde_control") is not None, reason="ur_rtde is installed here")
-def test_without_the_library_it_says_which_python_has_it() -> None:
-    assert "has no wheel for this Python" in Path(worker.__file__).read_text(encoding="utf-8")

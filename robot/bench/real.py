@@ -1,7 +1,7 @@
 """Real group: contact radius of balls on a real sensor against the simulated gel; the user brings the frames.
 
 Two comparisons a press. `image`: the real frame against our rendered one, the circle found in both by the same fit
-(`circle.py`). `pressure`: the radius of the simulated contact itself, against the radius that the labels give.
+(`calibration/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius that the labels give.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.bench.circle import NoCircle, contact_circle
+from calibration.circle import NoCircle, contact_circle
 from robot.bench.labels import BadData, Image, Presses, read_frames, read_labels
 from robot.bench.measure import Measurement, timed
 from robot.bench.press import layer, press

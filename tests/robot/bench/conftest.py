@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,6 @@ from robot.bench.press import layer
 
 PITCH = 0.0625e-3  # of image and FFT grid alike [m]
 SIZE = 200  # px
-
-Dented = Callable[..., tuple[NDArray[np.uint8], NDArray[np.uint8], float]]
-
 
 def dented(
     ball: float, depth: float, centre: tuple[float, float], thickness: float = 10e-3
@@ -50,11 +46,6 @@ presses:
   - {{ frames: [nowhere.png, ball_a.png], ball_radius: 3 mm, depth: 0.5 mm, radius_px: {radius:g} }}
   - {{ ball_radius: 3 mm, depth: 0.25 mm, radius_px: 14 }}
 """
-
-
-@pytest.fixture
-def press_image() -> Dented:
-    return dented
 
 
 @pytest.fixture

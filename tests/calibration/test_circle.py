@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.bench.circle import NoCircle, contact_circle, dent_slope
+from calibration.circle import NoCircle, contact_circle, dent_slope
 
 PITCH = 0.0625e-3
 

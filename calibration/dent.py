@@ -1,0 +1,60 @@
+"""The dent that a ball presses into a gel: the geometry that a photometric calibration takes for truth.
+
+Inside the contact circle the gel has the ball's slope; outside it the elastic skirt falls off exponentially:
+
+    s(r) = r / sqrt(R^2 - r^2)                                       r < a
+    s(r) = fraction * a / sqrt(R^2 - a^2) * exp(-(r - a) / length)   r >= a
+
+Length and fraction of the skirt belong to the sensor and are found with the circles. Without a skirt, flanks that are
+bright outside the contact would be taken for contact: shallow presses would read a tenth of their depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+STEEPEST_RIM = 0.98  # contact radius over ball radius, at most: beyond it the slope is no number
+
+
+@dataclass(frozen=True, slots=True)
+class Skirt:
+    """The elastic skirt of one sensor's gel."""
+
+    length: float  # [px]
+    fraction: float  # of the ball's slope at the contact circle [-]
+
+
+@dataclass(frozen=True, slots=True)
+class ContactCircle:
+    """Contact circle in the image [px]; pixel centres are whole numbers, x right, y down."""
+
+    x: float
+    y: float
+    radius: float
+
+
+def dent_gradient(u: Float64, v: Float64, circle: ContactCircle, skirt: Skirt, ball: float) -> Float64:
+    """(..., 2) slopes of the height (into the gel) at pixels u, v (...,); `ball`: its radius [px].
+
+    Raises ValueError for a circle as large as the ball.
+    """
+    a = circle.radius
+    if not 0 < a < ball:
+        raise ValueError(f"a contact circle of {a:.1f} px is none of a ball of {ball:.1f} px")
+    dx, dy = u - circle.x, v - circle.y
+    r = np.hypot(dx, dy)
+    rim = skirt.fraction * a / np.sqrt(ball**2 - a**2)
+    inside = 1.0 / np.sqrt(np.maximum(ball**2 - r**2, ball**2 - a**2))  # slope over r
+    outside = rim * np.exp(-np.maximum(r - a, 0.0) / skirt.length) / np.maximum(r, 1e-9)
+    steepness = np.where(r < a, inside, outside)
+    return np.stack([-steepness * dx, -steepness * dy], axis=-1)
+
+
+def rim_slope(circle: ContactCircle, ball: float) -> float:
+    """The steepest slope of the dent [-]."""
+    return circle.radius / float(np.sqrt(ball**2 - circle.radius**2))

@@ -77,6 +77,7 @@ class GuidedStart:
         self._go(self._begun, TRAVEL)
         if self._arms:
             time.sleep(PAUSE)
+            self._clock.look()  # what is felt by now, not what was felt before the retreat, shall be zero
         for driven in self._arms.values():
             driven.arm.zero_wrench()
         self._clock.look()

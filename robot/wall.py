@@ -46,6 +46,9 @@ class RigArm:
         arm = self._driven.arm
         if at is None:
             return arm.state()
+        deadline = time.monotonic() + arm.facts.link_timeout
+        while arm.state().time < at and time.monotonic() < deadline:  # a package comes later than what it tells of
+            time.sleep(1e-3)
         packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
         history = ArmHistory(arm.name)
         for state in arm.history(packages):

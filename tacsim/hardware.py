@@ -104,9 +104,9 @@ class UrArmFacts(Facts):
     payload: Payload = Payload()
     limits: ArmLimits
     start: Placement | None = None  # world_from_sensor, clear of everything; None: where the scene of a mock rig says
-    link_timeout: Annotated[Time, Field(ge=0.01, le=1.0)] = 50e-3  # no package for so long: the link is lost [s]
+    link_timeout: Annotated[Time, Field(ge=0.01, le=2.0)] = 50e-3  # no package for so long: the link is lost [s]
     action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # no action for so long: the arm holds [s]
-    watchdog: Annotated[float, Field(ge=1.0, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
+    watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
     latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]

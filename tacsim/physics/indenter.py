@@ -22,6 +22,10 @@ from tacsim.physics.layout import (
 )
 from tacsim.runtime import ti
 
+Slip = ti.types.ndarray(dtype=vec3, ndim=3)
+Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
+Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
+
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
 FAR = 1e9

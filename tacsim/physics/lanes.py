@@ -133,3 +133,18 @@ def note_most(partial: ti.template(), env, slot, number, value):
             ti.atomic_max(partial[env, slot, number], value)
     else:
         partial[env, slot, number] = ti.max(partial[env, slot, number], value)
+
+
+# Registers of one thread on a device, where the CPU has arrays to drop values in.
+
+
+@ti.func
+def empty_lanes():
+    empty = real(0.0)
+    return empty
+
+
+@ti.func
+def empty_four():
+    empty = vec4(0.0)
+    return empty

@@ -1,8 +1,8 @@
 """The same physics on a device (a GPU): one thread a particle, element or node, one kernel a substep.
 
 Threads of a device cannot meet inside a loop, so each phase of a substep is a loop of its own, and the host counts the
-substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only the
-loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
+substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only
+the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
 
 Arrays stay on the device for a launch. Before it they are copied there, after it what has changed is copied back, so
 everybody else goes on working with NumPy.
@@ -12,10 +12,32 @@ from typing import Any
 
 import numpy as np
 
-from tacsim.physics.gel import Corners, GelState, Lattice, NodeLanes, Skin, Touch, element_block, gel_advance, node_block
+from tacsim.physics.gel import (
+    Corners,
+    GelState,
+    Lattice,
+    NodeLanes,
+    Skin,
+    Touch,
+    element_block,
+    gel_advance,
+    node_block,
+)
 from tacsim.physics.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
 from tacsim.physics.indenter import Pressure, Slip, Values, indent
-from tacsim.physics.lanes import PARTS, SLOTS, Counts, Facts, Partial, empty_four, empty_lanes, note_least, real, vec3, vec4
+from tacsim.physics.lanes import (
+    PARTS,
+    SLOTS,
+    Counts,
+    Facts,
+    Partial,
+    empty_four,
+    empty_lanes,
+    note_least,
+    real,
+    vec3,
+    vec4,
+)
 from tacsim.physics.layout import (
     BACKING,
     CAPACITY,
@@ -96,7 +118,9 @@ def column(
                 margin + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
                 nodes, corners, corners, corners, corners, 1, ny + 1, 0,
             )  # fmt: skip
-    gel_advance(env, g * blocks + block, gels, nodes, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+    gel_advance(
+        env, g * blocks + block, gels, nodes, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny
+    )
 
 
 @ti.kernel

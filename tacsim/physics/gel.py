@@ -120,8 +120,8 @@ class GelState:
     (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
     skin: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside.
     touch: (E, COPIES, gels, P, 4) contact force on the surface nodes, one copy a part.
-    corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device, which
-    works on all layers at once, (E, gels, nz, 24, W).
+    corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
+    which works on all layers at once, (E, gels, nz, 24, W).
     lattice: (2, P) 1 at the first node of an element, else 0; and 1 / share of a node's mass, 0 where there is no node.
     """
 
@@ -197,7 +197,6 @@ class GelState:
             self.lattice.reshape(-1, LANES),
         )  # fmt: skip
 
-
     def memory(self) -> tuple[np.ndarray, ...]:
         """What a device takes: nodes with the margin round them, skin, touch, corners with theirs, lattice."""
         return self._nodes, self.skin, self.touch, self._corners, self.lattice
@@ -237,8 +236,8 @@ def element_block(
 
     u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
     where the forces go, `row` the way to the next corner or axis; sj, si: how much further on nodes across j and i
-    stand, 0 in views that are shifted in memory; w: of `work`, the first that is free. One-point quadrature and hourglass stiffness
-    (Flanagan & Belytschko 1981, modes of the cube).
+    stand, 0 in views that are shifted in memory; w: of `work`, the first that is free. One-point quadrature and
+    hourglass stiffness (Flanagan & Belytschko 1981, modes of the cube).
     """
     h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
     whole = lattice[block]
@@ -355,7 +354,8 @@ def gel_advance(
 ):  # fmt: skip
     """Symplectic Euler with lumped masses on this part's nodes of its gel, and their skin.
 
-    On a device a part is a column of nodes: part // columns is the gel, part % columns the column. Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted.
+    Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted. On a
+    device a part is one column of nodes: of gel part // columns, number part % columns.
     """
     dt, h = facts[env, STEP], facts[env, GEL_SPACING]
     pieces = PARTS // gels

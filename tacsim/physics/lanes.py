@@ -141,10 +141,10 @@ def note_most(partial: ti.template(), env, slot, number, value):
 @ti.func
 def empty_lanes():
     empty = real(0.0)
-    return empty
+    return empty  # noqa: RET504 - only a variable can be written to
 
 
 @ti.func
 def empty_four():
     empty = vec4(0.0)
-    return empty
+    return empty  # noqa: RET504 - only a variable can be written to

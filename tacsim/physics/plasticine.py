@@ -12,6 +12,7 @@ import numpy as np
 from tacsim.physics.gel import MM, MPA
 from tacsim.physics.lanes import (
     COPIES,
+    ON_DEVICE,
     PARTS,
     add_to,
     copy_of,
@@ -58,7 +59,8 @@ Strains = ti.types.ndarray(dtype=vec4, ndim=1)
 Masses = ti.types.ndarray(dtype=vec4, ndim=1)
 Velocities = ti.types.ndarray(dtype=vec4, ndim=1)
 Sums = ti.types.ndarray(dtype=vec4, ndim=1)
-SUMS = 64  # of `sums` for each part: 16 slots, far enough apart that the compiler does not merge two of them
+APART = 1 if ON_DEVICE else 4  # slots in `sums`: far enough that the CPU's compiler does not merge two of them
+SUMS = 16 * APART  # of `sums` for each part
 
 ELASTIC = 1e9  # strain limit that is never reached
 
@@ -332,18 +334,18 @@ def gather(
             for j in ti.static(range(3)):
                 line = first + (i * ny + j) * nz
                 middle, end = velocities[line + 1], velocities[line + 2]
-                sums[drop + 4 * (j)] = wz[0] * velocities[line] + wz[1] * middle + wz[2] * end
-                sums[drop + 4 * (12 + j)] = wz[1] * middle + (2.0 * wz[2]) * end
-            new = wy[0] * sums[drop] + wy[1] * sums[drop + 4] + wy[2] * sums[drop + 8]
-            sums[drop + 4 * (3 + i)] = keep_or(never, sums[drop + 4 * (3 + i)], new)
-            new = wy[1] * sums[drop + 4] + (2.0 * wy[2]) * sums[drop + 8]
-            sums[drop + 4 * (6 + i)] = keep_or(never, sums[drop + 4 * (6 + i)], new)
-            new = wy[0] * sums[drop + 48] + wy[1] * sums[drop + 52] + wy[2] * sums[drop + 56]
-            sums[drop + 4 * (9 + i)] = keep_or(never, sums[drop + 4 * (9 + i)], new)
-        velocity = wx[0] * sums[drop + 12] + wx[1] * sums[drop + 16] + wx[2] * sums[drop + 20]
-        x = wx[1] * sums[drop + 16] + (2.0 * wx[2]) * sums[drop + 20]
-        y = wx[0] * sums[drop + 24] + wx[1] * sums[drop + 28] + wx[2] * sums[drop + 32]
-        z = wx[0] * sums[drop + 36] + wx[1] * sums[drop + 40] + wx[2] * sums[drop + 44]
+                sums[drop + APART * j] = wz[0] * velocities[line] + wz[1] * middle + wz[2] * end
+                sums[drop + APART * (12 + j)] = wz[1] * middle + (2.0 * wz[2]) * end
+            new = wy[0] * sums[drop] + wy[1] * sums[drop + APART] + wy[2] * sums[drop + APART * 2]
+            sums[drop + APART * (3 + i)] = keep_or(never, sums[drop + APART * (3 + i)], new)
+            new = wy[1] * sums[drop + APART] + (2.0 * wy[2]) * sums[drop + APART * 2]
+            sums[drop + APART * (6 + i)] = keep_or(never, sums[drop + APART * (6 + i)], new)
+            new = wy[0] * sums[drop + APART * 12] + wy[1] * sums[drop + APART * 13] + wy[2] * sums[drop + APART * 14]
+            sums[drop + APART * (9 + i)] = keep_or(never, sums[drop + APART * (9 + i)], new)
+        velocity = wx[0] * sums[drop + APART * 3] + wx[1] * sums[drop + APART * 4] + wx[2] * sums[drop + APART * 5]
+        x = wx[1] * sums[drop + APART * 4] + (2.0 * wx[2]) * sums[drop + APART * 5]
+        y = wx[0] * sums[drop + APART * 6] + wx[1] * sums[drop + APART * 7] + wx[2] * sums[drop + APART * 8]
+        z = wx[0] * sums[drop + APART * 9] + wx[1] * sums[drop + APART * 10] + wx[2] * sums[drop + APART * 11]
         scale = 4.0 / cell
         x, y, z = scale * (x - fx[0] * velocity), scale * (y - fx[1] * velocity), scale * (z - fx[2] * velocity)
         rates[p, 0] = keep_or(never, rates[p, 0], velocity)

@@ -82,7 +82,6 @@ GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 REACH = 3e-3  # of a mesh's distance grid, up from its tip [m]
 
 
-
 @ti.kernel
 def press_substeps(
     team: ti.i32, drive: Drive,

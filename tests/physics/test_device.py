@@ -170,5 +170,28 @@ def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]])
         assert str(found["invert.words"]).startswith("a gel element is inverted or crushed")
 
 
+WORLD = "from tacsim.physics.world import make_world; from tacsim.scene import Scene; make_world(Scene(physics={!r}))"
+
+
+@pytest.mark.parametrize(
+    ("device", "code", "words"),
+    [
+        ("abacus", WORLD.format("hybrid"), "ValueError: TACSIM_DEVICE must be one of cpu, cuda, vulkan, metal, found"),
+        ("vulkan", WORLD.format("seed"), "RuntimeError: physics 'seed' runs on the CPU only"),
+        pytest.param(
+            "cuda", WORLD.format("hybrid"), "RuntimeError: TACSIM_DEVICE is 'cuda', but Taichi finds no such device",
+            marks=pytest.mark.skipif(available("cuda"), reason="there is a CUDA device"),
+        ),
+    ],
+)  # fmt: skip
+def test_a_device_that_will_not_do_is_refused(device: str, code: str, words: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "TACSIM_DEVICE": device}, capture_output=True, text=True,
+        timeout=SECONDS, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert words in done.stderr
+
+
 if __name__ == "__main__":
     np.savez(sys.argv[1], **all_outcomes())

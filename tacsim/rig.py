@@ -81,6 +81,16 @@ class Rig:
         self._addressable = set(arms) | {sensor for sensor, spec in specs.items() if spec.arm is None}
 
     @property
+    def sensors(self) -> Mapping[str, TactileSource]:
+        """By name; for what needs more than an observation a period: calibration, inspection."""
+        return self._sensors
+
+    @property
+    def arms(self) -> Mapping[str, Arm]:
+        """By name; see `sensors`."""
+        return self._arms
+
+    @property
     def frames(self) -> Mapping[str, TactileFrame]:
         """Native frames of the last observation, by sensor; empty before the first."""
         return self._frames

@@ -9,6 +9,7 @@ import typer
 from robot.cli.bench import bench
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
+from robot.cli.latency import latency
 from robot.cli.look import doctor, schema
 from robot.cli.mock import mock
 from robot.cli.run import replay, run
@@ -24,10 +25,19 @@ app = typer.Typer(
     epilog="Example: [bold]tacsim run --task squeeze --out runs/first[/]   "
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
 )
-for command in (run, press, reproduce, replay, mock, bench, debug, schema, doctor):
-    # typer takes the first line of help from the docstring, and the example from the epilog
-    text, _, example = (command.__doc__ or "").partition("Example:")
-    app.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
+calibrate = typer.Typer(
+    help="Measure what a rig file must say of the hardware.", no_args_is_help=True, rich_markup_mode="rich"
+)
+app.add_typer(calibrate, name="calibrate")
+COMMANDS = {
+    app: (run, press, reproduce, replay, mock, bench, debug, schema, doctor),
+    calibrate: (latency,),
+}
+for group, commands in COMMANDS.items():
+    for command in commands:
+        # typer takes the first line of help from the docstring, and the example from the epilog
+        text, _, example = (command.__doc__ or "").partition("Example:")
+        group.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
 
 
 def _print_version(wanted: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from typing import Annotated
 
 import typer
@@ -12,37 +13,50 @@ from robot.cli.output import results
 
 
 def mock(
-    arms: Annotated[int, typer.Option("--arms", min=1, max=16, help="How many: 127.0.0.2, 127.0.0.3, ...")] = 1,
+    arms: Annotated[int, typer.Option("--arms", min=0, max=16, help="How many: 127.0.0.2, 127.0.0.3, ...")] = 1,
     host: Annotated[
         list[str] | None,
         typer.Option("--host", help="Address of an arm, instead of --arms; may be repeated.", show_default=False),
     ] = None,
     model: Annotated[str, typer.Option(help="ur3e, ur5e or ur10e.")] = "ur5e",
+    cameras: Annotated[
+        int, typer.Option("--cameras", min=0, max=16, help="How many: at the arms' addresses, then the next ones.")
+    ] = 0,
+    camera_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of every camera.")] = 8081,
     allow_network: Annotated[
         bool, typer.Option("--allow-network", help="Allow addresses that other machines reach.")
     ] = False,
 ) -> None:
-    """Run mock UR controllers until Ctrl-C: RTDE, script and dashboard ports, as a robot has them.
+    """Run mock UR controllers and cameras until Ctrl-C: RTDE, script and dashboard ports, MJPEG over HTTP.
 
-    They move, feel and stop like an arm, but know no dynamics. Any UR client can connect.
+    Arms move, feel and stop like an arm, but know no dynamics. Any UR client can connect. Cameras send 320 x 240 px,
+    30 times a second, with a strip below that tells number and clock of the frame; nothing stands before them. For arms
+    and cameras with simulated gels before them, open the rig `mock`.
 
-    Example: tacsim mock --arms 2
+    Example: tacsim mock --arms 2 --cameras 2
     """
     from robot.kinematics import MODELS
-    from robot.mock import MockArms
+    from robot.mock import MockArms, MockCamera
     from robot.mock.controller import PORTS
     from robot.mock.door import DOOR_PORT
 
     if model not in MODELS:
         raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(MODELS)}", param_hint="--model")
     hosts = host or [f"127.0.0.{2 + index}" for index in range(arms)]
-    with Interrupt() as interrupt, MockArms(hosts, model=model, allow_network=allow_network) as running:
+    if not hosts and not cameras:
+        raise typer.BadParameter("nothing to run: give at least one arm or camera", param_hint="--arms, --cameras")
+    seen_from = [hosts[index] if index < len(hosts) else f"127.0.0.{2 + index}" for index in range(cameras)]
+    with Interrupt() as interrupt, ExitStack() as stack:
+        controllers = stack.enter_context(MockArms(hosts, model=model, allow_network=allow_network)) if hosts else None
+        eyes = [stack.enter_context(MockCamera(each, camera_port, allow_network=allow_network)) for each in seen_from]
         ports = ", ".join(map(str, sorted(PORTS)))
         for each in hosts:
             results.print(f"{model} at {each}: ports {ports}; fault door {DOOR_PORT}")
+        for eye in eyes:
+            results.print(f"camera at {eye.url}", markup=False)
         results.print("Ctrl-C ends them.")
-        while not interrupt() and running.running:
+        while not interrupt() and (controllers is None or controllers.running) and all(eye.running for eye in eyes):
             time.sleep(0.1)
         if interrupt():
             raise typer.Exit(interrupt.exit_code)
-        raise RuntimeError("the process of the mock controllers has ended by itself; its reason stands above")
+        raise RuntimeError("a process of the mocks has ended by itself; its reason stands above")

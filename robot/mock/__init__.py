@@ -7,10 +7,14 @@ with MockUR("127.0.0.2") as mock:
 
 from __future__ import annotations
 
-from robot.mock.camera import MockCamera, MockCameraState
+from typing import TYPE_CHECKING, Any
+
 from robot.mock.controller import SERIAL as MOCK_SERIAL
 from robot.mock.door import Door, DoorError, Input, Inputs, MockState
 from robot.mock.ur import MockArms, MockError, MockUR
+
+if TYPE_CHECKING:
+    from robot.mock.camera import MockCamera, MockCameraState
 
 __all__ = [
     "MOCK_SERIAL",
@@ -25,3 +29,12 @@ __all__ = [
     "MockState",
     "MockUR",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Cameras are imported when asked for: `python -m robot.mock.camera` must not find itself imported already."""
+    if name in ("MockCamera", "MockCameraState"):
+        from robot.mock import camera
+
+        return getattr(camera, name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -134,6 +134,11 @@ class MockCamera:
         answer["size"] = None if answer["size"] is None else tuple(answer["size"])
         return MockCameraState(**{field.name: answer[field.name] for field in fields(MockCameraState)})
 
+    @property
+    def running(self) -> bool:
+        """False once the process has ended."""
+        return self._process.poll() is None
+
     def close(self) -> None:
         """Ends the process; harmless a second time."""
         with self._lock:

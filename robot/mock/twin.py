@@ -14,6 +14,7 @@ import io
 import json
 import os
 import selectors
+import signal
 import struct
 import subprocess
 import sys
@@ -122,19 +123,25 @@ class Twin:
     def _ask(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         pipe_in, pipe_out = self._process.stdin, self._process.stdout
         assert pipe_in is not None and pipe_out is not None
+        if pipe_in.closed:
+            raise TwinError(f"the simulated bench (process {self.pid}) is closed; open the rig anew")
         try:
             write_message(pipe_in, request)
             with selectors.DefaultSelector() as ready:
                 ready.register(pipe_out, selectors.EVENT_READ)
                 if not ready.select(PATIENCE):
-                    self.close()
                     raise TwinError(f"the simulated bench gave no answer within {PATIENCE:g} s and was ended")
             message = read_message(pipe_out)
-        except (OSError, ValueError) as failure:
-            raise TwinError(f"the simulated bench (process {self.pid}) cannot be asked: {failure}") from failure
-        if message is None:
-            code = self._process.wait()
-            raise TwinError(f"the simulated bench (process {self.pid}) ended with {code}; open the rig anew")
+            if message is None:
+                raise OSError("it has ended")
+        except BaseException as failure:  # also Ctrl-C: an answer left in the pipe would be taken for the next one
+            self.close()
+            if isinstance(failure, (OSError, ValueError)):
+                raise TwinError(
+                    f"the simulated bench (process {self.pid}, ended with {self._process.returncode}) cannot be asked: "
+                    f"{failure}; open the rig anew"
+                ) from failure
+            raise
         said, arrays = message
         if "error" in said:
             raise TwinError(f"simulated bench: {said['error']}")
@@ -182,13 +189,16 @@ def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], dict[str, NDArray[Any
     text, body = pipe.read(text_length), pipe.read(body_length)
     if len(text) < text_length or len(body) < body_length:
         return None
-    said: dict[str, Any] = json.loads(text)
-    arrays: dict[str, NDArray[Any]] = {}
-    start = 0
-    for name, kind, shape in said.pop("arrays"):
-        size = int(np.prod(shape)) * np.dtype(kind).itemsize
-        arrays[name] = np.frombuffer(body[start : start + size], np.dtype(kind)).reshape(shape)
-        start += size
+    try:
+        said: dict[str, Any] = json.loads(text)
+        arrays: dict[str, NDArray[Any]] = {}
+        start = 0
+        for name, kind, shape in said.pop("arrays"):
+            size = int(np.prod(shape)) * np.dtype(kind).itemsize
+            arrays[name] = np.frombuffer(body[start : start + size], np.dtype(kind)).reshape(shape)
+            start += size
+    except (KeyError, TypeError, AttributeError) as failure:
+        raise ValueError(f"no message: {type(failure).__name__}: {failure}") from failure
     return said, arrays
 
 
@@ -265,6 +275,7 @@ class _Bench:
 
 def main() -> None:
     """Answers requests on standard input until it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C means the parent, which ends this process in order
     answers = io.BufferedWriter(io.FileIO(os.dup(1), "wb"))
     os.dup2(2, 1)  # whoever prints shall not break a message
     os.nice(NICENESS)

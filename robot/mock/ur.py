@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from robot.errors import DeviceError
 from robot.mock.controller import SERIAL
 from robot.mock.door import DOOR_PORT, Door
 from robot.mock.machine import Version
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 VERSION: Version = (5, 11, 0, 108150)
 
 
-class MockError(RuntimeError):
+class MockError(DeviceError):
     """A mock controller did not start."""
 
 

@@ -110,7 +110,6 @@ class GuidedStart:
             self._clock.look()
 
     def _go(self, targets: Mapping[str, Pose], timeout: float) -> None:
-        for name, target in targets.items():
-            driven = self._arms[name]
-            driven.target = driven.arm.command(target)
+        for name, driven in self._arms.items():  # none in a dry run
+            driven.target = driven.arm.command(targets[name])
         drive(self._arms, timeout)

@@ -52,7 +52,7 @@ class RigArm:
         while arm.state().time < at and time.monotonic() < deadline:  # a package comes later than what it tells of
             time.sleep(1e-3)
         packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
-        history = ArmHistory(arm.name)
+        history = ArmHistory(arm.name, max_gap=arm.facts.link_timeout)  # a longer gap is a lost link
         for state in arm.history(packages):
             history.append(state)
         aligned = history.at(at)

@@ -50,6 +50,8 @@ MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controll
 CLOSING = 0.6  # longest ramp when the driver closes [s]
 PARENTLESS = 0.5  # the same when it is gone [s]
 LIBRARY_PATIENCE = 4.5  # after so long the library gives a call up by itself [s]
+STUCK = 10.0  # after so long without a period the process is ended: the library may wait for ever [s]
+ORPHANED = 3.0  # the same when nobody is there who could kill it [s]
 GRACE = 5  # periods in which a package may tell why the controller takes no more commands
 FAILED = 3  # exit status: the reason stands on stdout as JSON
 WINDOW = 500  # periods in the statistics
@@ -161,6 +163,7 @@ class Worker:
             self._looks = 0 if self._read() else self._looks + 1
             self._publish(self.servo.status)
             orphan = os.getppid() != self.orders.parent
+            _end_if_stuck(ORPHANED if orphan else STUCK)
             now = time.monotonic()
             # A process that slept looks again: the packages may lie there unread.
             if self._looks > 5 and now - float(self.record["time"]) > self.orders.link_timeout:
@@ -297,6 +300,12 @@ class Worker:
         if orphan:
             self.segment.remove()
         os._exit(0)
+
+
+def _end_if_stuck(seconds: float) -> None:
+    """The kernel ends this process unless it is asked again within `seconds`, even in the middle of a library call."""
+    if sys.platform != "win32":
+        signal.setitimer(signal.ITIMER_REAL, seconds)  # SIGALRM is not caught
 
 
 _CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP)

@@ -148,7 +148,7 @@ def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
         camera.delay(DELAY)
         words = ["calibrate", "latency", str(tmp_path / "tapper.yaml"), "--arm", "upper", "--sensor", "upper"]
         with Hand(host, camera):
-            done = CliRunner().invoke(app, [*words, "--depth", "1 mm"], env={"COLUMNS": "200"})
+            done = CliRunner().invoke(app, [*words, "--depth", "1 mm", "--taps", "5"], env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.output
     said = done.stdout.split()
     found = float(said[said.index("is") + 1])

@@ -8,8 +8,10 @@ import sys
 
 import pytest
 
+from robot.camera import Camera
 from robot.mock import Door
 from robot.mock.client import TIMEOUT, loopback_host
+from tacsim.hardware import CameraSensorFacts
 
 START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 
@@ -30,12 +32,29 @@ def test_it_serves_until_ctrl_c() -> None:
         assert process.wait(TIMEOUT) == 128 + signal.SIGINT
 
 
+def test_cameras_stand_at_the_arms_addresses() -> None:
+    host = loopback_host(42)
+    options = ["--host", host, "--cameras", "1", "--camera-port", "8090"]
+    process = subprocess.Popen([*START, *options], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    with process, process.stdout:
+        said = [process.stdout.readline() for _ in range(3)]
+        url = f"http://{host}:8090/?action=stream"
+        assert said[1].strip() == f"camera at {url}"
+        facts = CameraSensorFacts(driver="camera", source=url, width=320, height=240, stamped=True, max_age=10.0)
+        with Camera(facts, "finger", TIMEOUT) as camera:
+            assert camera.read(TIMEOUT).image.shape == (240, 320, 3)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT) == 128 + signal.SIGINT
+
+
 @pytest.mark.parametrize(
     ("options", "words", "code"),
     [
         (["--model", "ur7"], "--model", 2),
         (["--host", "192.168.0.9"], "not a loopback", 1),
-        (["--arms", "0"], "--arms", 2),
+        (["--arms", "0"], "nothing to run", 2),
+        (["--arms", "0", "--cameras", "1", "--camera-port", "70000"], "--camera-port", 2),
     ],
 )
 def test_what_it_refuses(options: list[str], words: str, code: int) -> None:

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,7 +126,10 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, act: str) -> Twin:
     [
         ("sys.exit(7)", r"ended with 7.*open the rig anew"),
         ("sys.stdout.buffer.write(b'x' * 8); sys.stdout.buffer.flush()", r"the limit is \d+"),
-        ("write_message(sys.stdout.buffer, {'error': 'SimulationDiverged: so and so'})", "SimulationDiverged: so and so"),
+        (
+            "write_message(sys.stdout.buffer, {'error': 'SimulationDiverged: so and so'})",
+            "SimulationDiverged: so and so",
+        ),
         ("os.close(1); time.sleep(600)", "cannot be asked"),  # closed its end, but lives on
     ],
 )
@@ -245,8 +249,7 @@ def test_the_process_ends_with_its_parent() -> None:
     def gone() -> bool:
         try:
             os.kill(child, 0)
-            with open(f"/proc/{child}/stat") as stat:
-                return stat.read().rpartition(")")[2].split()[0] == "Z"
+            return Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
         except (ProcessLookupError, FileNotFoundError):
             return True
 

@@ -1,0 +1,75 @@
+"""The pytest plugin for users: it works in a project of theirs, and side by side with itself."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from robot.mock.fixtures import mock_host, rig_addresses
+from tacsim.config import load_rig
+
+ROOT = Path(__file__).resolve().parents[3]
+THEIRS = """
+import numpy as np
+import pytest
+from robot.camera import Camera
+from tacsim.config import load_rig
+from tacsim.hardware import CameraSensorFacts
+
+
+def test_the_controller_is_there_and_can_be_broken(mock_ur):
+    assert mock_ur.door.state().mode == "RUNNING"
+    mock_ur.door.protective_stop()
+    assert mock_ur.door.state().safety == "PROTECTIVE_STOP"
+
+
+def test_it_is_whole_again_in_the_next_test(mock_ur):
+    assert mock_ur.door.state().safety == "NORMAL"
+
+
+def test_the_camera_shows_what_is_pushed(mock_camera):
+    mock_camera.push(np.full((240, 320, 3), 77, np.uint8))
+    facts = CameraSensorFacts(driver="camera", source=mock_camera.url, width=320, height=240, stamped=True, max_age=10)
+    with Camera(facts, "finger") as camera:
+        assert abs(int(camera.wait_for(1, 10.0).image.mean()) - 77) < 3
+
+
+def test_the_rig_opens_with_overrides(mock_rig, tmp_path):
+    with pytest.raises(Exception, match="no_such_key"):
+        mock_rig("no_such_key=1")
+"""
+
+
+def test_it_works_as_a_plugin_of_somebody_elses_tests(tmp_path: Path) -> None:
+    (tmp_path / "conftest.py").write_text('pytest_plugins = ["robot.mock.fixtures"]\n')
+    (tmp_path / "test_theirs.py").write_text(THEIRS)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert "4 passed" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
+
+
+def test_addresses_are_of_loopback_and_of_this_process() -> None:
+    facts = load_rig("mock", overrides=rig_addresses()).facts
+    hosts = [arm.host for arm in facts.arms.values()]  # type: ignore[union-attr]
+    assert len(set(hosts)) == 2
+    assert all(host.startswith(mock_host(1).rpartition(".")[0] + ".") and host.startswith("127.") for host in hosts)
+    for name, host in zip(facts.arms, hosts, strict=True):
+        assert f"//{host}:" in facts.sensors[name].source  # type: ignore[union-attr, operator]
+
+
+@pytest.mark.parametrize("number", [1, 254])
+def test_two_processes_have_addresses_of_their_own(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = mock_host(number)
+    monkeypatch.setattr(os, "getpid", lambda pid=os.getpid() + 1: pid)
+    assert mock_host(number) != own

@@ -71,5 +71,6 @@ def test_addresses_are_of_loopback_and_of_this_process() -> None:
 @pytest.mark.parametrize("number", [1, 254])
 def test_two_processes_have_addresses_of_their_own(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     own = mock_host(number)
-    monkeypatch.setattr(os, "getpid", lambda pid=os.getpid() + 1: pid)
+    other = os.getpid() + 1
+    monkeypatch.setattr(os, "getpid", lambda: other)
     assert mock_host(number) != own

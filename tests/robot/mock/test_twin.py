@@ -208,7 +208,7 @@ def test_a_bench_answers_with_pictures_surfaces_forces_and_truth(twin: Twin, fac
 
 def test_what_cannot_be_done_is_said_and_the_bench_goes_on(twin: Twin) -> None:
     twin.place(twin.initial)
-    with pytest.raises(TwinError, match="simulated bench: .*third"):
+    with pytest.raises(TwinError, match=r"simulated bench: .*third"):
         twin.move({**twin.initial, "third": Pose()})
     assert np.isfinite(twin.place(twin.initial).wrenches["upper"]).all()
 

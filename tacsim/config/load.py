@@ -119,7 +119,10 @@ def _settle_scene(root: Node, own_scene: bool, reading: Reading) -> Node:
     if _simulated(root):
         root = _adopt_scene(root)  # an override may have taken it away
         if not _has(root, "scene") and not root.items.get("task", root).broken:
-            what = "is missing: something here is simulated (driver 'sim', or a camera's `mock`); allowed: a scene, or a task with one"
+            what = (
+                "is missing: something here is simulated (driver 'sim', or a camera's `mock`); allowed: a scene, or a "
+                "task (which has one)"
+            )
             reading.report(root.place, "scene", what)
         return root
     if own_scene and _has(root, "scene"):

@@ -20,8 +20,11 @@ from robot.start import GuidedStart
 from robot.trajectory import PERIOD
 from robot.twin_sensor import TwinSensor
 from robot.ur import URArm
+from tacsim import pose as se3
 from tacsim.hardware import ArmLimits, CameraSensorFacts, UrArmFacts
 from tacsim.interface import ArmState, Normaliser, Pose, TactileObservation, TactileSource
+from tacsim.limits import ActionError
+from tacsim.record.timing import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
 from tacsim.rigfile import RigFacts, SimSensorFacts
 from tacsim.touch import contact_signal
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from calibration.normaliser import FrameNormaliser
 
 Confirm = Callable[[str], bool]
+SHORTENED = 1e-7  # a target that was changed by more counts as shortened [m, rad]
 QUESTION = "Is the body in its place between the sensors, and everybody out of reach of the arms?"
 
 
@@ -42,6 +46,7 @@ class RigArm:
     def __init__(self, driven: Driven, *, still: bool = False) -> None:
         self._driven, self._still = driven, still
         self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
+        self.limits_hit = 0  # targets that were shortened or refused
 
     def state(self, at: float | None = None) -> ArmState:
         """Raises NotAligned for a moment of which no package tells."""
@@ -63,8 +68,14 @@ class RigArm:
         """With `still` nothing is sent, and None says so."""
         if self._still:
             return None
-        self._driven.target = self._driven.arm.command(target)
-        return self._driven.target
+        try:
+            sent = self._driven.arm.command(target)
+        except ActionError:
+            self.limits_hit += 1
+            raise
+        self.limits_hit += target is not None and sent is not None and max(se3.distance(target, sent)) > SHORTENED
+        self._driven.target = sent
+        return sent
 
     def stop(self) -> None:
         self._driven.target = None
@@ -121,8 +132,10 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
         behind = {name: RigArm(driven, still=dry_run) for name, driven in arms.items()}
 
         def diagnostics() -> Mapping[str, float]:
-            alignment = {f"alignment_{name}": arm.alignment for name, arm in behind.items()}
-            return {**bench.diagnostics(), **clock.diagnostics(), **alignment}
+            found = {**bench.diagnostics(), **clock.diagnostics()}
+            for name, arm in behind.items():
+                found |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
+            return found
 
         rig = Rig(
             name=facts.name,

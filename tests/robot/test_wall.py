@@ -17,11 +17,13 @@ import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import robot.wall
+from robot.align import NotAligned
 from robot.camera import StaleFrame
 from robot.deploy import EpisodeFailed, run_episode
 from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, LinkLost, ProtectiveStop, SafetyViolation
@@ -33,7 +35,7 @@ from robot.snapshot import FOLDER
 from robot.start import NotConfirmed, NoTouch
 from tacsim.config import ConfigError, load_rig
 from tacsim.hardware import CameraSensorFacts
-from tacsim.interface import Action, Needs, Observation, Pose
+from tacsim.interface import Action, ArmState, Needs, Observation, Pose
 from tacsim.rig import Rig
 from tacsim.rigfile import RigFacts
 
@@ -241,6 +243,28 @@ def test_a_start_aside_is_drawn_from_the_seed(shared: Opened) -> None:
     assert places[0] == pytest.approx(places[1], abs=20e-6)
     assert float(np.abs(places[0] - places[2]).max()) > 50e-6
     assert float(np.abs(places).max()) <= 2e-3 + 20e-6
+
+
+@pytest.mark.parametrize(("link_timeout", "lost"), [(2.0, False), (0.05, True)])
+def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_timeout: float, lost: bool) -> None:
+    now = time.monotonic()
+    zero = np.zeros(6)
+    states = [
+        ArmState(Pose(np.array([x, 0.0, 0.0])), zero, zero, zero, now - ago) for x, ago in ((0.0, 0.3), (3e-3, 0.0))
+    ]
+    stub = SimpleNamespace(
+        name="left",
+        facts=SimpleNamespace(link_timeout=link_timeout),
+        state=lambda: states[-1],
+        history=lambda number: states,
+    )
+    arm = RigArm(SimpleNamespace(arm=stub))  # type: ignore[arg-type]
+    if lost:
+        with pytest.raises(NotAligned, match="was the link lost"):
+            arm.state(now - 0.1)
+    else:
+        assert arm.state(now - 0.1).pose.position == pytest.approx([2e-3, 0, 0])
+        assert arm.alignment == pytest.approx(0.1)
 
 
 # -- what stops it ---------------------------------------------------------------------------------------------------

@@ -87,13 +87,15 @@ def to_normal(gradient: Float64) -> Float64:
     return normal
 
 
-def fit_inverse(sets: Sequence[tuple[Float64, Float64]]) -> Float64:
-    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; the ridge grows with the
-    number of pixels, which the first diagonal element counts."""
-    square = sum((s for s, _ in sets), np.zeros((TERMS, TERMS)))
-    right = sum((r for _, r in sets), np.zeros((TERMS, 2)))
-    solution: Float64 = np.linalg.solve(square + RIDGE * square[0, 0] * np.eye(TERMS), right)
-    return solution
+def fit_inverse(sets: Sequence[tuple[Float64, Float64]], *, place: bool) -> Float64:
+    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `place` those of
+    all terms in x and y are 0. The ridge grows with the number of pixels, which the first diagonal element counts."""
+    use = np.array([i for i, (_, axes) in enumerate(_terms()) if place or not axes])
+    square = sum((s[np.ix_(use, use)] for s, _ in sets), np.zeros((len(use), len(use))))
+    right = sum((r[use] for _, r in sets), np.zeros((len(use), 2)))
+    weights = np.zeros((TERMS, 2))
+    weights[use] = np.linalg.solve(square + RIDGE * square[0, 0] * np.eye(len(use)), right)
+    return weights
 
 
 def _colour_powers() -> list[tuple[int, ...]]:

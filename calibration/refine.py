@@ -94,7 +94,9 @@ class _Problem:
     def solved(self) -> _Problem:
         self._terms = [self._features(i, self.circles[i], self.skirt) for i in range(len(self.windows))]
         square = sum((t.T @ t for t in self._terms), np.zeros((self._terms[0].shape[1],) * 2))
-        right = sum((t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3)))
+        right = sum(
+            (t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3))
+        )
         self._square = square + RIDGE * np.trace(square) / len(square) * np.eye(len(square))
         self._weights = np.linalg.solve(self._square, right)
         self._residuals = [w.change - t @ self._weights for t, w in zip(self._terms, self.windows, strict=True)]
@@ -149,6 +151,4 @@ class _Problem:
 
     def _features(self, i: int, circle: ContactCircle, skirt: Skirt) -> Float64:
         window = self.windows[i]
-        return features(
-            dent_gradient(window.u, window.v, circle, skirt, self.ball), window.u, window.v, DEGREE, 0
-        )
+        return features(dent_gradient(window.u, window.v, circle, skirt, self.ball), window.u, window.v, DEGREE, 0)

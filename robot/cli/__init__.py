@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from robot.cli.bench import bench
+from robot.cli.calibrate import calibrate
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
 from robot.cli.look import doctor, schema
@@ -27,6 +28,7 @@ for command in (run, press, reproduce, replay, bench, debug, schema, doctor):
     # typer takes the first line of help from the docstring, and the example from the epilog
     text, _, example = (command.__doc__ or "").partition("Example:")
     app.command(help=text, epilog=f"Example: [bold]{example.strip()}[/]")(command)
+app.add_typer(calibrate, name="calibrate")
 
 
 def _print_version(wanted: bool) -> None:

@@ -33,6 +33,9 @@ TOO_LITTLE = 0.5  # share of its change of colour that a dent may leave unexplai
 SURELY = 0.05  # a press that leaves no more than this share unexplained is no outlier
 OUTLIER = 5.0  # a press whose unexplained share is so many times the median's is left out
 MOST_SATURATED = 0.4  # of the contact
+DOUBTED = 5  # presses that the ball's radius is tried on
+OTHER_BALLS = (0.75, 1.33)  # radii that are tried, in the one given
+BETTER = 0.8  # another radius must leave less than this share of what the given one leaves
 SECOND = 0.7  # a second patch as strong as this share of the first is a second contact
 
 
@@ -108,7 +111,7 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
         except (NoCircle, BadPresses) as error:
             refused.append((name, str(error)))
     presses, refined = _refined(found, refused, ball)
-    warnings = [*_doubts(presses, refined, ball), *(["only one press: it says little"] if len(presses) == 1 else [])]
+    warnings = [*_doubts(presses, ball), *(["only one press: it says little"] if len(presses) == 1 else [])]
     labels = [_gradient(press, refined.skirt, ball) for press in presses]
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
@@ -204,7 +207,7 @@ def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) ->
     raise BadPresses(f"no frame can be used. {why}")
 
 
-def _doubts(presses: Sequence[Press], refined: Refined, ball: float) -> list[str]:
+def _doubts(presses: Sequence[Press], ball: float) -> list[str]:
     """What a person should look at."""
     doubts = []
     steep = [press.name for press in presses if press.circle.radius > 0.97 * STEEPEST_RIM * ball]
@@ -212,15 +215,16 @@ def _doubts(presses: Sequence[Press], refined: Refined, ball: float) -> list[str
         doubts.append(
             f"contact as wide as the ball in {', '.join(steep)}: is the ball's radius (or the pixel pitch) right?"
         )
-    other = {
-        factor: refine([_window(p) for p in presses], [_scaled(p.circle, factor, ball) for p in presses], factor * ball)
-        for factor in (0.75, 1.33)
+    few = presses[:: -(-len(presses) // DOUBTED)]
+    unexplained = {
+        factor: refine([_window(p) for p in few], [_scaled(p.circle, factor, ball) for p in few], factor * ball).total
+        for factor in (1.0, *OTHER_BALLS)
     }
-    best = min(other, key=lambda factor: other[factor].total)
-    if other[best].total < 0.8 * refined.total:
+    best = min(unexplained, key=unexplained.__getitem__)
+    if unexplained[best] < BETTER * unexplained[1.0]:
         doubts.append(
-            f"a ball of {best:g} times the radius explains the pictures better ({1 - other[best].total:.1%} against "
-            f"{1 - refined.total:.1%}): check the ball's radius and the pixel pitch"
+            f"a ball of {best:g} times the radius leaves {unexplained[best]:.1%} of the change of colour unexplained, "
+            f"the one given {unexplained[1.0]:.1%}: check the ball's radius and the pixel pitch"
         )
     return doubts
 

@@ -61,7 +61,7 @@ def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: floa
         gradient, curvature = state.normal_equations()
         for _ in range(8):
             step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-12), -gradient)
-            trial = state.moved(step).solved()
+            trial = state.moved(np.asarray(step, dtype=np.float64)).solved()
             if trial.cost < state.cost:
                 break
             damping *= 4
@@ -98,7 +98,7 @@ class _Problem:
             (t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3))
         )
         self._square = square + RIDGE * np.trace(square) / len(square) * np.eye(len(square))
-        self._weights = np.linalg.solve(self._square, right)
+        self._weights = np.asarray(np.linalg.solve(self._square, right), dtype=np.float64)
         self._residuals = [w.change - t @ self._weights for t, w in zip(self._terms, self.windows, strict=True)]
         self.cost = sum(self.part_costs())
         return self

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.output import Out, busy, make, new_directory, notes, say_files, writing
+from robot.cli.output import Out, busy, make, new_directory, notes, quantity, say_files, writing
 
 if TYPE_CHECKING:
     from calibration.ballpress import Fit
@@ -26,8 +26,12 @@ def _group() -> None:
 )
 def sensor(
     frames: Annotated[Path, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more.")],
-    ball_radius: Annotated[str, typer.Option(help='Radius of the ball, for example "2.92 mm".')],
-    pixel_pitch: Annotated[str, typer.Option(help='Distance of two pixels on the gel, for example "0.0593 mm".')],
+    ball_radius: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help='Of the ball, for example "2.92 mm".')
+    ],
+    pixel_pitch: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Distance of two pixels on the gel.")
+    ],
     reference: Annotated[
         Path | None,
         typer.Option(help="The picture without contact.", show_default="background.png or the like in FRAMES"),
@@ -43,12 +47,7 @@ def sensor(
     Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, and prints how
     well each press is predicted by the others.
     """
-    from tacsim.quantity import parse
-
-    try:
-        ball, pitch = parse(ball_radius, "length"), parse(pixel_pitch, "length")
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
+    ball, pitch = ball_radius, pixel_pitch
     if not (ball > 0 and pitch > 0):
         raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
     folder = new_directory(out, "calibration")

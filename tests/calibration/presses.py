@@ -70,7 +70,8 @@ class HiddenSensor:
         places = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50), (160, 60), (90, 120)]
         depths = [0.5, 0.35, 0.65, 0.45, 0.55, 0.3, 0.6, 0.4]
         jitter = self._rng.uniform(-6, 6, (8, 2))
-        return [self.press(d * 1e-3, x + jx, y + jy) for d, (x, y), (jx, jy) in zip(depths, places, jitter)][:count]
+        spread = zip(depths, places, jitter, strict=True)
+        return [self.press(d * 1e-3, x + jx, y + jy) for d, (x, y), (jx, jy) in spread][:count]
 
     def _photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
         flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self._lighting)

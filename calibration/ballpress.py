@@ -17,6 +17,7 @@ from calibration.dent import STEEPEST_RIM, ContactCircle, Skirt, dent_gradient, 
 from calibration.inverse import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.photometry import FEW, Equations, Order, choose_order, equations, solve
 from calibration.reference import SATURATED, UnusableReference, make_reference
+from calibration.refine import BLUR as RIM_BLUR
 from calibration.refine import Refined, Window, refine
 from tacsim.optics.photometric import PhotometricLight, PhotometricModel, place_in_image
 
@@ -33,9 +34,6 @@ TOO_LITTLE = 0.5  # share of its change of colour that a dent may leave unexplai
 SURELY = 0.05  # a press that leaves no more than this share unexplained is no outlier
 OUTLIER = 5.0  # a press whose unexplained share is so many times the median's is left out
 MOST_SATURATED = 0.4  # of the contact
-DOUBTED = 5  # presses that the ball's radius is tried on
-OTHER_BALLS = (0.75, 1.33)  # radii that are tried, in the one given
-BETTER = 0.8  # another radius must leave less than this share of what the given one leaves
 SECOND = 0.7  # a second patch as strong as this share of the first is a second contact
 
 
@@ -208,29 +206,15 @@ def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) ->
 
 
 def _doubts(presses: Sequence[Press], ball: float) -> list[str]:
-    """What a person should look at."""
+    """What a person should look at. A wrong radius of the ball scales every slope, which another light explains just as
+    well; only a contact as wide as the ball gives it away."""
     doubts = []
     steep = [press.name for press in presses if press.circle.radius > 0.97 * STEEPEST_RIM * ball]
     if steep:
         doubts.append(
             f"contact as wide as the ball in {', '.join(steep)}: is the ball's radius (or the pixel pitch) right?"
         )
-    few = presses[:: -(-len(presses) // DOUBTED)]
-    unexplained = {
-        factor: refine([_window(p) for p in few], [_scaled(p.circle, factor, ball) for p in few], factor * ball).total
-        for factor in (1.0, *OTHER_BALLS)
-    }
-    best = min(unexplained, key=unexplained.__getitem__)
-    if unexplained[best] < BETTER * unexplained[1.0]:
-        doubts.append(
-            f"a ball of {best:g} times the radius leaves {unexplained[best]:.1%} of the change of colour unexplained, "
-            f"the one given {unexplained[1.0]:.1%}: check the ball's radius and the pixel pitch"
-        )
     return doubts
-
-
-def _scaled(circle: ContactCircle, factor: float, ball: float) -> ContactCircle:
-    return ContactCircle(circle.x, circle.y, min(circle.radius, 0.9 * factor * ball))
 
 
 def _window(press: Press) -> Window:
@@ -254,7 +238,7 @@ def _near(press: Press) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.
 def _gradient(press: Press, skirt: Skirt, ball: float) -> Float64:
     """(H, W, 2) the press's labels."""
     v, u = np.mgrid[: press.lit.shape[0], : press.lit.shape[1]].astype(np.float64)
-    return dent_gradient(u, v, press.circle, skirt, ball)
+    return dent_gradient(u, v, press.circle, skirt, ball, RIM_BLUR)
 
 
 def _forward_equations(press: Press, gradient: Float64) -> Equations:

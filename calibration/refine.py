@@ -20,6 +20,7 @@ Float64 = NDArray[np.float64]
 
 DEGREE = 3  # of the light during refinement, the same everywhere on the gel
 RIDGE = 1e-4
+BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
 STEPS = 25
 ENOUGH = 1e-4  # relative gain of a step that ends the refinement
 DELTA = 0.05  # step of the finite differences [px]; of the skirt relative to it
@@ -151,4 +152,6 @@ class _Problem:
 
     def _features(self, i: int, circle: ContactCircle, skirt: Skirt) -> Float64:
         window = self.windows[i]
-        return features(dent_gradient(window.u, window.v, circle, skirt, self.ball), window.u, window.v, DEGREE, 0)
+        return features(
+            dent_gradient(window.u, window.v, circle, skirt, self.ball, BLUR), window.u, window.v, DEGREE, 0
+        )

@@ -51,10 +51,11 @@ class SurfaceFinder:
     def __init__(
         self, slopes: GradientModel, valid: Mask, grid: CanonicalGrid, *, dots: bool, drifts: bool = False
     ) -> None:
-        self._slopes, self._grid, self._dots, self._drifts = slopes, grid, dots, drifts
+        self._slopes, self._grid, self._dots = slopes, grid, dots
         self._box = seen_box(valid)
         self._unseen = ~valid[self._box]
         pitch = grid.pitch / grid.image_scale
+        self._drift = _Drift(self._unseen.shape) if drifts else None
         self._integrate = Integrator(self._unseen.shape, pitch)
         self._shape = valid.shape
 
@@ -66,8 +67,8 @@ class SurfaceFinder:
         change, reference = change / clear, reference / clear
         if self._dots:
             hidden = hidden | _ink(reference + change)
-        if self._drifts:
-            change -= _drift(change, hidden)
+        if self._drift is not None:
+            change -= self._drift(change, hidden)
         gradient, beyond = self._slopes(change)
         if self._dots:
             gradient = _bridged(gradient, hidden)
@@ -129,25 +130,31 @@ def _ink(relative: Float32) -> Mask:
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8)), dtype=np.bool_)
 
 
-def _drift(change: Float32, hidden: Mask) -> Float32:
-    """(H, W, 3) how colour has changed where nothing touches: a quadratic in the place through the calm pixels, twice,
-    the second time through those near the first; their median where too few are calm to tell more."""
-    rows, columns = hidden.shape
-    u, v = np.meshgrid(np.linspace(-1, 1, columns, dtype=np.float32), np.linspace(-1, 1, rows, dtype=np.float32))
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    thin = np.s_[::DRIFT_THIN, ::DRIFT_THIN]
-    few, seen, open_ = terms[thin].reshape(-1, 6), change[thin].reshape(-1, 3), ~hidden[thin].ravel()
-    level = np.median(seen[open_], axis=0) if open_.any() else np.zeros(3, dtype=np.float32)
-    drift = np.zeros_like(seen) + level
-    weights = np.zeros((6, 3), dtype=np.float32)
-    weights[0] = level
-    for _ in range(2):
-        calm = open_ & (np.abs(seen - drift).max(axis=1) < CALM)
-        if calm.mean() < LEAST_CALM:
-            break
-        weights, *_ = np.linalg.lstsq(few[calm], seen[calm], rcond=None)
-        drift = few @ weights
-    return np.asarray(terms @ weights, dtype=np.float32)
+class _Drift:
+    """How colour has changed where nothing touches: a quadratic in the place through the calm pixels, twice, the second
+    time through those near the first; their median where too few are calm to tell more."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        u, v = np.meshgrid(*(np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape)))
+        self._terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+        self._few = np.ascontiguousarray(self._terms[::DRIFT_THIN, ::DRIFT_THIN].reshape(-1, 6))
+
+    def __call__(self, change: Float32, hidden: Mask) -> Float32:
+        """(H, W, 3) drift of relative changes (H, W, 3), of which those `hidden` (H, W) say nothing."""
+        seen = change[::DRIFT_THIN, ::DRIFT_THIN].reshape(-1, 3)
+        told = ~hidden[::DRIFT_THIN, ::DRIFT_THIN].ravel()
+        weights = np.zeros((6, 3), dtype=np.float32)
+        if told.any():
+            weights[0] = np.median(seen[told], axis=0)
+        for _ in range(2):
+            calm = told & (np.abs(seen - self._few @ weights).max(axis=1) < CALM)
+            if calm.mean() < LEAST_CALM:
+                break
+            terms = self._few[calm].astype(np.float64)
+            square = terms.T @ terms + 1e-6 * len(terms) * np.eye(6)
+            weights = np.linalg.solve(square, terms.T @ seen[calm]).astype(np.float32)
+        drift: Float32 = self._terms @ weights
+        return drift
 
 
 def _bridged(gradient: Float32, hidden: Mask) -> Float32:

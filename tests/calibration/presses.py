@@ -49,7 +49,7 @@ class HiddenSensor:
         self._noise = noise
 
     def empty(self) -> np.ndarray:
-        return self._photograph(np.zeros((ROWS, COLUMNS, 2)))
+        return self.photograph(np.zeros((ROWS, COLUMNS, 2)))
 
     def press(self, depth: float, x: float, y: float, drift: np.ndarray | float = 0.0, ball: float = BALL_PX) -> Made:
         """`depth` [m]; x, y: where [px]; `drift`: grey levels that are added; `ball`: its radius [px]."""
@@ -63,7 +63,7 @@ class HiddenSensor:
         height = np.where(r < a, depth / 2 + cap * PITCH, outside)  # Hertz is half as deep at the contact circle
         step = dent_slope(r, a, ball)
         gradient = -np.stack([u - x, v - y], axis=-1) * (step / np.maximum(r, 1e-9))[..., None]
-        return Made(self._photograph(gradient, drift), gradient, height, (x, y, float(a)))
+        return Made(self.photograph(gradient, drift), gradient, height, (x, y, float(a)))
 
     def presses(self, count: int) -> list[Made]:
         """Presses of various depths all over the gel."""
@@ -73,7 +73,7 @@ class HiddenSensor:
         spread = zip(depths, places, jitter, strict=True)
         return [self.press(d * 1e-3, x + jx, y + jy) for d, (x, y), (jx, jy) in spread][:count]
 
-    def _photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
+    def photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
         flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self._lighting)
         change = 255 * (shade(gradient.astype(np.float32), self._lighting) - flat)
         noise = self._rng.normal(0, self._noise, (ROWS, COLUMNS, 3))

@@ -78,4 +78,5 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
         app, ["calibrate", "sensor", str(tmp_path / "none"), *lengths, "--out", str(out) + "2"]
     )
     assert nothing.exit_code == 2
-    assert "no folder" in nothing.output
+    assert "folder" in nothing.output
+    assert "Traceback" not in nothing.output

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from calibration.circle import NoCircle, contact_circle
 from calibration.dent import STEEPEST_RIM, ContactCircle, Skirt, dent_gradient, rim_slope
 from calibration.inverse import InverseModel, fit_inverse, inverse_features, to_normal
-from calibration.photometry import Equations, Order, choose_order, equations, solve
-from calibration.refine import Refined, Window, refine
+from calibration.photometry import FEW, Equations, Order, choose_order, equations, solve
 from calibration.reference import SATURATED, UnusableReference, make_reference
+from calibration.refine import BLUR as RIM_BLUR
+from calibration.refine import Refined, Window, refine
 from tacsim.optics.photometric import PhotometricLight, PhotometricModel, place_in_image
 
 Float64 = NDArray[np.float64]
@@ -27,12 +28,13 @@ BLUR = 0.8  # of the camera, and of what is fitted [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 NEAR = 2.3  # a press is looked at up to this many contact radii
 FAR = 3.0  # beyond this many, the gel is untouched
-PIXELS = 6000  # of a press that the refinement looks at, about
+PIXELS = 2500  # of a press that the refinement looks at, about
 LEAST_UNTOUCHED = 0.15  # share of the picture that must be untouched for a drift to be told
-TOO_LITTLE = 0.5  # share of the change of colour that a dent must explain, or the press is left out
+TOO_LITTLE = 0.5  # share of its change of colour that a dent may leave unexplained, or the press is left out
+SURELY = 0.05  # a press that leaves no more than this share unexplained is no outlier
 OUTLIER = 5.0  # a press whose unexplained share is so many times the median's is left out
 MOST_SATURATED = 0.4  # of the contact
-SECOND = 0.5  # a second patch as strong as this share of the first is a second contact
+SECOND = 0.7  # a second patch as strong as this share of the first is a second contact
 
 
 class BadPresses(ValueError):
@@ -50,7 +52,7 @@ class Press:
     lit: NDArray[np.bool_]  # (H, W) not saturated
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Score:
     """How well one press is predicted by a calibration that has not seen it."""
 
@@ -59,6 +61,8 @@ class Score:
     error: float  # mean |error| in contact and near it (r < 1.5 a) [grey levels]
     nothing: float  # the same, if no change were predicted: the background alone
     correlation: float  # of predicted and real change there
+    predicted: NDArray[np.float32]  # (H, W, 3) change of colour [grey levels]
+    real: NDArray[np.float32]  # (H, W, 3) the same, as seen, without drift
     angle: float  # mean error of the normal by the inverse model in contact [degrees]
     untouched_angle: float  # the same, far from contact
 
@@ -105,7 +109,7 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
         except (NoCircle, BadPresses) as error:
             refused.append((name, str(error)))
     presses, refined = _refined(found, refused, ball)
-    warnings = [*_doubts(presses, refined, ball), *(["only one press: it says little"] if len(presses) == 1 else [])]
+    warnings = [*_doubts(presses, ball), *(["only one press: it says little"] if len(presses) == 1 else [])]
     labels = [_gradient(press, refined.skirt, ball) for press in presses]
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
@@ -130,7 +134,9 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
 
 
 def _check_frames(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
-    other = [f"{name} ({image.shape[1]} x {image.shape[0]})" for name, image in frames if image.shape != reference.shape]
+    other = [
+        f"{name} ({image.shape[1]} x {image.shape[0]})" for name, image in frames if image.shape != reference.shape
+    ]
     if other:
         raise BadPresses(
             f"frames of another size than the one without contact ({reference.shape[1]} x {reference.shape[0]} px): "
@@ -171,8 +177,7 @@ def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:
     if untouched.mean() < LEAST_UNTOUCHED:
         level = np.median(difference[untouched], axis=0) if untouched.any() else np.zeros(3)
         return np.broadcast_to(level, difference.shape).copy()
-    v, u = place_in_image(difference.shape[1], difference.shape[0])[::-1]
-    u, v = np.meshgrid(u, v)[0], np.meshgrid(u, v)[1]
+    u, v = np.meshgrid(*place_in_image(difference.shape[1], difference.shape[0]))
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     weights, *_ = np.linalg.lstsq(terms[untouched], difference[untouched], rcond=None)
     quadratic: Float64 = terms @ weights
@@ -183,10 +188,8 @@ def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) ->
     """Refines all circles, leaves outliers out, and refines again. Raises BadPresses when nothing is left."""
     while found:
         refined = refine([_window(press) for press in found], [press.circle for press in found], ball)
-        limit = max(OUTLIER * float(np.median(refined.unexplained)), 1.0 - TOO_LITTLE) if len(found) > 2 else TOO_LITTLE
-        limit = min(limit, TOO_LITTLE)
-        if len(found) > 2:
-            limit = min(limit, max(OUTLIER * float(np.median(refined.unexplained)), 0.05))
+        usual = float(np.median(refined.unexplained))
+        limit = min(TOO_LITTLE, max(OUTLIER * usual, SURELY)) if len(found) > 2 else TOO_LITTLE
         worst = int(np.argmax(refined.unexplained))
         if refined.unexplained[worst] <= limit:
             moved = [
@@ -202,27 +205,16 @@ def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) ->
     raise BadPresses(f"no frame can be used. {why}")
 
 
-def _doubts(presses: Sequence[Press], refined: Refined, ball: float) -> list[str]:
-    """What a person should look at."""
+def _doubts(presses: Sequence[Press], ball: float) -> list[str]:
+    """What a person should look at. A wrong radius of the ball scales every slope, which another light explains just as
+    well; only a contact as wide as the ball gives it away."""
     doubts = []
     steep = [press.name for press in presses if press.circle.radius > 0.97 * STEEPEST_RIM * ball]
     if steep:
-        doubts.append(f"contact as wide as the ball in {', '.join(steep)}: is the ball's radius (or the pixel pitch) right?")
-    other = {
-        factor: refine([_window(p) for p in presses], [_scaled(p.circle, factor, ball) for p in presses], factor * ball)
-        for factor in (0.75, 1.33)
-    }
-    best = min(other, key=lambda factor: other[factor].total)
-    if other[best].total < 0.8 * refined.total:
         doubts.append(
-            f"a ball of {best:g} times the radius explains the pictures better ({1 - other[best].total:.1%} against "
-            f"{1 - refined.total:.1%}): check the ball's radius and the pixel pitch"
+            f"contact as wide as the ball in {', '.join(steep)}: is the ball's radius (or the pixel pitch) right?"
         )
     return doubts
-
-
-def _scaled(circle: ContactCircle, factor: float, ball: float) -> ContactCircle:
-    return ContactCircle(circle.x, circle.y, min(circle.radius, 0.9 * factor * ball))
 
 
 def _window(press: Press) -> Window:
@@ -246,7 +238,7 @@ def _near(press: Press) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.
 def _gradient(press: Press, skirt: Skirt, ball: float) -> Float64:
     """(H, W, 2) the press's labels."""
     v, u = np.mgrid[: press.lit.shape[0], : press.lit.shape[1]].astype(np.float64)
-    return dent_gradient(u, v, press.circle, skirt, ball)
+    return dent_gradient(u, v, press.circle, skirt, ball, RIM_BLUR)
 
 
 def _forward_equations(press: Press, gradient: Float64) -> Equations:
@@ -273,13 +265,11 @@ def _inverse_equations(press: Press, gradient: Float64) -> tuple[Float64, Float6
 
 def _forward_model(sets: Sequence[Equations], order: Order, steepest: float) -> PhotometricModel:
     weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(sets, order))
-    return PhotometricModel(
-        degree=order.degree, position=order.position, weights=weights, steepest=steepest, blur=BLUR
-    )
+    return PhotometricModel(degree=order.degree, position=order.position, weights=weights, steepest=steepest, blur=BLUR)
 
 
 def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> InverseModel:
-    weights = tuple((float(x), float(y)) for x, y in fit_inverse(sets))
+    weights = tuple((float(x), float(y)) for x, y in fit_inverse(sets, place=len(sets) > FEW))
     return InverseModel(weights=weights, steepest=steepest)
 
 
@@ -304,7 +294,7 @@ def _score(
     predicted = _smooth(light.astype(np.float64), BLUR) * mean
     real = press.change * mean
     contact = away < 1.5
-    weights = fit_inverse([inverse[k] for k in others])
+    weights = fit_inverse([inverse[k] for k in others], place=len(others) > FEW)
     at_u, at_v = place_in_image(shape[1], shape[0])
     terms = inverse_features(
         _smooth(press.change, INVERSE_BLUR).reshape(-1, 3), 2 * at_u[u.ravel()], 2 * at_v[v.ravel()]
@@ -316,6 +306,8 @@ def _score(
         error=float(np.abs(predicted - real)[contact].mean()),
         nothing=float(np.abs(real)[contact].mean()),
         correlation=float(np.corrcoef(predicted[contact].ravel(), real[contact].ravel())[0, 1]),
+        predicted=predicted.astype(np.float32),
+        real=real.astype(np.float32),
         angle=float(angle[away < 1].mean()),
         untouched_angle=float(angle[away > FAR].mean()) if (away > FAR).any() else 0.0,
     )

@@ -38,11 +38,17 @@ class ContactCircle:
     radius: float
 
 
-def dent_gradient(u: Float64, v: Float64, circle: ContactCircle, skirt: Skirt, ball: float) -> Float64:
+def dent_gradient(
+    u: Float64, v: Float64, circle: ContactCircle, skirt: Skirt, ball: float, blur: float = 0.0
+) -> Float64:
     """(..., 2) slopes of the height (into the gel) at pixels u, v (...,); `ball`: its radius [px].
+
+    `blur` [px]: standard deviation of the blur through which the step at the contact circle is seen.
 
     Raises ValueError for a circle as large as the ball.
     """
+    from scipy.special import ndtr
+
     a = circle.radius
     if not 0 < a < ball:
         raise ValueError(f"a contact circle of {a:.1f} px is none of a ball of {ball:.1f} px")
@@ -51,7 +57,8 @@ def dent_gradient(u: Float64, v: Float64, circle: ContactCircle, skirt: Skirt, b
     rim = skirt.fraction * a / np.sqrt(ball**2 - a**2)
     inside = 1.0 / np.sqrt(np.maximum(ball**2 - r**2, ball**2 - a**2))  # slope over r
     outside = rim * np.exp(-np.maximum(r - a, 0.0) / skirt.length) / np.maximum(r, 1e-9)
-    steepness = np.where(r < a, inside, outside)
+    share = (r < a).astype(np.float64) if blur == 0 else ndtr((a - r) / blur)  # of the inside
+    steepness = share * inside + (1.0 - share) * outside
     return np.stack([-steepness * dx, -steepness * dy], axis=-1)
 
 

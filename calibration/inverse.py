@@ -52,7 +52,7 @@ class PolynomialSlopes:
         """Slopes (H, W, 2) of relative changes (H, W, 3); where they are steeper than calibrated they are clipped."""
         colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
         products: dict[tuple[int, ...], Float32] = {}
-        normal = self._maps[()].copy()
+        normal = self._maps[()].copy()  # zeros, unless somebody's weights say otherwise
         product = np.empty_like(normal)
         for powers in self._powers[1:]:
             last = colours[powers[-1]]
@@ -87,13 +87,16 @@ def to_normal(gradient: Float64) -> Float64:
     return normal
 
 
-def fit_inverse(sets: Sequence[tuple[Float64, Float64]]) -> Float64:
-    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; the ridge grows with the
-    number of pixels, which the first diagonal element counts."""
-    square = sum((s for s, _ in sets), np.zeros((TERMS, TERMS)))
-    right = sum((r for _, r in sets), np.zeros((TERMS, 2)))
-    solution: Float64 = np.linalg.solve(square + RIDGE * square[0, 0] * np.eye(TERMS), right)
-    return solution
+def fit_inverse(sets: Sequence[tuple[Float64, Float64]], *, place: bool) -> Float64:
+    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `place` those of
+    all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The ridge grows
+    with the number of pixels, which the first diagonal element counts."""
+    use = np.array([i for i, (colour, axes) in enumerate(_terms()) if colour and (place or not axes)])
+    square = sum((s[np.ix_(use, use)] for s, _ in sets), np.zeros((len(use), len(use))))
+    right = sum((r[use] for _, r in sets), np.zeros((len(use), 2)))
+    weights = np.zeros((TERMS, 2))
+    weights[use] = np.linalg.solve(square + RIDGE * square[0, 0] * np.eye(len(use)), right)
+    return weights
 
 
 def _colour_powers() -> list[tuple[int, ...]]:

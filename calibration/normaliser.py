@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.bundle import Calibration, read_bundle
 from calibration.gradient import from_model
+from calibration.inverse import PolynomialSlopes
 from calibration.lens import Rectification, from_corners, from_geometry
 from calibration.reference import Reference, make_reference
-from calibration.surface import SurfaceFinder, view, window
+from calibration.surface import SurfaceFinder, seen_box, view, window
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
@@ -135,19 +138,37 @@ def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: Canoni
     return FrameNormaliser(rectify, grid, find)
 
 
-def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
-    """The normaliser of recorded frames of `image_shape` (rows, columns), through the four corners of the gel.
+def for_calibrated(calibration: Calibration, grid: CanonicalGrid) -> FrameNormaliser:
+    """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle."""
+    geometry = calibration.geometry
+    wide = view(grid, calibration.gel_size)
+    rectify = from_geometry(geometry, calibration.gel_size, wide)
+    pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
+    x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
+    slopes = PolynomialSlopes(calibration.inverse, x, y)
+    find = SurfaceFinder(slopes, rectify.valid, grid, dots=calibration.markers is not None, drifts=True)
+    return FrameNormaliser(rectify, grid, find)
 
-    Raises calibration.lens.BadCorners.
+
+def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
+    """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, or through the
+    four corners of the gel.
+
+    Raises calibration.lens.BadCorners, calibration.bundle.BadBundle.
     """
+    if facts.calibration is not None:
+        return for_calibrated(read_bundle(Path(facts.calibration))[0], grid)
     return FrameNormaliser(from_corners(facts.corners, facts.size, image_shape, canonical_image(grid)), grid)
 
 
 def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
-    """The normaliser of a sensor that a camera sees: by its model, or through the four corners of the gel.
+    """The normaliser of a sensor that a camera sees: by its calibration, by its model, or through the four corners of
+    the gel. Only the last finds no height. `gel_size`: x, y of a model's gel [m].
 
-    Raises ValueError for a model without inverse, calibration.lens.BadCorners.
+    Raises calibration.bundle.BadBundle, ValueError for a model without inverse, calibration.lens.BadCorners.
     """
+    if facts.calibration is not None:
+        return for_calibrated(read_bundle(Path(facts.calibration))[0], grid)
     if facts.model is not None:
         return for_pictures(facts.model, gel_size, grid)
     shape = (facts.height, facts.width)

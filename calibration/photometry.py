@@ -71,8 +71,7 @@ def solve(presses: Sequence[Equations], order: Order) -> Float64:
 def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
     """Solution of the normal equations with `ridge` times the mean diagonal added to the diagonal."""
     shift = ridge * float(np.trace(square)) / len(square)
-    solution: Float64 = np.linalg.solve(square + max(shift, 1e-300) * np.eye(len(square)), right)
-    return solution
+    return np.asarray(np.linalg.solve(square + max(shift, 1e-300) * np.eye(len(square)), right), dtype=np.float64)
 
 
 def left_out_error(presses: Sequence[Equations], order: Order) -> float:

@@ -20,6 +20,7 @@ Float64 = NDArray[np.float64]
 
 DEGREE = 3  # of the light during refinement, the same everywhere on the gel
 RIDGE = 1e-4
+BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
 STEPS = 25
 ENOUGH = 1e-4  # relative gain of a step that ends the refinement
 DELTA = 0.05  # step of the finite differences [px]; of the skirt relative to it
@@ -61,7 +62,7 @@ def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: floa
         gradient, curvature = state.normal_equations()
         for _ in range(8):
             step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-12), -gradient)
-            trial = state.moved(step).solved()
+            trial = state.moved(np.asarray(step, dtype=np.float64)).solved()
             if trial.cost < state.cost:
                 break
             damping *= 4
@@ -94,9 +95,11 @@ class _Problem:
     def solved(self) -> _Problem:
         self._terms = [self._features(i, self.circles[i], self.skirt) for i in range(len(self.windows))]
         square = sum((t.T @ t for t in self._terms), np.zeros((self._terms[0].shape[1],) * 2))
-        right = sum((t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3)))
+        right = sum(
+            (t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3))
+        )
         self._square = square + RIDGE * np.trace(square) / len(square) * np.eye(len(square))
-        self._weights = np.linalg.solve(self._square, right)
+        self._weights = np.asarray(np.linalg.solve(self._square, right), dtype=np.float64)
         self._residuals = [w.change - t @ self._weights for t, w in zip(self._terms, self.windows, strict=True)]
         self.cost = sum(self.part_costs())
         return self
@@ -150,5 +153,5 @@ class _Problem:
     def _features(self, i: int, circle: ContactCircle, skirt: Skirt) -> Float64:
         window = self.windows[i]
         return features(
-            dent_gradient(window.u, window.v, circle, skirt, self.ball), window.u, window.v, DEGREE, 0
+            dent_gradient(window.u, window.v, circle, skirt, self.ball, BLUR), window.u, window.v, DEGREE, 0
         )

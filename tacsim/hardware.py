@@ -136,10 +136,12 @@ class CameraSensorFacts(Facts):
     # http://... (MJPEG), a device by its serial path (/dev/v4l/by-id/...), a video file, or a folder of images.
     source: Annotated[str, Field(min_length=1, max_length=4096)]
     arm: Name | None = None
-    # What the picture shows, one of two: `model` (its geometry; of a mock also what is rendered), or gel `corners`.
+    # What the picture shows, one of three: `model` (its geometry; of a mock also what is rendered), gel `corners`, or
+    # `calibration` (path of a bundle that `tacsim calibrate sensor` wrote; only it gives a real sensor's height).
     model: SensorModel | None = None
     corners: tuple[Corner, Corner, Corner, Corner] | None = None  # top left, top right, bottom right, bottom left [px]
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
+    calibration: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
     width: Annotated[int, Field(ge=16, le=8192)] = 640  # of the frames that are expected; others are refused [px]
     height: Annotated[int, Field(ge=16, le=8192)] = 480
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # asked of the camera; of a folder: how fast it is played
@@ -152,8 +154,8 @@ class CameraSensorFacts(Facts):
 
     @model_validator(mode="after")
     def _one_geometry(self) -> Self:
-        if self.model is not None and self.corners is not None:
-            raise ValueError("give model or corners, not both: each says where the gel lies in the picture")
+        if sum(each is not None for each in (self.model, self.corners, self.calibration)) > 1:
+            raise ValueError("give one of model, corners, calibration: each says where the gel lies in the picture")
         if self.mock is not None and self.model is None:
             raise ValueError("a mock camera needs a model: it says what is rendered")
         return self

@@ -47,6 +47,7 @@ class ReplaySensorFacts(Facts):
     corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
     reference: str | None = None  # picture without contact; None: the first frame
+    calibration: str | None = None  # bundle of `tacsim calibrate sensor`, instead of corners: height is found by it
 
 
 ArmFacts = Annotated[SimArmFacts | UrArmFacts | ReplayArmFacts, Field(discriminator="driver")]

@@ -1,7 +1,8 @@
 """Real group: contact radius of balls on a real sensor against the simulated gel; the user brings the frames.
 
 Two comparisons a press. `image`: the real frame against our rendered one, the circle found in both by the same fit
-(`calibration/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius that the labels give.
+(`calibration/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius that the labels
+give.
 """
 
 from __future__ import annotations

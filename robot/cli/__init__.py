@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from robot.cli.bench import bench
+from robot.cli.calibrate import calibrate
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
 from robot.cli.latency import latency
@@ -24,9 +25,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Example: [bold]tacsim run --task squeeze --out runs/first[/]   "
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
-)
-calibrate = typer.Typer(
-    help="Measure what a rig file must say of the hardware.", no_args_is_help=True, rich_markup_mode="rich"
 )
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {

@@ -133,7 +133,8 @@ def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
 def untouched_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
     """(H, W, 3) what the picture shows of the flat gel."""
     flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
-    return np.clip(unlit_image(lighting, shape) + flat, 0.0, 1.0)
+    untouched: Float32 = np.clip(unlit_image(lighting, shape) + flat, 0.0, 1.0)
+    return untouched
 
 
 def read_background(path: str, shape: tuple[int, int]) -> Float32:

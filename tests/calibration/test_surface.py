@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.gradient import from_model
 from calibration.normaliser import FrameNormaliser, for_camera, for_pictures, for_simulated
-from calibration.surface import view
+from calibration.surface import SurfaceFinder, view
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.optics.geometry import CanonicalGrid, Markers, SensorGeometry, SensorModel
@@ -161,6 +162,24 @@ def test_colours_that_no_slope_has_are_counted() -> None:
     seen = normalise(frame(spoiled), now=0.0)
     assert normalise.beyond == pytest.approx(40 * 60 / (240 * 320), rel=0.1)
     assert np.isfinite(seen.height).all()
+
+
+def test_a_lamp_that_drifts_is_no_dent() -> None:
+    """A sensor that was calibrated has a real lamp: a change that is smooth over all the gel is taken for its drift."""
+    wide = for_pictures(MODEL, GEL, GRID)
+    valid = wide._rectify.valid
+    slopes = from_model(MODEL)
+    found = []
+    for drifts in (False, True):
+        normalise = FrameNormaliser(wide._rectify, GRID, SurfaceFinder(slopes, valid, GRID, dots=False, drifts=drifts))
+        normalise.take_reference(frame(Renderer(MODEL, GEL)(flat())))
+        image = Renderer(MODEL, GEL)(ball(0.4e-3)).astype(float)
+        ramp = np.linspace(-6, 6, 320)[None, :, None] + np.array([4.0, -2.0, 0.0])
+        found.append(normalise(frame(np.rint(np.clip(image + ramp, 0, 255)).astype(np.uint8)), now=0.0).height)
+    _, true = both(ball(0.4e-3))
+    spoiled, mended = (float(np.abs(height - true.height).max()) for height in found)
+    assert spoiled > 60e-6
+    assert mended < 35e-6  # the gel's own gentle slopes far from the contact pass for drift
 
 
 def test_the_view_is_the_canonical_image_made_wider() -> None:

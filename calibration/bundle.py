@@ -1,0 +1,153 @@
+"""The calibration of one sensor as a folder: `calibration.yaml`, and the picture without contact beside it.
+
+A bundle belongs to one serial number. Reading checks version, checksums and sizes, so a damaged, older or foreign one
+is refused with a word on what to do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field
+
+from calibration.inverse import InverseModel
+from tacsim.config import ConfigError, load
+from tacsim.hardware import Placement
+from tacsim.optics.geometry import Lighting, Markers, SensorGeometry, SensorModel
+from tacsim.optics.photometric import PhotometricModel
+from tacsim.quantity import Facts, Length, Time
+from tacsim.record.episode import EpisodeError
+from tacsim.record.images import decode_image, encode_png
+
+FORMAT = 1
+FILE, REFERENCE = "calibration.yaml", "reference.png"
+LARGEST_FILE = 1 << 20  # [bytes] of the YAML
+
+Positive = Annotated[Length, Field(gt=0)]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class BadBundle(ValueError):
+    """A calibration that cannot be used: which, why, and what to do."""
+
+
+class Residual(Facts):
+    """How well one press is predicted by a calibration made without it."""
+
+    frame: str
+    circle: tuple[float, float, float]  # x, y, radius of the contact [px]
+    error: float  # mean |error| in and near contact [grey levels]
+    nothing: float  # the same for a picture without contact [grey levels]
+    correlation: float
+    angle: float  # of the normal in contact [degrees]
+
+
+class Provenance(Facts):
+    """Where a calibration comes from."""
+
+    made: str  # date and time, ISO 8601
+    software: str
+    ball_radius: Positive
+    frames: tuple[str, ...]
+    left_out: dict[str, str] = {}  # frames that took no part, and why
+    warnings: tuple[str, ...] = ()
+
+
+class Calibration(Facts):
+    """Everything that is known of one sensor."""
+
+    format: Literal[1]
+    serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    geometry: SensorGeometry
+    gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
+    forward: PhotometricModel  # slope -> colour
+    inverse: InverseModel  # colour -> slope
+    skirt_length: Positive  # of the dent that a ball presses [m]
+    skirt_fraction: Annotated[float, Field(gt=0)]
+    markers: Markers | None = None  # None: no dots are printed on the gel
+    tool_from_sensor: Placement | None = None  # None: not measured
+    latency: Annotated[Time, Field(ge=0)] | None = None  # from exposure to arrival; None: not measured [s]
+    residuals: tuple[Residual, ...] = ()
+    provenance: Provenance
+    reference: Digest  # SHA-256 of the picture's bytes
+    checksum: Digest = "0" * 64  # SHA-256 of all the rest
+
+    def digest(self) -> str:
+        """What `checksum` must be."""
+        content = self.model_dump(mode="json", exclude={"checksum"})
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.uint8]) -> Path:
+    """Writes the bundle into `folder`, which exists, and returns the path of its YAML file; the two checksums are set
+    here. `reference`: (H, W, 3) RGB without contact. Raises OSError."""
+    png = encode_png(reference)
+    stamped = calibration.model_copy(update={"reference": hashlib.sha256(png).hexdigest()})
+    stamped = stamped.model_copy(update={"checksum": stamped.digest()})
+    (folder / REFERENCE).write_bytes(png)
+    path = folder / FILE
+    text = yaml.safe_dump(stamped.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDArray[np.uint8]]:
+    """The calibration at `path` (its folder or YAML file) and its picture without contact; `serial` is the sensor that
+    it must belong to. Raises BadBundle."""
+    file = path / FILE if path.is_dir() else path
+    again = "make it again with `tacsim calibrate sensor`"
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise BadBundle(f"{file}: {file.stat().st_size} bytes is too much for a calibration; {again}")
+        text = file.read_text(encoding="utf-8")
+        png = file.with_name(REFERENCE).read_bytes()
+    except FileNotFoundError as missing:
+        raise BadBundle(
+            f"{missing.filename} is not there: a calibration is a folder with {FILE} and {REFERENCE}"
+        ) from None
+    except (OSError, UnicodeDecodeError) as failure:
+        raise BadBundle(f"{file}: cannot be read: {failure}") from failure
+    version = re.search(r"^format:\s*(\S+)", text, re.MULTILINE)
+    if version is None:
+        raise BadBundle(f"{file} is no calibration: it names no format")
+    if version[1] != str(FORMAT):
+        raise BadBundle(f"{file} has format {version[1]}, this version of tacsim reads {FORMAT}; {again}")
+    try:
+        calibration = load(Calibration, file)
+    except ConfigError as error:
+        raise BadBundle(f"{file} is damaged; {again}.\n{error}") from None
+    if calibration.checksum != calibration.digest():
+        raise BadBundle(f"{file} was changed since it was written (its checksum differs); {again}")
+    if hashlib.sha256(png).hexdigest() != calibration.reference:
+        raise BadBundle(f"{file.with_name(REFERENCE)} is not the picture of this calibration (its checksum differs)")
+    if serial is not None and serial != calibration.serial:
+        raise BadBundle(f"{file} belongs to sensor '{calibration.serial}', not to '{serial}'")
+    try:
+        picture = decode_image(png, str(file.with_name(REFERENCE)), ("PNG",))
+    except EpisodeError as error:
+        raise BadBundle(str(error)) from None
+    wanted = (calibration.geometry.height, calibration.geometry.width, 3)
+    if picture.shape != wanted:
+        raise BadBundle(f"{file.with_name(REFERENCE)} is {picture.shape}, the calibration is of {wanted}")
+    return calibration, picture
+
+
+def sensor_model(path: Path) -> SensorModel:
+    """The simulated twin of a calibrated sensor: its geometry, its untouched picture, its light. Raises BadBundle."""
+    calibration, _ = read_bundle(path)
+    folder = path if path.is_dir() else path.parent
+    return SensorModel(
+        name=calibration.serial,
+        geometry=calibration.geometry,
+        lighting=Lighting(background=str(folder / REFERENCE)),
+        photometric=calibration.forward,
+        texture=0.0,  # the picture has the gel's own
+        source=f"calibration of {calibration.serial}, {calibration.provenance.made}",
+    )

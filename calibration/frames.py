@@ -1,0 +1,71 @@
+"""A folder of frames of presses: which is the one without contact, and what is no picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.ballpress import BadPresses
+from tacsim.record.episode import EpisodeError
+from tacsim.record.images import read_image
+
+Image = NDArray[np.uint8]
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+UNTOUCHED = (
+    "background",
+    "reference",
+    "ref",
+    "empty",
+    "no_contact",
+    "bg",
+    "frame0",
+)  # names of a frame without contact
+MOST = 200  # frames that are read
+MEDIAN_OF = 5  # frames whose median shows the gel without contact, if they are pressed in different places
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """What a folder holds."""
+
+    reference: Image  # (H, W, 3) RGB
+    presses: tuple[tuple[str, Image], ...]  # names and pictures
+    estimated: bool  # True: no frame without contact was given, the median of the presses stands for it
+
+
+def read_presses(folder: Path, reference: Path | None = None) -> Frames:
+    """Reads all pictures of a folder. `reference`: the one without contact; None: the one with a name of UNTOUCHED, or
+    the median of all. Raises BadPresses, naming every file that is no picture."""
+    if not folder.is_dir():
+        raise BadPresses(f"{folder} is no folder; name the folder that holds the frames")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    if reference is None:
+        reference = next((p for name in UNTOUCHED for p in paths if p.stem.lower() == name), None)
+    pressed = [path for path in paths if reference is None or path.resolve() != reference.resolve()]
+    if not pressed:
+        raise BadPresses(f"{folder} holds no frame of a press ({', '.join(PICTURES)})")
+    if len(pressed) > MOST:
+        raise BadPresses(f"{folder} holds {len(pressed)} pictures; 5 to 8 presses are enough, {MOST} the most")
+    images: dict[Path, Image] = {}
+    unreadable = []
+    for path in pressed if reference is None else [reference, *pressed]:
+        try:
+            images[path] = read_image(path)
+        except EpisodeError as error:
+            unreadable.append(str(error))
+    if unreadable:
+        raise BadPresses("\n".join(unreadable))
+    if reference is not None:
+        return Frames(images[reference], tuple((path.name, images[path]) for path in pressed), estimated=False)
+    shapes = {image.shape for image in images.values()}
+    if len(pressed) < MEDIAN_OF or len(shapes) > 1:
+        raise BadPresses(
+            f"{folder} holds no frame without contact; name it with --reference, or call it {UNTOUCHED[0]}.png. "
+            f"Without, {MEDIAN_OF} presses of one size in different places are needed, whose median stands for it"
+        )
+    median = np.median(np.stack(list(images.values())), axis=0).astype(np.uint8)
+    return Frames(median, tuple((path.name, images[path]) for path in pressed), estimated=True)

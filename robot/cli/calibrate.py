@@ -1,0 +1,142 @@
+"""`tacsim calibrate`: from frames to the calibration of a sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from robot.cli.output import Out, busy, make, new_directory, notes, quantity, say_files, writing
+
+if TYPE_CHECKING:
+    from calibration.ballpress import Fit
+    from calibration.bundle import Calibration
+
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
+
+
+@calibrate.callback()
+def _group() -> None:
+    """Calibrate what stands behind a rig."""
+
+
+@calibrate.command(
+    epilog='Example: [bold]tacsim calibrate sensor frames --ball-radius "2.92 mm" --pixel-pitch "0.0593 mm"[/]'
+)
+def sensor(
+    frames: Annotated[Path, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more.")],
+    ball_radius: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help='Of the ball, for example "2.92 mm".')
+    ],
+    pixel_pitch: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Distance of two pixels on the gel.")
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="The picture without contact.", show_default="background.png or the like in FRAMES"),
+    ] = None,
+    serial: Annotated[
+        str, typer.Option(help="Serial number of the sensor that the calibration belongs to.")
+    ] = "unknown",
+    markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False,
+    out: Out = None,
+) -> None:
+    """Calibrate a sensor's light from presses of a ball: colour of every slope, and slope of every colour.
+
+    Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, and prints how
+    well each press is predicted by the others.
+    """
+    ball, pitch = ball_radius, pixel_pitch
+    if not (ball > 0 and pitch > 0):
+        raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
+    folder = new_directory(out, "calibration")
+    with busy("loading"):
+        from calibration.ballpress import BadPresses, calibrate_light
+        from calibration.bundle import write_bundle
+        from calibration.frames import read_presses
+        from calibration.residual_picture import draw
+    try:
+        read = read_presses(frames, reference)
+        if read.estimated:
+            notes.print("no picture without contact: the median of all presses stands for it")
+        with busy(f"calibrating from {len(read.presses)} presses"):
+            fit = calibrate_light(read.reference, read.presses, ball / pitch)
+    except BadPresses as error:
+        raise typer.BadParameter(str(error), param_hint="FRAMES") from None
+    _show(fit, pitch)
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], markers=markers)
+    with writing(make(folder)):
+        written = [write_bundle(folder, bundle, fit.reference)]
+        if fit.scores:
+            written.append(folder / "residuals.png")
+            draw(fit, written[-1])
+    say_files(*written)
+
+
+def _bundle(fit: Fit, serial: str, ball: float, pitch: float, names: list[str], *, markers: bool) -> Calibration:
+    from datetime import UTC, datetime
+    from importlib import metadata
+
+    from calibration.bundle import FORMAT, Calibration, Provenance, Residual
+    from tacsim.optics.geometry import Markers, SensorGeometry
+
+    rows, columns, _ = fit.reference.shape
+    return Calibration(
+        format=FORMAT,
+        serial=serial,
+        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch),
+        gel_size=(columns * pitch, rows * pitch),
+        forward=fit.forward,
+        inverse=fit.inverse,
+        skirt_length=fit.skirt.length * pitch,
+        skirt_fraction=fit.skirt.fraction,
+        markers=Markers() if markers else None,
+        residuals=tuple(
+            Residual(
+                frame=score.name,
+                circle=(score.circle.x, score.circle.y, score.circle.radius),
+                error=score.error,
+                nothing=score.nothing,
+                correlation=score.correlation,
+                angle=score.angle,
+            )
+            for score in fit.scores
+        ),
+        provenance=Provenance(
+            made=datetime.now(UTC).isoformat(timespec="seconds"),
+            software=f"tacsim {metadata.version('tacsim')}",
+            ball_radius=ball,
+            frames=tuple(names),
+            left_out=dict(fit.left_out),
+            warnings=fit.warnings,
+        ),
+        reference="0" * 64,  # write_bundle sets it
+    )
+
+
+def _show(fit: Fit, pitch: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 1), title="Each press predicted by all the others", title_justify="left")
+    table.add_column("frame")
+    for column in ("contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]"):
+        table.add_column(column, justify="right")
+    for score in fit.scores:
+        table.add_row(
+            score.name, f"{score.circle.radius * pitch * 1e3:.3f}", f"{score.error:.1f}", f"{score.nothing:.1f}",
+            f"{score.correlation:.3f}", f"{score.angle:.1f}",
+        )  # fmt: skip
+    console = Console(highlight=False)
+    if fit.scores:
+        console.print(table)
+    order = fit.order
+    console.print(
+        f"model: degree {order.degree} in the normal, {order.position} in the place; calibrated up to a slope of "
+        f"{fit.steepest:.2f}; skirt {fit.skirt.length * pitch * 1e3:.2f} mm x {fit.skirt.fraction:.2f}"
+    )
+    for name, why in fit.left_out:
+        notes.print(f"left out: {name}: {why}", markup=False)
+    for warning in fit.warnings:
+        notes.print(f"look at this: {warning}", markup=False)

@@ -1,0 +1,80 @@
+"""Made-up sensors with hidden lights, under a ball: frames whose true surface is known (Hertz, not the dent that the
+calibrator assumes)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.circle import dent_slope
+from tacsim.optics.geometry import Light, Lighting
+from tacsim.optics.render import shade
+
+ROWS, COLUMNS = 200, 260
+PITCH = 0.08e-3  # [m]
+BALL = 2.5e-3  # [m]
+BALL_PX = BALL / PITCH
+
+
+@dataclass(frozen=True)
+class Made:
+    """One frame and what is true of it."""
+
+    image: np.ndarray  # (H, W, 3) uint8
+    gradient: np.ndarray  # (H, W, 2)
+    height: np.ndarray  # (H, W) [m]
+    circle: tuple[float, float, float]  # x, y, radius [px]
+
+
+class HiddenSensor:
+    """Three lights of random colour, direction and gloss, an uneven background, a camera's noise."""
+
+    def __init__(self, seed: int, noise: float = 1.5, gain: float = 0.45) -> None:
+        self._rng = np.random.default_rng(seed)
+        rng, turn = self._rng, self._rng.uniform(0, 2 * np.pi)
+        lights = tuple(
+            Light(
+                direction=(np.cos(turn + a), np.sin(turn + a), -rng.uniform(0.7, 1.0)),
+                colour=tuple(gain * np.clip(np.eye(3)[i] + rng.uniform(0, 0.3, 3), 0, 1)),
+                specular=rng.uniform(0, 0.2),
+            )
+            for i, a in enumerate((0.0, 2.2, 4.1))
+        )
+        self._lighting = Lighting(lights=lights, background=(0.4, 0.4, 0.4))
+        v, u = np.mgrid[:ROWS, :COLUMNS]
+        slope = rng.uniform(-20, 20, (2, 3))
+        level = rng.uniform(90, 130, 3)
+        self._base = level + (u / COLUMNS - 0.5)[..., None] * slope[0] + (v / ROWS - 0.5)[..., None] * slope[1]
+        self._noise = noise
+
+    def empty(self) -> np.ndarray:
+        return self.photograph(np.zeros((ROWS, COLUMNS, 2)))
+
+    def press(self, depth: float, x: float, y: float, drift: np.ndarray | float = 0.0, ball: float = BALL_PX) -> Made:
+        """`depth` [m]; x, y: where [px]; `drift`: grey levels that are added; `ball`: its radius [px]."""
+        a = np.sqrt(ball * depth / PITCH)
+        v, u = np.mgrid[:ROWS, :COLUMNS].astype(float)
+        r = np.hypot(u - x, v - y)
+        q = np.maximum(r / a, 1.0)
+        # free surface of a half-space (Johnson, eq. 3.42a); its slope is scaled to meet the ball's at the circle
+        outside = depth / np.pi * ((2 - q**2) * np.arcsin(1 / q) + np.sqrt(q * q - 1))
+        cap = np.sqrt(np.maximum(ball**2 - r**2, 0)) - np.sqrt(ball**2 - a**2)  # above the contact circle [px]
+        height = np.where(r < a, depth / 2 + cap * PITCH, outside)  # Hertz is half as deep at the contact circle
+        step = dent_slope(r, a, ball)
+        gradient = -np.stack([u - x, v - y], axis=-1) * (step / np.maximum(r, 1e-9))[..., None]
+        return Made(self.photograph(gradient, drift), gradient, height, (x, y, float(a)))
+
+    def presses(self, count: int) -> list[Made]:
+        """Presses of various depths all over the gel."""
+        places = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50), (160, 60), (90, 120)]
+        depths = [0.5, 0.35, 0.65, 0.45, 0.55, 0.3, 0.6, 0.4]
+        jitter = self._rng.uniform(-6, 6, (8, 2))
+        spread = zip(depths, places, jitter, strict=True)
+        return [self.press(d * 1e-3, x + jx, y + jy) for d, (x, y), (jx, jy) in spread][:count]
+
+    def photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
+        flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self._lighting)
+        change = 255 * (shade(gradient.astype(np.float32), self._lighting) - flat)
+        noise = self._rng.normal(0, self._noise, (ROWS, COLUMNS, 3))
+        return np.clip(np.rint(self._base + change + drift + noise), 0, 255).astype(np.uint8)

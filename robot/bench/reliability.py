@@ -19,7 +19,6 @@ from robot.bench.rehearsal import (
     START,
     STILL,
     TOOL,
-    Disturbed,
     driven,
     facts,
     host,
@@ -33,7 +32,7 @@ from robot.bench.rehearsal import (
     until,
     walls,
 )
-from robot.bench.repeated import COUNT, Figure, repeated
+from robot.bench.repeated import COUNT, Disturbed, Figure, repeated
 from robot.bench.runner import Case
 from robot.errors import ProtectiveStop, StaleObservationError
 from robot.kinematics import matrix
@@ -111,9 +110,10 @@ def box_measured(repeat: int) -> list[Measurement]:
         worst = 0.0
         with driven(mock, given) as (arm, watcher):
             start = arm.state().pose
-            for _ in range(4):
-                arm.command(moved(start, *rng.uniform(-0.5, 0.5, 3)))
-                time.sleep(0.3)
+            for _ in range(3):
+                if not arm.status().is_fault:  # a stop at the wall is no breach of it
+                    arm.command(moved(start, *rng.uniform(-0.5, 0.5, 3)))
+                    time.sleep(0.3)
             worst = float(walls(given).excess(watcher.records()["position"][1:]).max())
         return {"beyond": 1e3 * max(worst, 0.0)}
 
@@ -143,7 +143,8 @@ def force(repeat: int) -> list[Measurement]:
         slow = np.linalg.norm(records["tcp_speed"][:, :3], axis=1) < STILL
         rest = records[slow & (records["stamp"] >= first["stamp"])][0]
         late = ticks > round(float(first["stamp"]) / PERIOD) + ahead  # a period after that package was sent
-        deepest = float(first["position"][2]) - speed**2 / (2 * HARD) - 1e-5
+        braking_way = float(np.sum(first["tcp_speed"][:3] ** 2)) / (2 * HARD)
+        deepest = float(first["position"][2]) - braking_way - 1e-5
         return {
             "approach commands": float((sensor_path(joints[late])[:, 2] < deepest).sum()),
             "standstill": 1e3 * float(rest["stamp"] - first["stamp"]),
@@ -207,7 +208,8 @@ def late_policy(repeat: int) -> list[Measurement]:
             until(arm.at_rest, "rest")
             time.sleep(0.1)
             mark = mock.door.received().last
-            under_way(arm, far, 0.02)
+            arm.command(far)
+            until(lambda: sound(arm) and len(servo_targets(mock.door.received(mark).entries)[0]) > 60, "new targets")
             _, joints = servo_targets(mock.door.received(mark).entries)
         steps = np.linalg.norm(np.diff(sensor_path(joints), axis=0), axis=1)
         return {

@@ -50,6 +50,7 @@ def markdown(report: Report) -> str:
         setting(report) + _busy(report),
         "## Figures",
         table(HEADER, lines(rows)),
+        *_notes(rows),
         "## How to read and rerun",
         READING.format(repeat=report.metadata.repeat),
         "## What a promise says, and which tests check its logic",
@@ -90,6 +91,12 @@ def _worst(figure: Target, rows: Sequence[Row]) -> float | None:
 
 def _words(value: float | None, unit: str) -> str:
     return "" if value is None else f"{value:.3g} {unit}".strip()
+
+
+def _notes(rows: Sequence[Row]) -> list[str]:
+    """What was disturbed while it was measured, once for each case."""
+    noted = {row.case: row.note for row in rows if row.note}
+    return ["\n".join(f"- `{case}`: {note}." for case, note in noted.items())] if noted else []
 
 
 def _logic(index: int) -> str:

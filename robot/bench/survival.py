@@ -28,7 +28,7 @@ from robot.bench.rehearsal import (
     until,
     workers,
 )
-from robot.bench.repeated import COUNT, Figure, repeated
+from robot.bench.repeated import COUNT, Disturbed, Figure, repeated
 from robot.camera import Camera, StaleFrame
 from robot.link import ArmStatus
 from robot.mock import MockCamera, MockState, MockUR
@@ -79,7 +79,7 @@ def policy_death(repeat: int) -> list[Measurement]:
             assert policy.stdout is not None
             try:
                 if policy.stdout.readline() != b"under way\n":
-                    raise RuntimeError("the policy that was to be killed did not come under way")
+                    raise Disturbed("the policy that was to be killed did not come under way")
                 (worker,) = workers(policy.pid)
                 before = mock.door.state()
             finally:
@@ -173,8 +173,8 @@ def camera(repeat: int) -> list[Measurement]:
             )
             with Camera(given, "bench") as camera:
                 ages = []
-                for _ in range(5):
-                    time.sleep(0.3)
+                for _ in range(3):
+                    time.sleep(0.25)
                     ages.append(time.monotonic() - camera.read(1.0).time)
                 stale = _stalled(mock, camera)
                 mock.stall(False)
@@ -191,7 +191,7 @@ def camera(repeat: int) -> list[Measurement]:
         repeat,
         once,
         [
-            Figure("age", "ms", "exposure, by the stamp; a consumer that pauses for 0.3 s"),
+            Figure("age", "ms", "exposure, by the stamp; a consumer that pauses for 0.25 s"),
             Figure("stale", COUNT, "frames delivered in a stall beyond max_age, or as new without a newer exposure"),
             Figure("back", "s", "the camera serves again, until a new frame is delivered"),
         ],
@@ -206,10 +206,10 @@ def _index(camera: Camera) -> int:
 
 
 def _stalled(mock: MockCamera, camera: Camera) -> int:
-    """Stalls a camera and reads for three times max_age; how many frames were not what they were taken for."""
+    """Stalls a camera and reads for twice max_age; how many frames were not what they were taken for."""
     mock.stall(True)
     wrong, seen = 0, camera.read(1.0)
-    end = time.monotonic() + 3 * MAX_AGE
+    end = time.monotonic() + 2 * MAX_AGE
     while time.monotonic() < end:
         asked = time.monotonic()
         try:

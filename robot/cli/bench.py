@@ -49,7 +49,7 @@ def bench(
     docs: Annotated[
         Path | None,
         typer.Option(
-            "--docs", metavar="DIR", help="Write benchmarks.md and its picture here; reliability.md from rows of robot."
+            "--docs", metavar="DIR", help="Write the pages here: benchmarks.md, reliability.md."
         ),
     ] = None,
     from_: Annotated[

@@ -14,7 +14,7 @@ CORE := .venv/installed-core-$(VERSION)
 DEV := .venv/installed-dev-$(VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-all test-extras lock clean python
+.PHONY: help run test check test-all test-gpu test-extras lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -23,6 +23,7 @@ help:
 	@echo "make test         install with dev extras, then lint, types, import contract, tests   (ARGS=\"-k rig\")"
 	@echo "make check        the same without the tests"
 	@echo "make test-all     make test, then the long runs"
+	@echo "make test-gpu     the physics tests and benchmarks on CUDA   (without a CUDA device: says so, and fails)"
 	@echo "make test-extras  tests that need heavy extras"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
@@ -42,6 +43,14 @@ test: check
 
 test-all: test
 	@$(BIN)/python -m pytest -q -m slow $(ARGS)
+
+# Without a device nothing was tested, which must not look like a pass: 77, as automake's tests say "skipped".
+test-gpu: $(DEV)
+	@TACSIM_DEVICE=cuda $(BIN)/python -c 'from tacsim.runtime import start; start()' >/dev/null 2>&1 || { \
+	  echo "make test-gpu: Taichi finds no CUDA device (or no driver) on this machine, so nothing was tested."; exit 77; }
+	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q tests/physics $(ARGS)
+	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench press --json runs/gpu/press.json
+	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench squeeze --json runs/gpu/squeeze.json
 
 test-extras:
 	@echo "No heavy extras yet: nothing to test."

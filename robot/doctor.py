@@ -117,8 +117,11 @@ def taichi() -> list[Check]:
     if sys.platform == "linux" and platform.machine() == "aarch64":
         advice = "simulate on another machine; hardware and replay work here"
         return [Check("taichi", "warn", "no Taichi wheel exists for linux aarch64", advice)]
-    from tacsim.runtime import start, ti
+    from tacsim.runtime import DEVICE, available, start, ti
 
+    if not available(DEVICE):
+        advice = "unset TACSIM_DEVICE to compute on the processor, or install the device's driver"
+        return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not there", advice)]
     arch = start()
     version = ".".join(str(part) for part in ti.__version__)
     return [Check("taichi", "ok", f"{version}, arch {arch}"), kernel_cache(Path(ti.cfg.offline_cache_file_path))]

@@ -9,17 +9,22 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from robot.align import ArmHistory
 from robot.camera import Camera
 from robot.clock import Driven, LockStep, WallClock
-from robot.errors import DeviceError
+from robot.errors import DeviceError, SafetyViolation
 from robot.mock.bench import MockBench
 from robot.start import GuidedStart
 from robot.trajectory import PERIOD
 from robot.twin_sensor import TwinSensor
 from robot.ur import URArm
-from tacsim.hardware import CameraSensorFacts, UrArmFacts
-from tacsim.interface import ArmState, Normaliser, Pose, TactileSource
+from tacsim import pose as se3
+from tacsim.hardware import ArmLimits, CameraSensorFacts, UrArmFacts
+from tacsim.interface import ArmState, Normaliser, Pose, TactileObservation, TactileSource
+from tacsim.limits import ActionError
+from tacsim.record.timing import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
 from tacsim.rigfile import RigFacts, SimSensorFacts
 from tacsim.touch import contact_signal
@@ -28,6 +33,7 @@ if TYPE_CHECKING:
     from calibration.normaliser import FrameNormaliser
 
 Confirm = Callable[[str], bool]
+SHORTENED = 1e-7  # a target that was changed by more counts as shortened [m, rad]
 QUESTION = "Is the body in its place between the sensors, and everybody out of reach of the arms?"
 
 
@@ -40,6 +46,7 @@ class RigArm:
     def __init__(self, driven: Driven, *, still: bool = False) -> None:
         self._driven, self._still = driven, still
         self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
+        self.limits_hit = 0  # targets that were shortened or refused
 
     def state(self, at: float | None = None) -> ArmState:
         """Raises NotAligned for a moment of which no package tells."""
@@ -61,8 +68,14 @@ class RigArm:
         """With `still` nothing is sent, and None says so."""
         if self._still:
             return None
-        self._driven.target = self._driven.arm.command(target)
-        return self._driven.target
+        try:
+            sent = self._driven.arm.command(target)
+        except ActionError:
+            self.limits_hit += 1
+            raise
+        self.limits_hit += target is not None and sent is not None and max(se3.distance(target, sent)) > SHORTENED
+        self._driven.target = sent
+        return sent
 
     def stop(self) -> None:
         self._driven.target = None
@@ -119,8 +132,10 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
         behind = {name: RigArm(driven, still=dry_run) for name, driven in arms.items()}
 
         def diagnostics() -> Mapping[str, float]:
-            alignment = {f"alignment_{name}": arm.alignment for name, arm in behind.items()}
-            return {**bench.diagnostics(), **clock.diagnostics(), **alignment}
+            found = {**bench.diagnostics(), **clock.diagnostics()}
+            for name, arm in behind.items():
+                found |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
+            return found
 
         rig = Rig(
             name=facts.name,
@@ -132,6 +147,7 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
             truth=bench.truth if bench.simulated and facts.scene is not None and facts.scene.body is not None else None,
             diagnostics=diagnostics,
             beside=bench.close,
+            watch=_watch(facts, sensors),
         )
         stack.pop_all()
         return rig
@@ -192,6 +208,47 @@ def _feel(
         return min(-float(arms[name].arm.state().wrench[2]) for name in carrying) / force
 
     return felt
+
+
+def _watch(
+    facts: RigFacts, sensors: Mapping[str, TactileSource]
+) -> Callable[[Mapping[str, TactileObservation]], None] | None:
+    """Guards the gels by what they show: how deep they are pressed, how far they are dragged.
+
+    Raises DeviceError for a limit that cannot be watched, because its sensor delivers no height or flow.
+    """
+    guards: list[tuple[str, str, ArmLimits]] = []
+    for name, sensor in facts.sensors.items():
+        arm = None if sensor.arm is None else facts.arms[sensor.arm]
+        if isinstance(arm, UrArmFacts) and (arm.limits.depth is not None or arm.limits.shear is not None):
+            spec, limits = sensors[name].spec, arm.limits
+            for limit, there, what in ((limits.depth, spec.height, "depth"), (limits.shear, spec.flow, "shear")):
+                if limit is not None and not there:
+                    raise DeviceError(
+                        f"arms.{sensor.arm}.limits.{what}: sensor '{name}' cannot tell it (no calibration, or no "
+                        "markers); leave it out, or calibrate the sensor"
+                    )
+            guards.append((name, str(sensor.arm), arm.limits))
+    if not guards:
+        return None
+
+    def watch(tactile: Mapping[str, TactileObservation]) -> None:
+        for name, arm, limits in guards:
+            touch = tactile[name]
+            if limits.depth is not None and touch.height is not None:
+                _require(float(touch.height.max(where=touch.valid, initial=0.0)), limits.depth, name, arm, "depth")
+            if limits.shear is not None and touch.flow is not None:
+                _require(float(np.nanmax(np.linalg.norm(touch.flow, axis=-1))), limits.shear, name, arm, "shear")
+
+    return watch
+
+
+def _require(found: float, limit: float, sensor: str, arm: str, what: str) -> None:
+    if found > limit:
+        raise SafetyViolation(
+            f"gel of sensor '{sensor}': {what} {1e3 * found:.3g} mm, limits.{what} of arm '{arm}' is "
+            f"{1e3 * limit:.3g} mm; the arms are stopped. Move them apart, then begin a new episode"
+        )
 
 
 def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:

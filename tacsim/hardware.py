@@ -179,3 +179,30 @@ class HardwareStart(Facts):
     approach_step: Annotated[Length, Field(gt=0, le=1e-3)] = 20e-6  # between two looks at what is felt [m]
     approach_way: Annotated[Length, Field(gt=0, le=0.1)] = 10e-3  # no contact after so far: NoTouch [m]
     touch_signal: Annotated[float, Field(gt=0)] | None = None  # contact signal that counts as touch; None: by force
+
+
+def loosened(before: UrArmFacts, after: UrArmFacts) -> list[str]:
+    """What guards the arm less in `after` than in `before`, as "key: from -> to"."""
+    found = []
+    for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed", "force", "torque"):
+        old, new = getattr(before.limits, key), getattr(after.limits, key)
+        if new > old:
+            found.append(f"limits.{key}: {old:g} -> {new:g}")
+    for key in ("depth", "shear"):
+        old, new = getattr(before.limits, key), getattr(after.limits, key)
+        if old is not None and (new is None or new > old):
+            found.append(f"limits.{key}: {old:g} -> {'not watched' if new is None else f'{new:g}'}")
+    boxes = before.limits.workspace, after.limits.workspace
+    if any(new < old for old, new in zip(boxes[0].lower, boxes[1].lower, strict=True)) or any(
+        new > old for old, new in zip(boxes[0].upper, boxes[1].upper, strict=True)
+    ):
+        found.append("limits.workspace: reaches farther")
+    if not set(before.limits.planes) <= set(after.limits.planes):
+        found.append("limits.planes: one is gone")
+    for key in ("link_timeout", "action_timeout"):
+        old, new = getattr(before, key), getattr(after, key)
+        if new > old:
+            found.append(f"{key}: {old:g} -> {new:g}")
+    if after.watchdog < before.watchdog:
+        found.append(f"watchdog: {before.watchdog:g} -> {after.watchdog:g}")
+    return found

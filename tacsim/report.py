@@ -23,9 +23,11 @@ def summary(episode: Episode) -> dict[str, Any]:
     """Facts and curves of an episode as JSON: an entry of each list a control step (the state after reset has none).
 
     `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
-    `correlation` (sensor -> r between contact signal and force). What is unknown or not finite is null.
+    `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.record.timing; null unless the rig is
+    live). What is unknown or not finite is null.
     """
     from tacsim.figure import contact_signals, normal_force, signal_against_force
+    from tacsim.record.timing import timing
 
     meta, done = episode.meta, [step for step in episode.steps if step.index > 0]
     signals = contact_signals(Episode(meta, done))
@@ -46,6 +48,7 @@ def summary(episode: Episode) -> dict[str, Any]:
         "seconds_per_step": _number(statistics.median(step.seconds for step in done)) if done else None,
         "seconds": [_number(step.seconds) for step in done],
         "settled": settled,
+        "timing": timing(episode),
         "complete": episode.complete,
         "dropped": episode.dropped,
         "versions": dict(meta.versions),
@@ -89,6 +92,8 @@ def end_table(facts: Mapping[str, Any], paths: Iterable[Path]) -> Table:
 
 
 def _results(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    from tacsim.record.timing import timing_rows
+
     known = [(value, k) for k, value in zip(facts["step"], facts["distance"], strict=True) if value is not None]
     best = min(known, default=None)
     rewards = [value for value in facts["reward"] if value is not None]
@@ -105,6 +110,8 @@ def _results(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
     if facts["settled"] is not None:
         rows.append(("settled", f"{facts['settled']} of {facts['steps']} steps"))
+    if facts["timing"] is not None:
+        rows += timing_rows(facts["timing"])
     if facts["dropped"]:
         rows.append(("dropped", f"{facts['dropped']} steps were not recorded"))
     return rows

@@ -17,6 +17,7 @@ from tacsim.interface import (
     Pose,
     RigSpec,
     TactileFrame,
+    TactileObservation,
     TactileSource,
     Truth,
 )
@@ -47,6 +48,7 @@ class Rig:
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
         read_timeout: how long to wait for a frame [s].
         beside: closes what the rig needs besides sensors and arms, after them.
+        watch: looks at what is touched before anybody acts on it, and raises what ends the episode.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Rig:
         diagnostics: Callable[[], Mapping[str, float]] = dict,
         read_timeout: float = 1.0,
         beside: Callable[[], None] | None = None,
+        watch: Callable[[Mapping[str, TactileObservation]], None] | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
@@ -69,6 +72,7 @@ class Rig:
         self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
         self._normalisers, self._start, self._truth = dict(normalisers), start, truth
         self._diagnostics, self._timeout, self._beside = diagnostics, read_timeout, beside
+        self._watch = watch
         self._frames: Mapping[str, TactileFrame] = {}
         self._references: Mapping[str, TactileFrame] = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
@@ -112,6 +116,8 @@ class Rig:
         now = self._clock.now()
         tactile = {name: self._normalisers[name](frame, now) for name, frame in frames.items()}
         self._frames = frames
+        if self._watch is not None:
+            self._watch(tactile)
         return Observation(tactile=tactile, arms=arms, time=now)
 
     def step(self, action: Action) -> tuple[Observation, Mapping[str, Pose | None]]:

@@ -15,27 +15,43 @@ with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the st
     warnings.simplefilter("ignore")
     import taichi as ti
 
-_running: tuple[str, int] | None = None  # arch, process
+DEVICES = ("cpu", "cuda", "vulkan", "metal")
+# Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.
+DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
+
+_running: int | None = None  # process
 
 
-def start(arch: str = "cpu", threads: int | None = None) -> str:
-    """Starts Taichi if it does not run yet; returns the arch in use.
+def start(cpu_only: str | None = None) -> str:
+    """Starts Taichi on DEVICE if it does not run yet; returns DEVICE.
 
-    Raises RuntimeError for a second arch in one process, and in a forked child, where kernels would hang.
+    cpu_only: what needs the CPU, in words, for the error that says so. Raises ValueError for an unknown device,
+    RuntimeError for one that is not there, or where the CPU is needed; and in a forked child, where kernels would hang.
     """
     global _running
+    if DEVICE not in DEVICES:
+        raise ValueError(f"TACSIM_DEVICE must be one of {', '.join(DEVICES)}, found '{DEVICE}'")
+    if cpu_only is not None and DEVICE != "cpu":
+        raise RuntimeError(f"{cpu_only} runs on the CPU only, but TACSIM_DEVICE is '{DEVICE}': unset it")
     if _running is None:
-        options = {} if threads is None else {"cpu_max_num_threads": threads}
+        if not available(DEVICE):
+            raise RuntimeError(
+                f"TACSIM_DEVICE is '{DEVICE}', but Taichi finds no such device or driver on this machine; unset it to "
+                f"compute on the CPU"
+            )
         # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
         with contextlib.redirect_stdout(io.StringIO()):
             # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
             ti.init(
-                arch=getattr(ti, arch), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
-                log_level=ti.ERROR, **options,
+                arch=getattr(ti, DEVICE), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
+                log_level=ti.ERROR, enable_fallback=False,
             )  # fmt: skip
-        _running = (arch, os.getpid())
-    if _running[1] != os.getpid():
+        _running = os.getpid()
+    if _running != os.getpid():
         raise RuntimeError("Taichi does not survive a fork: start worker processes with the 'spawn' method")
-    if _running[0] != arch:
-        raise RuntimeError(f"Taichi already runs on '{_running[0]}' in this process; use another process for '{arch}'")
-    return arch
+    return DEVICE
+
+
+def available(device: str) -> bool:
+    """Whether Taichi can start on this one of DEVICES here."""
+    return bool(ti.lang.misc.is_arch_supported(getattr(ti, device)))

@@ -122,7 +122,7 @@ class Block:
     """What a body or a gel on its own shares with its kernel. Use one of the two below."""
 
     def __init__(self, facts: dict[int, float], dt: float) -> None:
-        start()
+        start(cpu_only="a single block of a material (tacsim bench materials)")
         self.facts = np.zeros((1, FACTS), np.float32)
         self.facts[0, list(facts)] = list(facts.values())
         self.facts[0, STEP] = dt

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tacsim.scene import Scene
 
 PATIENCE = 600.0  # for one answer: a first motion compiles, a hard one takes many substeps [s]
-NICENESS = 10
+NICENESS = 19
 SAME = 1e-7  # a sensor that moved less has not moved [m, and rad over 0.1]
 _HEAD = struct.Struct(">II")  # length of the JSON, length of the arrays
 LARGEST = 256 * 2**20  # bytes of a message

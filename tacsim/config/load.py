@@ -16,6 +16,7 @@ from tacsim.config.kinds import NotFound, is_name, kind_of, named
 from tacsim.config.messages import report_errors
 from tacsim.config.overrides import Override, apply, parse_override
 from tacsim.config.references import read_file
+from tacsim.hardware import UrArmFacts, loosened
 from tacsim.optics.geometry import SensorModel
 from tacsim.rigfile import RigFacts, TaskFacts
 from tacsim.scene import Scene
@@ -39,7 +40,7 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     applied first. If anything in the rig is simulated, ``scene`` then is the effective scene: the rig's own, else the
     task's, so ``scene.preset=standard`` works either way. In a rig without a simulated part it is None.
 
-    Raises ConfigError with every problem found.
+    Raises ConfigError with every problem found; overrides that loosen the limits of a real arm are one.
     """
     reading = Reading()
     root = _open(RigFacts, rig, reading)
@@ -60,10 +61,31 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
         root = apply(root, RigFacts, override, reading)
     root = _settle_scene(root, own_scene, reading)
     facts = _validate(RigFacts, root, reading)
+    if overrides:
+        _require_limits(facts, load_rig(rig, task=task).facts)
     text = "# A rig, resolved: every reference and default written out, SI units.\n" + dump(
         facts.model_dump(mode="json")
     )
     return LoadedRig(facts, text, tuple(dict.fromkeys(reading.sources)))
+
+
+def _require_limits(facts: RigFacts, file: RigFacts) -> None:
+    """The limits of real arms are those of the file, or narrower: a file is looked over, a command line is typed."""
+    problems: list[str] = []
+    for name, arm in facts.arms.items():
+        there = file.arms.get(name)
+        if isinstance(arm, UrArmFacts) and isinstance(there, UrArmFacts) and arm.mock is None:
+            problems += [f"arms.{name}.{what}" for what in loosened(there, arm)]
+    if any(isinstance(arm, UrArmFacts) and arm.mock is None for arm in facts.arms.values()):
+        kept = {frozenset(apart.arms): apart.distance for apart in facts.keep_out}
+        problems += [
+            f"keep_out of {' and '.join(apart.arms)}: less than {apart.distance:g} m"
+            for apart in file.keep_out
+            if kept.get(frozenset(apart.arms), 0.0) < apart.distance
+        ]
+    if problems:
+        words = "would loosen the limits of a real arm; write it into the rig file"
+        raise ConfigError([Problem(Place("--set"), "", f"{what}: {words}") for what in problems])
 
 
 def _has(root: Node, key: str) -> bool:

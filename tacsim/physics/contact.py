@@ -6,7 +6,7 @@ rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 197
 holds nothing.
 """
 
-from tacsim.physics.lanes import vec3, vec4
+from tacsim.physics.lanes import add_to, copy_of, note_more, note_most, slot_of, vec3, vec4
 from tacsim.physics.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
 from tacsim.runtime import ti
 
@@ -131,7 +131,7 @@ def particle_contact(
                 gap = depth * n[2]  # overlap; negative where they have parted
                 if gap > deepest:  # an overlap found late must not explode; counted
                     gap = deepest
-                    partial[env, part, CAPPED] += 1.0
+                    note_more(partial, env, slot_of(part), CAPPED, 1.0)
                 vr = v - vec3(vs[0], vs[1], vs[2])
                 vn = vr.dot(n)
                 fn = ti.max(k_n * (gap + taken) - c_n * vn, 0.0)
@@ -143,13 +143,13 @@ def particle_contact(
                 back = vec4(force[0], force[1], force[2], 0.0)
                 for p, q in ti.static(ti.ndrange(3, 3)):
                     node = surface_node(i + p, j + q, nx, ny)
-                    touch[env, part, g, node] = touch[env, part, g, node] - (wx[p] * wy[q]) * back
+                    add_to(touch, (env, copy_of(part), g, node), -(wx[p] * wy[q]) * back)
         elif housing >= 0.0:
             gap = radius - housing - x[2]
             if gap + taken > 0.0:
                 if gap > deepest:
                     gap = deepest
-                    partial[env, part, CAPPED] += 1.0
+                    note_more(partial, env, slot_of(part), CAPPED, 1.0)
                 n = vec3(0.0, 0.0, 1.0)
                 fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)
                 taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
@@ -160,5 +160,5 @@ def particle_contact(
     kept = vec4(0.0)
     if touching:
         kept = vec4(slip[0], slip[1], slip[2], taken)
-        partial[env, part, OVERLAP] = ti.max(partial[env, part, OVERLAP], overlap)
+        note_most(partial, env, slot_of(part), OVERLAP, overlap)
     return touching, housed, force, kept

@@ -10,7 +10,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.physics.lanes import LANES, PARTS, SLOTS, anchor, first_of, keep_or, padded, real, vec4
+from tacsim.physics.lanes import (
+    COPIES,
+    LANES,
+    ON_DEVICE,
+    PARTS,
+    SLOTS,
+    anchor,
+    first_of,
+    keep_or,
+    note_least,
+    note_sum,
+    padded,
+    real,
+    vec4,
+)
 from tacsim.physics.layout import (
     BACKING,
     GEL_DAMPING,
@@ -105,8 +119,9 @@ class GelState:
     nodes: (E, gels, 3, 3, nz + 1, P) displacement, velocity, force; axis; layer; the nodes of a layer as one row, node
     (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
     skin: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside.
-    touch: (E, PARTS, gels, P, 4) contact force on the surface nodes, one copy a part.
-    corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis.
+    touch: (E, COPIES, gels, P, 4) contact force on the surface nodes, one copy a part.
+    corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
+    which works on all layers at once, (E, gels, nz, 24, W).
     lattice: (2, P) 1 at the first node of an element, else 0; and 1 / share of a node's mass, 0 where there is no node.
     """
 
@@ -124,8 +139,9 @@ class GelState:
         # has a view of its own, shifted in memory.
         self._nodes, self.nodes = shiftable((environments, gels, 3, 3, nz + 1, width), row + 1)
         self.skin = np.zeros((environments, gels, 2, nx + 3, ny + 3, 4), np.float32)
-        self.touch = np.zeros((environments, PARTS, gels, width, 4), np.float32)
-        self._corners, self.corners = shiftable((environments, PARTS, 2, 24, (longest + halo) * LANES), row + 1)
+        self.touch = np.zeros((environments, COPIES, gels, width, 4), np.float32)
+        cut = (gels, nz, 24, blocks + halo) if ON_DEVICE else (PARTS, 2, 24, (longest + halo) * LANES)
+        self._corners, self.corners = shiftable((environments, *cut), row + 1)
         self.lattice = np.zeros((2, width), np.float32)
         whole = np.zeros((nx + 1, row), np.float32)
         whole[:-1, :-1] = 1.0
@@ -181,6 +197,10 @@ class GelState:
             self.lattice.reshape(-1, LANES),
         )  # fmt: skip
 
+    def memory(self) -> tuple[np.ndarray, ...]:
+        """What a device takes: nodes with the margin round them, skin, touch, corners with theirs, lattice."""
+        return self._nodes, self.skin, self.touch, self._corners, self.lattice
+
 
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Zeros with `margin` more before and behind: the whole memory, and the array in its middle."""
@@ -208,26 +228,26 @@ def cross(a, b):
 
 @ti.func
 def element_block(
-    env, part, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(),
-    nij: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(), work: ti.template(),
-    never,
+    env, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(),
+    sj: ti.template(), si: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(),
+    work: ti.template(), w: ti.template(), never,
 ):  # fmt: skip
     """Forces of LANES elements on their corners. Returns det F.
 
     u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
-    where the forces go, `row` the way to the next corner or axis. One-point quadrature and hourglass stiffness
-    (Flanagan & Belytschko 1981, modes of the cube).
+    where the forces go, `row` the way to the next corner or axis; sj, si: how much further on nodes across j and i
+    stand, 0 in views that are shifted in memory; w: of `work`, the first that is free. One-point quadrature and
+    hourglass stiffness (Flanagan & Belytschko 1981, modes of the cube).
     """
     h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
     whole = lattice[block]
-    w = (env * PARTS + part) * SLOTS
     quarter = 0.25 / h
     area = (0.25 * h * h) * whole
     stiffness = (HOURGLASS * 2.0 * mu * h / 8.0) * whole
     for d in ti.static(range(3)):
         at = u + d * axis
-        a, b, c, e = n0[at], n0[at + layer], nj[at], nj[at + layer]
-        p, q, r, s = ni[at], ni[at + layer], nij[at], nij[at + layer]
+        a, b, c, e = n0[at], n0[at + layer], nj[at + sj], nj[at + sj + layer]
+        p, q, r, s = ni[at + si], ni[at + si + layer], nij[at + si + sj], nij[at + si + sj + layer]
         # sums and differences along z, then y, then x
         az, cz, pz, rz = b + a, e + c, q + p, s + r
         aw, cw, pw, rw = b - a, e - c, q - p, s - r
@@ -277,6 +297,20 @@ def element_block(
 
 
 @ti.func
+def node_block(
+    to, i, j, below, above, row, n0: ti.template(), c0: ti.template(), cj: ti.template(), ci: ti.template(),
+    cij: ti.template(), sj: ti.template(), si: ti.template(), never,
+):  # fmt: skip
+    """Internal force on LANES nodes along one axis, from the elements above them, at i in `corners`, and below, at j.
+
+    below, above: 1 or 0, whether there are any; row, sj, si: as for `element_block`.
+    """
+    under = c0[i] + cj[i + 6 * row - sj] + ci[i + 12 * row - si] + cij[i + 18 * row - si - sj]
+    over = c0[j + 3 * row] + cj[j + 9 * row - sj] + ci[j + 15 * row - si] + cij[j + 21 * row - si - sj]
+    n0[to] = keep_or(never, n0[to], below * under + above * over)
+
+
+@ti.func
 def gel_forces(
     env, part, gels, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(), c0: ti.template(),
     cj: ti.template(), ci: ti.template(), cij: ti.template(), lattice: ti.template(), facts: ti.template(),
@@ -292,6 +326,7 @@ def gel_forces(
     row = (blocks + pieces - 1) // pieces + halo  # of corners
     axis = (layers + 1) * blocks
     u, f = (env * gels + g) * 9 * axis, ((env * gels + g) * 9 + 6) * axis
+    w = (env * PARTS + part) * SLOTS
     smallest = real(1e9)
     for k in range(layers + 1):
         here = (2 * (env * PARTS + part) + k % 2) * 24 * row
@@ -299,19 +334,17 @@ def gel_forces(
         if k < layers:
             for block in range(ti.max(first - halo, 0), last):
                 jacobian = element_block(
-                    env, part, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj,
-                    ni, nij, c0, lattice, facts, work, never,
+                    env, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj, ni,
+                    nij, 0, 0, c0, lattice, facts, work, w, never,
                 )  # fmt: skip
                 smallest = ti.min(smallest, jacobian)
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for block in range(first, last):
             i, j = here + block - first + halo, before + block - first + halo
             for d in ti.static(range(3)):
-                under = c0[i + d * row] + cj[i + (6 + d) * row] + ci[i + (12 + d) * row] + cij[i + (18 + d) * row]
-                over = c0[j + (3 + d) * row] + cj[j + (9 + d) * row] + ci[j + (15 + d) * row] + cij[j + (21 + d) * row]
                 to = f + d * axis + k * blocks + block
-                n0[to] = keep_or(never, n0[to], below * under + above * over)
-    partial[env, part, SMALLEST_VOLUME] = ti.min(partial[env, part, SMALLEST_VOLUME], smallest.min())
+                node_block(to, i + d * row, j + d * row, below, above, row, n0, c0, cj, ci, cij, 0, 0, never)
+    note_least(partial, env, part, SMALLEST_VOLUME, smallest.min())
 
 
 @ti.func
@@ -321,27 +354,33 @@ def gel_advance(
 ):  # fmt: skip
     """Symplectic Euler with lumped masses on this part's nodes of its gel, and their skin.
 
-    Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted.
+    Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted. On a
+    device a part is one column of nodes: of gel part // columns, number part % columns.
     """
     dt, h = facts[env, STEP], facts[env, GEL_SPACING]
     pieces = PARTS // gels
-    g, piece = part // pieces, part % pieces
     row, count = ny + 1, (nx + 1) * (ny + 1)
     blocks = (count + LANES - 1) // LANES
-    first, last = first_of(blocks, piece, pieces), first_of(blocks, piece + 1, pieces)
+    g, piece = part // pieces, part % pieces
+    slot, first, last = part, first_of(blocks, piece, pieces), first_of(blocks, piece + 1, pieces)
+    if ti.static(ON_DEVICE):
+        g, first = part // blocks, part % blocks
+        slot, last = g * pieces + first % pieces, first + 1
     axis = (layers + 1) * blocks
     u = (env * gels + g) * 9 * axis
+    if ti.static(ON_DEVICE):
+        u += ny + 2  # the margin, see GelState.memory
     keep = 1.0 - facts[env, GEL_DAMPING] * dt
     rate = dt / (facts[env, GEL_DENSITY] * h * h * h)
     for d in ti.static(range(3)):
         held = real(0.0)
         for block in range(first, last):
             held += ti.select(lattice[blocks + block] > 0.0, n0[u + (6 + d) * axis + block], 0.0)
-        partial[env, part, BACKING + d] = held.sum()
+        note_sum(partial, env, slot, BACKING + d, held.sum())
     for block in range(first, last):  # contact forces of all parts
         for d in ti.static(range(3)):
             total = real(0.0)
-            for other in ti.static(range(PARTS)):
+            for other in ti.static(range(COPIES)):
                 total += real([touch[env, other, g, block * LANES + lane][d] for lane in range(LANES)])
             at = u + (6 + d) * axis + layers * blocks + block
             n0[at] = n0[at] + total
@@ -357,10 +396,12 @@ def gel_advance(
     for n in range(first * LANES, ti.min(last * LANES, count)):
         i, j = n // row, n % row
         for quantity in ti.static(range(2)):
-            at = vec4(
-                nodes[env, g, quantity, 0, layers, n], nodes[env, g, quantity, 1, layers, n],
-                nodes[env, g, quantity, 2, layers, n], 0.0,
-            )  # fmt: skip
+            at = vec4(0.0)
+            for d in ti.static(range(3)):
+                if ti.static(ON_DEVICE):
+                    at[d] = n0[u + (3 * quantity + d) * axis + layers * blocks + n][0]
+                else:
+                    at[d] = nodes[env, g, quantity, d, layers, n]
             for p in range(i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)):
                 for q in range(j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)):
                     skin[env, g, quantity, p, q] = at

@@ -21,6 +21,7 @@ from tacsim.physics.controller import (
     plan,
     run,
 )
+from tacsim.physics.device import Mirror, run_hybrid
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -32,7 +33,7 @@ from tacsim.physics.gel import (
 from tacsim.physics.health import Health, copies, judged, require_room, retried
 from tacsim.physics.hybrid_kernels import substeps
 from tacsim.physics.inertia import Inertia, kernel_density, kernel_second, plan_in_time
-from tacsim.physics.lanes import LANES, PARTS, SLOTS
+from tacsim.physics.lanes import LANES, ON_DEVICE, PARTS, SLOTS
 from tacsim.physics.layout import (
     BACKING,
     BODY_DAMPING,
@@ -92,15 +93,21 @@ class HybridState:
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._work = np.zeros((len(scenes) * PARTS * SLOTS, LANES), np.float32)
+        self._mirror = Mirror()
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 2, 6, 3) of the environments that go on, n each one's own."""
         drive = side_by_side(drives, self.counts)
         self.gels.refresh()
-        run_team(
-            substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.facts, self.counts,
-            self._work, self.partial, active=list(drives),
-        )  # fmt: skip
+        if ON_DEVICE:
+            run_hybrid(
+                self._mirror, drive, self.gels, self.particles, self.memory, self.facts, self.counts, self.partial
+            )
+        else:
+            run_team(
+                substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.facts,
+                self.counts, self._work, self.partial, active=list(drives),
+            )  # fmt: skip
 
 
 def _placed(scene: Scene) -> tuple[BodyFacts, np.ndarray, np.ndarray]:

@@ -12,7 +12,19 @@ from tacsim.physics.gel import (
     gel_advance,
     gel_forces,
 )
-from tacsim.physics.lanes import PARTS, Counts, Facts, Partial, Work, first_of, vec3, vec4
+from tacsim.physics.lanes import (
+    ON_DEVICE,
+    PARTS,
+    Counts,
+    Facts,
+    Partial,
+    Work,
+    note_sum,
+    part_range,
+    slot_of,
+    vec3,
+    vec4,
+)
 from tacsim.physics.layout import (
     BODY_CELL,
     BODY_DAMPING,
@@ -105,9 +117,15 @@ def grid_update(
     mean_across = mean - axis * (mean.dot(axis) / length2)
     nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
     base = env * counts[env, CAPACITY]
-    for i in range(first_of(nx, part, PARTS), first_of(nx, part + 1, PARTS)):
-        for j in range(ny):
-            for k in range(nz):
+    i0, i1, j0, j1, k0, k1 = 0, 0, 0, ny, 0, nz
+    if ti.static(ON_DEVICE):  # one node
+        i0, j0, k0 = part // (ny * nz), part // nz % ny, part % nz
+        i1, j1, k1 = i0 + 1, j0 + 1, k0 + 1
+    else:
+        i0, i1 = part_range(nx, part)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            for k in range(k0, k1):
                 node = (i * ny + j) * nz + k
                 q = node_sum(env, i, node, masses, counts)
                 velocity = vec3(0.0)
@@ -126,18 +144,22 @@ def grid_update(
 def touch_gel(
     env, part, g, it, drive: ti.template(), points: ti.template(), planes: ti.template(), rates: ti.template(),
     memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(),
-    partial: ti.template(), layers, nx, ny,
+    partial: ti.template(), highest, layers, nx, ny,
 ):  # fmt: skip
-    """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes."""
+    """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes.
+
+    highest: contact_ceiling of that gel.
+    """
     rotate = rotation(drive, env, it, g)
     origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    highest, spacing = contact_ceiling(skin, env, g), 0.5 * facts[env, BODY_CELL]
+    spacing = 0.5 * facts[env, BODY_CELL]
     rate = facts[env, STEP] / facts[env, BODY_MASS]
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
-    n, origin_p = counts[env, PARTICLES], env * counts[env, STRIDE]
-    for p in range(first_of(n, part, PARTS), first_of(n, part + 1, PARTS)):
+    origin_p = env * counts[env, STRIDE]
+    first, last = part_range(counts[env, PARTICLES], part)
+    for p in range(first, last):
         at = points[origin_p + p]
         arm = vec3(at[0], at[1], at[2]) - origin
         radius = support_radius(planes[origin_p + p], spacing)
@@ -159,10 +181,11 @@ def touch_gel(
                     on_housing -= force
         else:
             memory[env, g, p] = vec4(0.0)
+    slot = slot_of(part)
     for d in ti.static(range(3)):
-        partial[env, part, FORCE + 6 * g + d] = total[d]
-        partial[env, part, FORCE + 6 * g + 3 + d] = moment[d]
-        partial[env, part, HOUSED + 3 * g + d] = on_housing[d]
+        note_sum(partial, env, slot, FORCE + 6 * g + d, total[d])
+        note_sum(partial, env, slot, FORCE + 6 * g + 3 + d, moment[d])
+        note_sum(partial, env, slot, HOUSED + 3 * g + d, on_housing[d])
 
 
 @ti.kernel
@@ -191,7 +214,7 @@ def substeps(
                     for g in range(2):
                         touch_gel(
                             env, part, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
-                            layers, nx, ny,
+                            contact_ceiling(skin, env, g), layers, nx, ny,
                         )  # fmt: skip
                     clear_masses(env, part, masses, counts)
                     particles_to_grid(env, part, points, rates, strains, masses, facts, counts, partial)

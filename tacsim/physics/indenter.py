@@ -6,7 +6,7 @@ Everything is in the sensor frame [mm, MPa].
 """
 
 from tacsim.physics.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, spline, surface_node
-from tacsim.physics.lanes import PARTS, first_of, vec3, vec4
+from tacsim.physics.lanes import ON_DEVICE, add_to, copy_of, note_most, note_sum, part_range, slot_of, vec3, vec4
 from tacsim.physics.layout import (
     FORCE,
     FRICTION,
@@ -21,6 +21,10 @@ from tacsim.physics.layout import (
     STIFFNESS,
 )
 from tacsim.runtime import ti
+
+Slip = ti.types.ndarray(dtype=vec3, ndim=3)
+Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
+Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
@@ -117,8 +121,14 @@ def indent(
     back = rotate.transpose()
     total, moment = vec3(0.0), vec3(0.0)
     deepest = 0.0
-    for cell_i in range(first_of(nx, part, PARTS), first_of(nx, part + 1, PARTS)):
-        for cell_j in range(ny):
+    first_cell, last_cell, low, high = 0, 0, 0, ny
+    if ti.static(ON_DEVICE):
+        first_cell, low = part // ny, part % ny
+        last_cell, high = first_cell + 1, low + 1
+    else:
+        first_cell, last_cell = part_range(nx, part)
+    for cell_i in range(first_cell, last_cell):
+        for cell_j in range(low, high):
             # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides. A distance
             # grows no faster than the way, and no point of the cell is farther from its middle than two elements.
             middle = 0.25 * (
@@ -166,11 +176,15 @@ def indent(
                             push = vec4(force[0], force[1], force[2], 0.0)
                             for p, q in ti.static(ti.ndrange(3, 3)):
                                 node = surface_node(first_i + p, first_j + q, nx, ny)
-                                touch[env, part, 0, node] = touch[env, part, 0, node] + (wx[p] * wy[q]) * push
+                                add_to(touch, (env, copy_of(part), 0, node), (wx[p] * wy[q]) * push)
                     if not touching:
                         slip[env, i, j] = vec3(0.0)
                         pressure[env, i, j] = 0.0
-    partial[env, part, OVERLAP] = deepest
+    slot = slot_of(part)
+    if ti.static(ON_DEVICE):
+        note_most(partial, env, slot, OVERLAP, deepest)
+    else:
+        partial[env, part, OVERLAP] = deepest
     for d in ti.static(range(3)):
-        partial[env, part, FORCE + d] = total[d]
-        partial[env, part, FORCE + 3 + d] = moment[d]
+        note_sum(partial, env, slot, FORCE + d, total[d])
+        note_sum(partial, env, slot, FORCE + 3 + d, moment[d])

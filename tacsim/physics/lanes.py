@@ -7,12 +7,18 @@ the way that is recognised.
 
 Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
 a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
+
+On a device (a GPU) the same functions run with one lane, and a part is a single thing, a particle or a node with a
+thread of its own; there is one copy, and what is scattered is added atomically. The switch is ON_DEVICE, known when a
+kernel is compiled.
 """
 
-from tacsim.runtime import ti
+from tacsim.runtime import DEVICE, ti
 
-LANES = 8  # floats in a vector register of AVX2
-PARTS = 4
+ON_DEVICE = DEVICE != "cpu"
+LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
+PARTS = 4  # of an environment's work on the CPU; of its sums everywhere
+COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
 
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
@@ -33,11 +39,14 @@ def padded(n: int) -> int:
 @ti.func
 def keep_or(never, old, new):
     """new; `old` in words only (never is 0, which the compiler can't know): a value stored over the one just read."""
-    return ti.bit_cast(ti.bit_cast(new, ti.i32) | (ti.bit_cast(old, ti.i32) & never), ti.f32)
+    if ti.static(ON_DEVICE):
+        return new
+    else:
+        return ti.bit_cast(ti.bit_cast(new, ti.i32) | (ti.bit_cast(old, ti.i32) & never), ti.f32)
 
 
 @ti.func
-def anchor(work: ti.template(), slot, value, never):
+def anchor(work: ti.template(), slot: ti.template(), value, never):
     """Where the compiler starts to merge lanes: long chains of operations need one every ten or so."""
     work[slot] = keep_or(never, work[slot], value)
 
@@ -46,3 +55,96 @@ def anchor(work: ti.template(), slot, value, never):
 def first_of(count, part, parts):
     """Where share `part` of `count` things begins; it ends where the next begins."""
     return count * part // parts
+
+
+@ti.func
+def part_range(count, part):
+    """First of `count` things that a part does, and the one after its last; on a device a part is one thing."""
+    if ti.static(ON_DEVICE):
+        return part, part + 1
+    else:
+        return first_of(count, part, PARTS), first_of(count, part + 1, PARTS)
+
+
+@ti.func
+def slot_of(part):
+    """Where in `partial` a part notes its sums."""
+    if ti.static(ON_DEVICE):
+        return part % PARTS
+    else:
+        return part
+
+
+@ti.func
+def copy_of(part):
+    """Which copy a part scatters into."""
+    if ti.static(ON_DEVICE):
+        return 0
+    else:
+        return part
+
+
+@ti.func
+def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
+    """Adds to one entry of what a part scatters into."""
+    if ti.static(ON_DEVICE):
+        ti.atomic_add(array[at], value)
+    else:
+        array[at] = array[at] + value
+
+
+# What a part notes in `partial`. On the CPU a slot has one writer. On a device it has many, so a sum starts from a zero
+# that the launch's kernel has put there, and what changes nothing is not written, since that would only stand in line.
+
+
+@ti.func
+def note_sum(partial: ti.template(), env, slot, number, value):
+    """The part's whole sum of one substep."""
+    if ti.static(ON_DEVICE):
+        if value != 0.0:  # true of what is not a number
+            ti.atomic_add(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] = value
+
+
+@ti.func
+def note_more(partial: ti.template(), env, slot, number, value):
+    """What is added over a launch."""
+    if ti.static(ON_DEVICE):
+        if value != 0.0:
+            ti.atomic_add(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] += value
+
+
+@ti.func
+def note_least(partial: ti.template(), env, slot, number, value):
+    if ti.static(ON_DEVICE):
+        if value < partial[env, slot, number]:
+            ti.atomic_min(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] = ti.min(partial[env, slot, number], value)
+
+
+@ti.func
+def note_most(partial: ti.template(), env, slot, number, value):
+    if ti.static(ON_DEVICE):
+        if value > partial[env, slot, number]:
+            ti.atomic_max(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] = ti.max(partial[env, slot, number], value)
+
+
+# Registers of one thread on a device, where the CPU has arrays to drop values in.
+
+
+@ti.func
+def empty_lanes():
+    empty = real(0.0)
+    return empty  # noqa: RET504 - only a variable can be written to
+
+
+@ti.func
+def empty_four():
+    empty = vec4(0.0)
+    return empty  # noqa: RET504 - only a variable can be written to

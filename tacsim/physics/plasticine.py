@@ -10,7 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.physics.gel import MM, MPA
-from tacsim.physics.lanes import PARTS, first_of, keep_or, vec3, vec4
+from tacsim.physics.lanes import (
+    COPIES,
+    ON_DEVICE,
+    PARTS,
+    add_to,
+    copy_of,
+    keep_or,
+    note_least,
+    note_more,
+    note_most,
+    note_sum,
+    part_range,
+    slot_of,
+    vec3,
+    vec4,
+)
 from tacsim.physics.layout import (
     BODY_BULK,
     BODY_CELL,
@@ -44,7 +59,8 @@ Strains = ti.types.ndarray(dtype=vec4, ndim=1)
 Masses = ti.types.ndarray(dtype=vec4, ndim=1)
 Velocities = ti.types.ndarray(dtype=vec4, ndim=1)
 Sums = ti.types.ndarray(dtype=vec4, ndim=1)
-SUMS = 64  # of `sums` for each part: 16 slots, far enough apart that the compiler does not merge two of them
+APART = 1 if ON_DEVICE else 4  # slots in `sums`: far enough that the CPU's compiler does not merge two of them
+SUMS = 16 * APART  # of `sums` for each part
 
 ELASTIC = 1e9  # strain limit that is never reached
 
@@ -97,7 +113,7 @@ class BodyState:
     points: (E, N, 4) position [mm]; planes: (E, N, 4) tangent planes of the body's surface [1/mm], body_surface.py.
     rates: (E, N, 4, 4) velocity; and the columns of the affine velocity, its derivatives by x, y, z.
     strains: (E, N, 8) e = b_e - I (xx, yy, zz, xy, xz, yz), equivalent plastic strain, nothing.
-    masses: (E, PARTS, nodes, 4) momentum and mass, one copy a part; velocities: (E, nodes, 4).
+    masses: (E, COPIES, nodes, 4) momentum and mass, one copy a part; velocities: (E, nodes, 4).
     """
 
     def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
@@ -112,7 +128,7 @@ class BodyState:
                 self.planes[index, : len(p), :3] = planes[index]
         self.rates = np.zeros((e, n, 4, 4), np.float32)
         self.strains = np.zeros((e, n, 8), np.float32)
-        self.masses = np.zeros((e, PARTS, 1, 4), np.float32)
+        self.masses = np.zeros((e, COPIES, 1, 4), np.float32)
         self.velocities = np.zeros((e, 1, 4), np.float32)
         self._sums = np.zeros((e * PARTS * SUMS, 4), np.float32)
 
@@ -156,8 +172,8 @@ class BodyState:
         facts[environment, ORIGIN : ORIGIN + 3] = origin
         counts[environment, GRID : GRID + 3] = shape
         counts[environment, PARTICLES] = len(x)
-        for part in range(PARTS):
-            own = x[len(x) * part // PARTS : len(x) * (part + 1) // PARTS, 0]
+        for part in range(COPIES):
+            own = x[len(x) * part // COPIES : len(x) * (part + 1) // COPIES, 0]
             low, high = 0, 0
             if own.size:
                 low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
@@ -201,7 +217,7 @@ def stencil(x, origin, cell, low, high, ny, nz):
 def clear_masses(env, part, masses: ti.template(), counts: ti.template()):
     """This part's copy of the grid, where it may write."""
     plane = counts[env, GRID + 1] * counts[env, GRID + 2]
-    base = (env * PARTS + part) * counts[env, CAPACITY]
+    base = (env * COPIES + part) * counts[env, CAPACITY]
     for node in range(counts[env, SLAB + 2 * part] * plane, counts[env, SLAB + 2 * part + 1] * plane):
         masses[base + node] = vec4(0.0)
 
@@ -231,12 +247,14 @@ def particles_to_grid(
     impulse = -dt * facts[env, BODY_VOLUME] * 4.0 / cell
     origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
     ny, nz = counts[env, GRID + 1], counts[env, GRID + 2]
-    low, high = counts[env, SLAB + 2 * part], counts[env, SLAB + 2 * part + 1]
-    n, stride = counts[env, PARTICLES], counts[env, STRIDE]
-    base = (env * PARTS + part) * counts[env, CAPACITY]
+    copy = copy_of(part)
+    low, high = counts[env, SLAB + 2 * copy], counts[env, SLAB + 2 * copy + 1]
+    start = env * counts[env, STRIDE]
+    first_p, last_p = part_range(counts[env, PARTICLES], part)
+    base = (env * COPIES + copy) * counts[env, CAPACITY]
     dump = base + counts[env, GRID] * ny * nz  # three planes behind the grid, never read: for particles off the grid
     lost = 0
-    for p in range(env * stride + first_of(n, part, PARTS), env * stride + first_of(n, part + 1, PARTS)):
+    for p in range(start + first_p, start + last_p):
         inside, node, fx, w0, w1, w2 = stencil(points[p], origin, cell, low, high, ny, nz)
         lost += ti.select(inside, 0, 1)
         e, flow = strain_of(strains, p)
@@ -257,17 +275,17 @@ def particles_to_grid(
                 qj, zj = wy[j] * (qi + float(j) * yi), wy[j] * zi
                 line = first + (i * ny + j) * nz
                 for k in ti.static(range(3)):
-                    masses[line + k] = masses[line + k] + wz[k] * (qj + float(k) * zj)
-    partial[env, part, OFF_GRID] += float(lost)
+                    add_to(masses, line + k, wz[k] * (qj + float(k) * zj))
+    note_more(partial, env, slot_of(part), OFF_GRID, float(lost))
 
 
 @ti.func
 def node_sum(env, i, node, masses: ti.template(), counts: ti.template()):
     """Momentum and mass of a node in plane i: the copies of all parts, in their order."""
     q = vec4(0.0)
-    for part in ti.static(range(PARTS)):
+    for part in ti.static(range(COPIES)):
         if i >= counts[env, SLAB + 2 * part] and i < counts[env, SLAB + 2 * part + 1]:
-            q += masses[(env * PARTS + part) * counts[env, CAPACITY] + node]
+            q += masses[(env * COPIES + part) * counts[env, CAPACITY] + node]
     return q
 
 
@@ -282,6 +300,17 @@ def grid_to_particles(
     env, part, points: ti.template(), planes: ti.template(), rates: ti.template(), strains: ti.template(),
     velocities: ti.template(), sums: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(),
 ):  # fmt: skip
+    """`gather` with this part's share of `sums`."""
+    drop = (env * PARTS + part) * SUMS
+    gather(env, part, points, planes, rates, strains, velocities, sums, drop, facts, counts, partial)
+
+
+@ti.func
+def gather(
+    env, part, points: ti.template(), planes: ti.template(), rates: ti.template(), strains: ti.template(),
+    velocities: ti.template(), sums: ti.template(), drop: ti.template(), facts: ti.template(), counts: ti.template(),
+    partial: ti.template(),
+):  # fmt: skip
     """Velocity and affine velocity back to this part's particles; strain and position follow.
 
     No branch for particles off the grid, which would keep the compiler from merging lanes: they read some node of it,
@@ -290,11 +319,13 @@ def grid_to_particles(
     never, dt, cell = counts[env, NEVER], facts[env, STEP], facts[env, BODY_CELL]
     origin = vec3(facts[env, ORIGIN], facts[env, ORIGIN + 1], facts[env, ORIGIN + 2])
     ny, nz = counts[env, GRID + 1], counts[env, GRID + 2]
-    low, high = counts[env, SLAB + 2 * part], counts[env, SLAB + 2 * part + 1]
-    n, stride = counts[env, PARTICLES], counts[env, STRIDE]
-    base, drop = env * counts[env, CAPACITY], (env * PARTS + part) * SUMS
+    copy, slot = copy_of(part), slot_of(part)
+    low, high = counts[env, SLAB + 2 * copy], counts[env, SLAB + 2 * copy + 1]
+    start = env * counts[env, STRIDE]
+    first_p, last_p = part_range(counts[env, PARTICLES], part)
+    base = env * counts[env, CAPACITY]
     total, fastest, smallest = vec4(0.0), 0.0, 1e9
-    for p in range(env * stride + first_of(n, part, PARTS), env * stride + first_of(n, part + 1, PARTS)):
+    for p in range(start + first_p, start + last_p):
         _, node, fx, w0, w1, w2 = stencil(points[p], origin, cell, low, high, ny, nz)
         wx, wy, wz = vec3(w0[0], w1[0], w2[0]), vec3(w0[1], w1[1], w2[1]), vec3(w0[2], w1[2], w2[2])
         first = base + (node[0] * ny + node[1]) * nz + node[2]
@@ -303,18 +334,18 @@ def grid_to_particles(
             for j in ti.static(range(3)):
                 line = first + (i * ny + j) * nz
                 middle, end = velocities[line + 1], velocities[line + 2]
-                sums[drop + 4 * (j)] = wz[0] * velocities[line] + wz[1] * middle + wz[2] * end
-                sums[drop + 4 * (12 + j)] = wz[1] * middle + (2.0 * wz[2]) * end
-            new = wy[0] * sums[drop] + wy[1] * sums[drop + 4] + wy[2] * sums[drop + 8]
-            sums[drop + 4 * (3 + i)] = keep_or(never, sums[drop + 4 * (3 + i)], new)
-            new = wy[1] * sums[drop + 4] + (2.0 * wy[2]) * sums[drop + 8]
-            sums[drop + 4 * (6 + i)] = keep_or(never, sums[drop + 4 * (6 + i)], new)
-            new = wy[0] * sums[drop + 48] + wy[1] * sums[drop + 52] + wy[2] * sums[drop + 56]
-            sums[drop + 4 * (9 + i)] = keep_or(never, sums[drop + 4 * (9 + i)], new)
-        velocity = wx[0] * sums[drop + 12] + wx[1] * sums[drop + 16] + wx[2] * sums[drop + 20]
-        x = wx[1] * sums[drop + 16] + (2.0 * wx[2]) * sums[drop + 20]
-        y = wx[0] * sums[drop + 24] + wx[1] * sums[drop + 28] + wx[2] * sums[drop + 32]
-        z = wx[0] * sums[drop + 36] + wx[1] * sums[drop + 40] + wx[2] * sums[drop + 44]
+                sums[drop + APART * j] = wz[0] * velocities[line] + wz[1] * middle + wz[2] * end
+                sums[drop + APART * (12 + j)] = wz[1] * middle + (2.0 * wz[2]) * end
+            new = wy[0] * sums[drop] + wy[1] * sums[drop + APART] + wy[2] * sums[drop + APART * 2]
+            sums[drop + APART * (3 + i)] = keep_or(never, sums[drop + APART * (3 + i)], new)
+            new = wy[1] * sums[drop + APART] + (2.0 * wy[2]) * sums[drop + APART * 2]
+            sums[drop + APART * (6 + i)] = keep_or(never, sums[drop + APART * (6 + i)], new)
+            new = wy[0] * sums[drop + APART * 12] + wy[1] * sums[drop + APART * 13] + wy[2] * sums[drop + APART * 14]
+            sums[drop + APART * (9 + i)] = keep_or(never, sums[drop + APART * (9 + i)], new)
+        velocity = wx[0] * sums[drop + APART * 3] + wx[1] * sums[drop + APART * 4] + wx[2] * sums[drop + APART * 5]
+        x = wx[1] * sums[drop + APART * 4] + (2.0 * wx[2]) * sums[drop + APART * 5]
+        y = wx[0] * sums[drop + APART * 6] + wx[1] * sums[drop + APART * 7] + wx[2] * sums[drop + APART * 8]
+        z = wx[0] * sums[drop + APART * 9] + wx[1] * sums[drop + APART * 10] + wx[2] * sums[drop + APART * 11]
         scale = 4.0 / cell
         x, y, z = scale * (x - fx[0] * velocity), scale * (y - fx[1] * velocity), scale * (z - fx[2] * velocity)
         rates[p, 0] = keep_or(never, rates[p, 0], velocity)
@@ -329,7 +360,7 @@ def grid_to_particles(
         store_strain(strains, p, convect(e, step), flow)
         fastest = ti.max(fastest, ti.abs(velocity[0]), ti.abs(velocity[1]), ti.abs(velocity[2]))
         total += velocity
-    partial[env, part, SMALLEST_STEP_VOLUME] = ti.min(partial[env, part, SMALLEST_STEP_VOLUME], smallest)
-    partial[env, part, FASTEST] = ti.max(partial[env, part, FASTEST], fastest)
+    note_least(partial, env, slot, SMALLEST_STEP_VOLUME, smallest)
+    note_most(partial, env, slot, FASTEST, fastest)
     for d in ti.static(range(3)):
-        partial[env, part, MOTION + d] = total[d]
+        note_sum(partial, env, slot, MOTION + d, total[d])

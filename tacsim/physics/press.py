@@ -19,6 +19,7 @@ from tacsim.physics.controller import (
     plan,
     run,
 )
+from tacsim.physics.device import Mirror, run_press
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -39,9 +40,19 @@ from tacsim.physics.gel import (
 from tacsim.physics.health import Health, copies, judged, retried
 from tacsim.physics.hybrid import COURANT, ZETA_GEL, side_by_side
 from tacsim.physics.hybrid_kernels import Drive
-from tacsim.physics.indenter import BOX, CYLINDER, GRID, POINTS, SPHERE, indent
+from tacsim.physics.indenter import (
+    BOX,
+    CYLINDER,
+    GRID,
+    POINTS,
+    SPHERE,
+    Pressure,
+    Slip,
+    Values,
+    indent,
+)
 from tacsim.physics.inertia import Inertia, kernel_second, plan_in_time
-from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3
+from tacsim.physics.lanes import LANES, ON_DEVICE, PARTS, SLOTS, Counts, Facts, Partial, Work
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
@@ -69,10 +80,6 @@ from tacsim.shapes import distance_grid, extent
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 REACH = 3e-3  # of a mesh's distance grid, up from its tip [m]
-
-Slip = ti.types.ndarray(dtype=vec3, ndim=3)
-Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
-Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 
 @ti.kernel
@@ -137,6 +144,7 @@ class PressState:
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._work = np.zeros((len(scenes) * PARTS * SLOTS, LANES), np.float32)
+        self._mirror = Mirror()
         self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])
 
     def _set_shape(self, index: int, scene: Scene) -> np.ndarray:
@@ -151,10 +159,16 @@ class PressState:
         """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
         drive = side_by_side(drives, self.counts)
         self.gels.refresh()
-        run_team(
-            press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
-            self.counts, self._work, self.partial, active=list(drives),
-        )  # fmt: skip
+        if ON_DEVICE:
+            run_press(
+                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self.facts, self.counts,
+                self.partial,
+            )  # fmt: skip
+        else:
+            run_team(
+                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
+                self.counts, self._work, self.partial, active=list(drives),
+            )  # fmt: skip
 
 
 def _stacked(grids: Sequence[np.ndarray]) -> np.ndarray:

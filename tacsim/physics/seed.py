@@ -77,7 +77,10 @@ def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
 
 
 class SeedWorld:
-    """World of a scene with a body, by the seed's scheme. Raises ValueError without a body, or for one that hardens."""
+    """World of a scene with a body, by the seed's scheme.
+
+    Raises ValueError without a body, or for one that hardens; RuntimeError on a device (TACSIM_DEVICE).
+    """
 
     sensors: tuple[str, ...] = ("lower", "upper")
 
@@ -88,7 +91,7 @@ class SeedWorld:
             raise ValueError("physics 'seed' has no hardening (use 'hybrid', or leave out hardening_modulus)")
         if any(scene.gravity):
             raise ValueError("physics 'seed' has no gravity (use 'hybrid', or set gravity to [0, 0, 0])")
-        start()
+        start(cpu_only="physics 'seed'")
         self.scene = scene
         h = scene.spacing * MM
         self._dx, self._dt = CELL * h, COURANT * CELL * h

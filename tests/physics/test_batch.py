@@ -81,6 +81,7 @@ def fresh(batch: Batch, begin: list[Mapping[str, Any]]) -> Batch:
     return batch
 
 
+@pytest.mark.cpu
 def test_three_environments_are_three_worlds_to_the_bit(fresh: Batch) -> None:
     alone = [HybridWorld(scene) for scene in SCENES]
     assert len({len(world.truth().points) for world in alone}) == 3
@@ -95,6 +96,7 @@ def test_three_environments_are_three_worlds_to_the_bit(fresh: Batch) -> None:
         assert fresh.worlds[1].pose(name).position == pytest.approx(alone[1].pose(name).position)
 
 
+@pytest.mark.cpu
 def test_one_that_rests_does_not_change_and_moves_alone_later(fresh: Batch) -> None:
     before = state(fresh.worlds[1])
     ends = fresh.move([closed(fresh.worlds[0], 0.5e-3), None, closed(fresh.worlds[2], 0.5e-3)])
@@ -113,6 +115,7 @@ def test_nobody_moves(fresh: Batch) -> None:
     assert [state(world) for world in fresh.worlds] == before
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("fails", [1, RETRIES + 1])
 def test_one_that_diverges_is_taken_back_while_others_go_on(
     fresh: Batch, fails: int, monkeypatch: pytest.MonkeyPatch
@@ -155,6 +158,7 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
     assert isinstance(ends[2], SimulationDiverged) and "before the motion began" in str(ends[2])
 
 
+@pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
     arrays = fresh._state.particles.points, fresh._state.memory, fresh._state.gels.nodes
     nodes = fresh._state.particles.masses.shape[2]
@@ -216,6 +220,7 @@ def pressed(world: World, by: tuple[float, float, float]) -> dict[str, Pose]:
     return {"indenter": Pose(pose.position + by, pose.quaternion)}
 
 
+@pytest.mark.cpu
 def test_presses_of_several_indenters_are_worlds_to_the_bit(pressing: tuple[Scene, ...]) -> None:
     batch, alone = Batch(pressing), [PressWorld(scene) for scene in pressing]
     way = ((0.1e-3, 0, -0.5e-3), (0, 0, -0.3e-3), (0, -0.1e-3, -0.4e-3))
@@ -258,6 +263,7 @@ def test_wrong_targets_are_refused_before_anything_moves(fresh: Batch) -> None:
     assert [state(world) for world in fresh.worlds] == before
 
 
+@pytest.mark.cpu
 def test_a_batch_of_one_is_a_world(fresh: Batch) -> None:
     one, alone = Batch(SCENES[:1]), make_world(SCENES[0])
     assert one.move([closed(alone, 0.4e-3)]) == [alone.move(closed(alone, 0.4e-3))]

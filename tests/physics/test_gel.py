@@ -23,6 +23,8 @@ from tacsim.physics.layout import BACKING, COUNTS, FACTS, GEL_DAMPING, NUMBERS, 
 from tacsim.runtime import start, ti
 from tacsim.scene import Gel, GelMaterial
 
+pytestmark = pytest.mark.cpu
+
 
 @ti.kernel
 def substep(

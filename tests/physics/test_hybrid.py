@@ -120,6 +120,7 @@ def test_a_twist_is_felt_by_both_sensors() -> None:
     assert w.wrench("upper")[5] == pytest.approx(w.wrench("lower")[5], rel=0.1)  # its z points down: same sign
 
 
+@pytest.mark.cpu
 def test_bitwise_repeatable_and_restorable() -> None:
     results = []
     w = world()
@@ -136,6 +137,7 @@ def test_bitwise_repeatable_and_restorable() -> None:
             assert np.array_equal(result[name], results[0][name]), name
 
 
+@pytest.mark.cpu
 def test_nothing_is_recompiled_for_a_second_scene() -> None:
     world().move({})
     compiled = len(hybrid.substeps._primal.compiled_kernels) if hasattr(hybrid.substeps, "_primal") else None

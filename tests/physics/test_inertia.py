@@ -87,6 +87,7 @@ def test_without_a_duration_what_moved_stops() -> None:
     assert np.abs(world.snapshot()["velocity"]).max() == 0
 
 
+@pytest.mark.cpu
 def test_a_snapshot_keeps_the_kind_of_inertia() -> None:
     world = HybridWorld(Scene(gravity=(0, 0, -9.81), body=CUBE, gel=GEL))
     world.move({}, duration=1e-3)
@@ -99,6 +100,7 @@ def test_a_snapshot_keeps_the_kind_of_inertia() -> None:
     assert np.array_equal(world.truth().position, end)
 
 
+@pytest.mark.cpu
 def test_quasi_static_motions_do_not_know_the_density() -> None:
     """Scaled inertia: the path alone counts, so a heavier gel ends with the same bits."""
     ends = []
@@ -130,6 +132,7 @@ def test_the_advice_for_a_longer_duration_holds() -> None:
     assert FASTEST_DRIVE < 0.5
 
 
+@pytest.mark.cpu
 def test_loads_and_the_seed_have_no_duration() -> None:
     with pytest.raises(ValueError, match="loads"):
         HybridWorld(Scene(body=CUBE, gel=GEL)).move({}, loads={"upper": 0.1}, duration=1e-3)

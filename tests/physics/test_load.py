@@ -36,7 +36,7 @@ def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
     assert world.pose("lower").position[2] < pressed[2]
 
 
-@pytest.mark.parametrize("physics", ["hybrid", "seed"])
+@pytest.mark.parametrize("physics", ["hybrid", pytest.param("seed", marks=pytest.mark.cpu)])
 def test_the_load_stays_through_a_shear(physics: str) -> None:
     body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=BodyMaterial(yield_stress=30e3))
     world = make_world(Scene(body=body, physics=physics))  # type: ignore[arg-type]

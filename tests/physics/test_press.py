@@ -126,6 +126,7 @@ def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
     assert np.abs(a.surface("lower").displacement - b.surface("lower").displacement).max() < 10e-6
 
 
+@pytest.mark.cpu
 def test_a_motion_driven_launch_by_launch_is_the_move() -> None:
     """Two worlds advanced in turns, each at its own phase, end as by `move`, to the bit."""
     alone = [world(Sphere(radius=4e-3)) for _ in range(2)]

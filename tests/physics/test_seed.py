@@ -12,6 +12,8 @@ from tacsim.physics.world import World
 from tacsim.runtime import start
 from tacsim.scene import Body, BodyMaterial, Box, Gel, Scene, Settling
 
+pytestmark = pytest.mark.cpu
+
 CLAY = BodyMaterial(yield_stress=30e3)
 
 

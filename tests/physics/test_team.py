@@ -11,6 +11,8 @@ from tacsim.physics.batch import Batch
 from tacsim.physics.press import PressWorld
 from tacsim.scene import Gel, Indenter, Scene, Sphere
 
+pytestmark = pytest.mark.cpu
+
 
 def scene(radius: float) -> Scene:
     return Scene(body=None, indenter=Indenter(geometry=Sphere(radius=radius)), gel=Gel(size=(8e-3, 8e-3, 4e-3)))

@@ -49,7 +49,7 @@ class Hand:
             raise EndOfEpisode(f"{self.frames} frames")
         return TactileFrame(np.full((8, 8, 3), self.ticks, np.uint8), self.now(), self.ticks)
 
-    def state(self) -> ArmState:
+    def state(self, at: float | None = None) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), None, self.now())
 
     def command(self, target: Pose | None) -> Pose | None:

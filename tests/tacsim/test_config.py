@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from tacsim.config import KINDS, ConfigError, config_root, json_schema, load, load_rig, load_scene, load_sensor, names
 from tacsim.config.document import Reading, _Loader, as_json, dump, parse_text
 from tacsim.config.load import load_task
+from tacsim.hardware import UrArmFacts
 from tacsim.rigfile import ReplaySensorFacts, RepositionFacts, SimSensorFacts, SqueezeFacts
 from tacsim.scene import BodyMaterial, Box, Cylinder, GelMaterial, Sphere
 
@@ -329,3 +331,36 @@ def test_the_loader_is_a_safe_one() -> None:
     assert issubclass(_Loader, yaml.SafeLoader)
     with pytest.raises(KeyError):
         names("robot")
+
+
+def test_overrides_do_not_loosen_the_limits_of_a_real_arm() -> None:
+    for override, words in {
+        "arms.upper.limits.force=100": "limits.force: 20 -> 100",
+        "arms.upper.limits.workspace.upper=[1, 1, 1]": "limits.workspace: reaches farther",
+        "arms.lower.action_timeout=1": "action_timeout: 0.2 -> 1",
+        "keep_out=[]": "keep_out of lower and upper",
+    }.items():
+        with pytest.raises(ConfigError, match=re.escape(words)) as refused:
+            load_rig("ur5e", overrides=[override])
+        assert "write it into the rig file" in str(refused.value)
+
+
+def test_overrides_may_narrow_the_limits_of_a_real_arm_and_change_those_of_a_mock() -> None:
+    arm = load_rig("ur5e", overrides=["arms.upper.limits.force=10", "arms.upper.limits.depth=1 mm"]).facts.arms["upper"]
+    assert isinstance(arm, UrArmFacts) and arm.limits.force == 10 and arm.limits.depth == 1e-3
+    arm = load_rig("mock", overrides=["arms.upper.limits.force=100"]).facts.arms["upper"]
+    assert isinstance(arm, UrArmFacts) and arm.limits.force == 100
+
+
+def test_a_real_arm_without_limits_or_with_a_slow_watchdog_is_refused(tmp_path: Path) -> None:
+    text = (config_root() / "rigs/ur5e.yaml").read_text()
+    slow = tmp_path / "slow.yaml"
+    slow.write_text(text.replace("watchdog: 10", "watchdog: 2", 1))
+    with pytest.raises(ConfigError, match="at least 10 Hz"):
+        load_rig(slow)
+    lines = text.splitlines()
+    first = next(index for index, line in enumerate(lines) if "workspace:" in line)
+    bare = tmp_path / "bare.yaml"
+    bare.write_text("\n".join(lines[:first] + lines[first + 1 :]) + "\n")
+    with pytest.raises(ConfigError, match="workspace"):
+        load_rig(bare)

@@ -48,7 +48,7 @@ class Parts:
         self.note("read")
         return self.frame(7)
 
-    def state(self) -> ArmState:
+    def state(self, at: float | None = None) -> ArmState:
         self.note("state")
         return ArmState(Pose(), np.zeros(6), np.zeros(6), None, self.time)
 

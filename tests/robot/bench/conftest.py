@@ -14,6 +14,7 @@ from robot.bench.press import layer
 PITCH = 0.0625e-3  # of image and FFT grid alike [m]
 SIZE = 200  # px
 
+
 def dented(
     ball: float, depth: float, centre: tuple[float, float], thickness: float = 10e-3
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float]:

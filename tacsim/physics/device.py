@@ -1,0 +1,284 @@
+"""The same physics on a device (a GPU): one thread a particle, element or node, one kernel a substep.
+
+Threads of a device cannot meet inside a loop, so each phase of a substep is a loop of its own, and the host counts the
+substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only
+the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
+
+Arrays stay on the device for a launch. Before it they are copied there, after it what has changed is copied back, so
+everybody else goes on working with NumPy.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from tacsim.physics.gel import (
+    Corners,
+    GelState,
+    Lattice,
+    NodeLanes,
+    Skin,
+    Touch,
+    element_block,
+    gel_advance,
+    node_block,
+)
+from tacsim.physics.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
+from tacsim.physics.indenter import Pressure, Slip, Values, indent
+from tacsim.physics.lanes import (
+    PARTS,
+    SLOTS,
+    Counts,
+    Facts,
+    Partial,
+    empty_four,
+    empty_lanes,
+    note_least,
+    real,
+    vec3,
+    vec4,
+)
+from tacsim.physics.layout import (
+    BACKING,
+    CAPACITY,
+    FORCE,
+    GRID,
+    HOUSED,
+    MOTION,
+    OVERLAP,
+    PARTICLES,
+    SMALLEST_VOLUME,
+    STEPS,
+)  # fmt: skip
+from tacsim.physics.plasticine import (
+    SUMS,
+    BodyState,
+    Masses,
+    Points,
+    Rates,
+    Strains,
+    Velocities,
+    gather,
+    particles_to_grid,
+)
+from tacsim.runtime import ti
+
+Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
+
+
+@ti.func
+def goes(env, it, counts: ti.template()):
+    """Whether an environment takes part in this substep."""
+    return it < counts[env, STEPS]
+
+
+@ti.func
+def clear_sums(env, slot, partial: ti.template()):
+    """What parts add up anew each substep, but for the particles' motion, which outlives it."""
+    partial[env, slot, OVERLAP] = 0.0
+    for n in range(12):
+        partial[env, slot, FORCE + n] = 0.0
+    for n in range(3):
+        partial[env, slot, BACKING + n] = 0.0
+    for n in range(6):
+        partial[env, slot, HOUSED + n] = 0.0
+
+
+@ti.func
+def element(
+    env, gel, k, block, nodes: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(),
+    partial: ti.template(), layers, nx, ny,
+):  # fmt: skip
+    """Forces of one element on its corners; gel: counted over all environments."""
+    work = [empty_lanes() for _ in range(SLOTS)]  # registers, where the CPU has memory
+    blocks = (nx + 1) * (ny + 1)
+    axis, row, margin = (layers + 1) * blocks, blocks + ny + 2, ny + 2
+    u = margin + gel * 9 * axis + k * blocks + block
+    to = margin + (gel * layers + k) * 24 * row + ny + 2 + block
+    jacobian = element_block(
+        env, u, axis, blocks, to, row, block, nodes, nodes, nodes, nodes, 1, ny + 1, corners, lattice, facts, work, 0, 0
+    )
+    note_least(partial, env, block % PARTS, SMALLEST_VOLUME, jacobian.min())
+
+
+@ti.func
+def column(
+    env, g, gels, block, nodes: ti.template(), skin: ti.template(), touch: ti.template(), corners: ti.template(),
+    lattice: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
+):  # fmt: skip
+    """Forces on one column of nodes of gel g, from its backing to its surface, and its motion."""
+    gel, blocks = env * gels + g, (nx + 1) * (ny + 1)
+    axis, row, margin = (layers + 1) * blocks, blocks + ny + 2, ny + 2
+    for k in range(layers + 1):
+        i = margin + (gel * layers + ti.min(k, layers - 1)) * 24 * row + ny + 2 + block
+        j = margin + (gel * layers + ti.max(k - 1, 0)) * 24 * row + ny + 2 + block
+        below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
+        for d in ti.static(range(3)):
+            node_block(
+                margin + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
+                nodes, corners, corners, corners, corners, 1, ny + 1, 0,
+            )  # fmt: skip
+    gel_advance(
+        env, g * blocks + block, gels, nodes, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny
+    )
+
+
+@ti.kernel
+def press_substep(
+    it: ti.i32, drive: Drive,
+    nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    slip: Slip, pressure: Pressure, values: Values, facts: Facts, counts: Counts, partial: Partial, layers: ti.i32,
+):  # fmt: skip
+    """One substep of every environment's indenter on its gel; see `tacsim.physics.press.press_substeps`."""
+    for at in range(counts.shape[0] * PARTS):
+        if goes(at // PARTS, it, counts):
+            clear_sums(at // PARTS, at % PARTS, partial)
+    for env, n in ti.ndrange(touch.shape[0], touch.shape[3]):
+        if goes(env, it, counts):
+            touch[env, 0, 0, n] = vec4(0.0)
+    for env, k, n in ti.ndrange(counts.shape[0], layers, touch.shape[3]):
+        if goes(env, it, counts):
+            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            element(env, env, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
+    for env, cell in ti.ndrange(counts.shape[0], (skin.shape[3] - 3) * (skin.shape[4] - 3)):
+        if goes(env, it, counts):
+            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            indent(env, cell, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
+    for env, n in ti.ndrange(counts.shape[0], touch.shape[3]):
+        if goes(env, it, counts):
+            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            column(env, 0, 1, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
+
+
+@ti.kernel
+def hybrid_substep(
+    it: ti.i32, drive: Drive,
+    nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities,
+    memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
+    layers: ti.i32, room: ti.i32, most: ti.i32,
+):  # fmt: skip
+    """One substep of every environment's two gels and body; see `tacsim.physics.hybrid_kernels.substeps`.
+
+    room: particles of the largest body; most: nodes of the largest grid.
+    """
+    for at in range(counts.shape[0] * PARTS):
+        if goes(at // PARTS, it, counts):
+            clear_sums(at // PARTS, at % PARTS, partial)
+    for env, g in ti.ndrange(counts.shape[0], 2):
+        if goes(env, it, counts):
+            ceiling[env, g] = 0.0
+    for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
+        if goes(env, it, counts):
+            touch[env, 0, g, n] = vec4(0.0)
+            row = skin.shape[4] - 2
+            height = skin[env, g, 0, n // row + 1, n % row + 1][2]
+            if height > ceiling[env, g]:
+                ti.atomic_max(ceiling[env, g], height)
+    for env, node in ti.ndrange(counts.shape[0], most):
+        if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
+            masses[env * counts[env, CAPACITY] + node] = vec4(0.0)
+    for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, touch.shape[3]):
+        if goes(env, it, counts):
+            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            element(env, env * 2 + g, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
+    for env, p in ti.ndrange(counts.shape[0], room):
+        if goes(env, it, counts) and p < counts[env, PARTICLES]:
+            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            for g in range(2):
+                touch_gel(
+                    env, p, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
+                    ceiling[env, g], layers, nx, ny,
+                )  # fmt: skip
+    for env, p in ti.ndrange(counts.shape[0], room):
+        if goes(env, it, counts) and p < counts[env, PARTICLES]:
+            particles_to_grid(env, p, points, rates, strains, masses, facts, counts, partial)
+    for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
+        if goes(env, it, counts):
+            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            column(env, g, 2, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
+    for env, node in ti.ndrange(counts.shape[0], most):
+        if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
+            grid_update(env, node, it, drive, masses, velocities, facts, counts, partial)
+    for at in range(counts.shape[0] * PARTS):
+        if goes(at // PARTS, it, counts):
+            for d in range(3):
+                partial[at // PARTS, at % PARTS, MOTION + d] = 0.0
+    for env, p in ti.ndrange(counts.shape[0], room):
+        if goes(env, it, counts) and p < counts[env, PARTICLES]:
+            sums = [empty_four() for _ in range(SUMS)]
+            gather(env, p, points, planes, rates, strains, velocities, sums, 0, facts, counts, partial)
+
+
+class Mirror:
+    """What a device has of the host's arrays, by name; made when first asked for, and anew when a shape changes."""
+
+    def __init__(self) -> None:
+        self._there: dict[str, Any] = {}
+
+    def room(self, name: str, dtype: Any, shape: tuple[int, ...]) -> Any:
+        """An array that only the device uses; zeros at first."""
+        known = self._there.get(name)
+        if known is None or known.shape != shape:
+            self._there[name] = known = ti.ndarray(dtype, shape)
+            known.fill(0)
+        return known
+
+    def sent(self, name: str, host: np.ndarray, dtype: Any) -> Any:
+        """A copy of `host`, whose last axis is the vector if dtype is one."""
+        there = self.room(name, dtype, host.shape[:-1] if isinstance(dtype, type(vec4)) else host.shape)
+        there.from_numpy(np.ascontiguousarray(host))
+        return there
+
+    def bring(self, **hosts: np.ndarray) -> None:
+        """Copies back into these arrays what the device has by their names."""
+        for name, host in hosts.items():
+            host[...] = self._there[name].to_numpy().reshape(host.shape)
+
+    def send_gels(self, gels: GelState) -> tuple[Any, ...]:
+        """What every kernel with gels takes."""
+        nodes, skin, touch, corners, lattice = gels.memory()
+        return (
+            self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, vec4),
+            self.room("touch", vec4, touch.shape[:-1]), self.room("corners", real, corners.shape),
+            self.sent("lattice", lattice.reshape(-1, 1), real),
+        )  # fmt: skip
+
+
+def run_press(
+    mirror: Mirror, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray, values: np.ndarray,
+    facts: np.ndarray, counts: np.ndarray, partial: np.ndarray,
+) -> None:  # fmt: skip
+    """One launch; the arrays are those of `PressState`."""
+    arguments = (
+        mirror.sent("drive", drive, ti.f32), *mirror.send_gels(gels), mirror.sent("slip", slip, vec3),
+        mirror.sent("pressure", pressure, ti.f32), mirror.sent("values", values, ti.f32),
+        mirror.sent("facts", facts, ti.f32), mirror.sent("counts", counts, ti.i32),
+        mirror.sent("partial", partial, ti.f32),
+    )  # fmt: skip
+    for it in range(drive.shape[1]):
+        press_substep(it, *arguments, gels.nodes.shape[4] - 1)
+    mirror.bring(nodes=gels.memory()[0], slip=slip, pressure=pressure, partial=partial)
+
+
+def run_hybrid(
+    mirror: Mirror, drive: np.ndarray, gels: GelState, body: BodyState, memory: np.ndarray, facts: np.ndarray,
+    counts: np.ndarray, partial: np.ndarray,
+) -> None:  # fmt: skip
+    """One launch; the arrays are those of `HybridState`."""
+    points, planes, rates, strains, masses, velocities, _ = body.arguments()
+    arguments = (
+        mirror.sent("drive", drive, ti.f32), *mirror.send_gels(gels), mirror.sent("points", points, vec4),
+        mirror.sent("planes", planes, vec4), mirror.sent("rates", rates, vec4), mirror.sent("strains", strains, vec4),
+        mirror.room("masses", vec4, masses.shape[:-1]), mirror.room("velocities", vec4, velocities.shape[:-1]),
+        mirror.sent("memory", memory, vec4), mirror.sent("facts", facts, ti.f32),
+        mirror.sent("counts", counts, ti.i32), mirror.sent("partial", partial, ti.f32),
+        mirror.room("ceiling", ti.f32, (len(counts), 2)),
+    )  # fmt: skip
+    layers, most = gels.nodes.shape[4] - 1, int(counts[:, GRID : GRID + 3].prod(axis=1).max())
+    for it in range(drive.shape[1]):
+        hybrid_substep(it, *arguments, layers, body.points.shape[1], most)
+    mirror.bring(
+        nodes=gels.memory()[0], points=points, planes=planes, rates=rates, strains=strains, memory=memory,
+        partial=partial,
+    )  # fmt: skip

@@ -149,12 +149,16 @@ def way_inside(start: ArrayLike, end: ArrayLike, inside: Region) -> float:
 
     From outside, a way that ends inside is free (it only gets better), and any other is closed.
     """
-    here = inside.normals @ np.asarray(start, dtype=np.float64) - inside.offsets
-    there = inside.normals @ np.asarray(end, dtype=np.float64) - inside.offsets
-    leaving = there > ROUNDING
-    if not leaving.any():
-        return 1.0
-    return float((np.maximum(-here[leaving], 0.0) / (there[leaving] - here[leaving]).clip(min=ROUNDING)).min())
+    return float(ways_inside(start, end, inside))
+
+
+def ways_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> FloatArray:
+    """:func:`way_inside` of many ways at once: (..., 3) and (..., 3) -> (...,)."""
+    here = np.asarray(starts, dtype=np.float64) @ inside.normals.T - inside.offsets
+    there = np.asarray(ends, dtype=np.float64) @ inside.normals.T - inside.offsets
+    shares: FloatArray = np.maximum(-here, 0.0) / (there - here).clip(min=ROUNDING)
+    least: FloatArray = np.where(there > ROUNDING, shares, 1.0).min(-1)
+    return least
 
 
 def way_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: float) -> float:

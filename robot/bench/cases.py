@@ -6,11 +6,19 @@ from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
-from robot.bench import deep, incline, materials, press, real, scenes, squeeze
+from robot.bench import deep, incline, materials, press, real, reliability, scenes, squeeze
 from robot.bench.runner import Case
 from robot.bench.schema import Group
 
-CASES: tuple[Case, ...] = (*press.CASES, *squeeze.CASES, *deep.CASES, *incline.CASES, *materials.CASES, *scenes.CASES)
+CASES: tuple[Case, ...] = (
+    *press.CASES,
+    *squeeze.CASES,
+    *deep.CASES,
+    *incline.CASES,
+    *materials.CASES,
+    *scenes.CASES,
+    *reliability.CASES,
+)
 
 
 def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None) -> list[Case]:

@@ -86,18 +86,18 @@ def markdown(report: Report) -> str:
         "run, each case in a process of its own, kernels compiled before the clock starts. Seconds are the median of "
         "wall time ± interquartile range (none with fewer than three repetitions), CPU s the processor time of all "
         "threads.",
-        _setting(report),
+        setting(report),
         f"![Time against error, by method](images/{PICTURE})",
         "## Figures",
         FIGURES,
-        _table(targets.HEADER, targets.lines(report.results)),
+        table(targets.HEADER, targets.lines(report.results)),
         "## How to read and rerun",
         READING,
     ]
     for group, words in GROUP_WORDS.items():
         rows = [row for row in report.results if row.group == group]
         if rows:
-            parts += [f"## {words}", _table(COLUMNS, map(cells, rows)), *_remarks(rows)]
+            parts += [f"## {words}", table(COLUMNS, map(cells, rows)), *_remarks(rows)]
         if group == "real" and rows:
             parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
     if report.failures:
@@ -110,7 +110,8 @@ def markdown(report: Report) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _setting(report: Report) -> str:
+def setting(report: Report) -> str:
+    """Machine, load, date, commit and versions of a run, in a sentence or two."""
     facts = report.metadata
     machine = facts.machine
     loads = [load for load in (machine.load_before, machine.load_after) if load is not None]
@@ -141,6 +142,7 @@ def _remarks(rows: Sequence[Row]) -> list[str]:
     return ["\n".join(lines)]
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])

@@ -97,7 +97,8 @@ class Controller:
     def refuse(self) -> None:
         """Closes the ports; who is connected stays."""
         for listener in self._listeners:
-            self._unwatch(listener)
+            if not self.faults.black_hole:  # else nobody watches it
+                self._unwatch(listener)
             listener.close()
         self._listeners.clear()
 

@@ -217,6 +217,24 @@ def test_all_fields_of_a_state_are_of_one_instant(arm: URArm) -> None:
     assert torn == 0
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm) -> None:
+    """As a policy looks, all the time and in motion: whatever is read is of one package."""
+    start = arm.state().pose
+    flange_from_tool = se3.to_matrix(arm.facts.flange_from_tool.pose)
+    packages = set()
+    for look in range(100_000):
+        if look % 5_000 == 0:
+            arm.command(moved(start, x=0.03 * (-1) ** (look // 5_000)))
+        record = arm._link.states.latest()
+        assert record is not None
+        packages.add(float(record["stamp"]))
+        expected = KINEMATICS.forward(record["joints"], flange_from_tool)
+        assert np.abs(expected - matrix(record["tcp_pose"])).max() < 1e-9
+    assert len(packages) > 100
+
+
 def test_pose_between_packages(arm: URArm) -> None:
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.05))
@@ -599,9 +617,17 @@ POLICY = """
     arm.command(Pose(start.position + [0.12, 0.0, 0.0], start.quaternion))
     while abs(arm.state().pose.position[0] - start.position[0]) < 0.02:
         time.sleep(0.001)
-    print(arm._segment.name, flush=True)
+    print(arm._segment.name, arm._process.pid, flush=True)
     time.sleep(60)
 """
+
+
+def running(process: int) -> bool:
+    """False also for one that has ended and that nobody has asked for its exit status."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
@@ -620,8 +646,7 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(mock: MockUR,
         text=True,
     )
     assert policy.stdout is not None
-    segment = policy.stdout.readline().strip()
-    assert segment
+    segment, worker = policy.stdout.readline().split()
     before = mock.door.state()
     assert not before.rests
     policy.send_signal(number)
@@ -632,6 +657,7 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(mock: MockUR,
     until(lambda: not mock.door.state().program, "end of the program")
     until(lambda: 30004 not in mock.door.state().clients, "closed sockets")
     until(lambda: not (snapshot.FOLDER / segment).exists(), "removed memory")
+    until(lambda: not running(int(worker)), "end of the worker")
 
 
 # -- one commander ---------------------------------------------------------------------------------------------------
@@ -753,6 +779,23 @@ def test_nothing_is_left_after_close(mock: MockUR) -> None:
     arm.stop()
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
+def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
+    before = open_files()
+    arm = URArm(facts(watchdog=10.0), "left")
+    in_motion(arm, moved(arm.state().pose, x=0.1))
+    worker = arm._process
+    assert worker is not None
+    os.kill(worker.pid, signal.SIGKILL)
+    until(lambda: arm.status() == ArmStatus.WORKER_DEAD, "death")
+    arm.close()
+    assert worker.returncode == -signal.SIGKILL  # reaped, no zombie
+    assert leftovers("left") == []
+    assert open_files() == before
+    until(lambda: not mock.door.state().program, "the watchdog's stop")
+    until(lambda: set(mock.door.state().clients) <= {30020}, "closed sockets")
+
+
 def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
     arm = URArm(facts(), "left")
     assert arm._process is not None
@@ -837,8 +880,13 @@ def test_both_arms_stop_when_one_does(pair: tuple[URArm, URArm, MockUR]) -> None
     until(lambda: right.status() == ArmStatus.PROTECTIVE_STOP, "protective stop")
     with pytest.raises(SafetyViolation, match="stopped because the other arm did"):
         left.command(a)
-    # Within two periods of the stop's publication: the loops count them.
     until(left.at_rest, "rest")
+    # Within two periods of the stop's publication, as the loop of the arm that hears of it counts them.
+    told = right._link.states.recent(HISTORY)
+    told = told[told["status"] == ArmStatus.PROTECTIVE_STOP][0]["beat"]
+    heard = left._link.states.recent(HISTORY)
+    before = heard[heard["beat"] < told][-1]["cycles"]
+    assert heard[heard["status"] == ArmStatus.PARTNER_STOPPED][0]["cycles"] - before <= 2
     right.recover()
     left.recover()
     go(left, a)

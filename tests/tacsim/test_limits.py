@@ -25,6 +25,7 @@ from tacsim.limits import (
     stopping_distance,
     way_clear,
     way_inside,
+    ways_inside,
 )
 
 START = se3.from_rotation_vector([0.1, -0.2, 0.3], [0.4, 0.0, 0.0])
@@ -165,6 +166,18 @@ def test_many_hostile_targets_are_refused_or_shortened_into_the_box() -> None:
         way, whole = sent.position - now.position, wanted.position - now.position
         assert np.allclose(way, share * whole, atol=1e-9)
     assert shortened > 1_000
+
+
+def test_a_million_hostile_ways_end_inside() -> None:
+    rows = hostile(1_000_000, seed=2)
+    ends = rows[finite_targets(rows), :3]
+    starts = np.random.default_rng(2).uniform([0.0, -0.2, 0.1], BOX[1], ends.shape)  # on the free side of the slope
+    shares = ways_inside(starts, ends, SLOPE)
+    assert ((shares >= 0.0) & (shares <= 1.0)).all()
+    assert (shares < 1.0).sum() > 100_000
+    assert SLOPE.excess(starts + shares[:, None] * (ends - starts)).max() <= 1e-9
+    some = range(0, len(ends), 5_000)
+    assert [way_inside(starts[k], ends[k], SLOPE) for k in some] == pytest.approx(shares[some].tolist(), abs=1e-12)
 
 
 @given(points, points)

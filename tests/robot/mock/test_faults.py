@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from robot.mock import Door, DoorError, MockUR
-from robot.mock.client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
+from robot.mock.client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, loopback_host
 from robot.mock.controller import PORTS
 
 
@@ -173,6 +173,12 @@ def test_black_hole(mock: MockUR, door: Door) -> None:
             other.settimeout(TIMEOUT)
             assert other.recv(100).startswith(b"Connected")
         client.receive()
+
+
+def test_a_black_hole_ends_as_quietly_as_any_mock() -> None:
+    with MockUR(loopback_host(8), ready_timeout=60) as mock:
+        mock.door.black_hole(True)
+    assert mock._process.returncode == 0
 
 
 def test_delay_is_at_least_what_was_asked(mock: MockUR, door: Door) -> None:

@@ -157,7 +157,7 @@ def _sensor(name: str, facts: object, bench: MockBench) -> TactileSource:
     if isinstance(facts, CameraSensorFacts):
         camera = Camera(facts, name)
         # With a model of the light, the normaliser finds the surface in the picture.
-        camera.spec = replace(camera.spec, height=facts.model is not None)
+        camera.spec = replace(camera.spec, height=facts.model is not None or facts.calibration is not None)
         return camera
     assert isinstance(facts, SimSensorFacts)
     return TwinSensor(bench, name, facts)

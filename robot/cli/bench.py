@@ -48,9 +48,7 @@ def bench(
     repeat: Annotated[int, typer.Option(min=1, max=1000, help="Timed repetitions; a case stops at 1 s of them.")] = 5,
     docs: Annotated[
         Path | None,
-        typer.Option(
-            "--docs", metavar="DIR", help="Write the pages here: benchmarks.md, reliability.md."
-        ),
+        typer.Option("--docs", metavar="DIR", help="Write the pages here: benchmarks.md, reliability.md."),
     ] = None,
     from_: Annotated[
         Path | None, typer.Option("--from", metavar="FILE", help="Measure nothing: show this report of an earlier run.")

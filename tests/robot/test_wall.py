@@ -33,6 +33,7 @@ from robot.mock.fixtures import mock_host, rig_addresses
 from robot.open import open_rig
 from robot.snapshot import FOLDER
 from robot.start import NotConfirmed, NoTouch
+from robot.wall import RigArm
 from tacsim.config import ConfigError, load_rig
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import Action, ArmState, Needs, Observation, Pose

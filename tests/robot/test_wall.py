@@ -117,14 +117,11 @@ def cameras_of(facts: RigFacts) -> Iterator[dict[str, MockCamera]]:
 
 
 @contextlib.contextmanager
-def opened(rig: Path | str, *overrides: str, dry_run: bool = False, patient: bool = True) -> Iterator[Opened]:
-    """`patient`: no time-out of the arms depends on how busy the machine is."""
+def opened(rig: Path | str, *overrides: str, dry_run: bool = False, link_timeout: float = 20.0) -> Iterator[Opened]:
+    """No time-out of the arms depends on how busy the machine is; `link_timeout` [s] is long for the same reason."""
     facts = load_rig(rig, overrides=overrides).facts
-    if patient:  # model_copy does not validate
-        slow = {"link_timeout": 20.0, "watchdog": 0.05, "action_timeout": 5.0}
-        facts = facts.model_copy(
-            update={"arms": {name: arm.model_copy(update=slow) for name, arm in facts.arms.items()}}
-        )
+    slow = {"link_timeout": link_timeout, "watchdog": 0.05, "action_timeout": 5.0}  # model_copy does not validate
+    facts = facts.model_copy(update={"arms": {name: arm.model_copy(update=slow) for name, arm in facts.arms.items()}})
     benches: list[MockBench] = []
 
     class Kept(MockBench):
@@ -439,7 +436,7 @@ def test_closing_leaves_nothing_and_may_be_done_twice(tmp_path: Path) -> None:
 
 
 def one_killed(folder: Path, first: int, victim: Callable[[Opened], int]) -> EpisodeFailed:
-    with opened(bare_file(folder, first), patient=False) as found:
+    with opened(bare_file(folder, first), link_timeout=6.0) as found:
         failed = failing(found.rig, lambda: os.kill(victim(found), signal.SIGKILL))
         with contextlib.suppress(DeviceError, ExceptionGroup):
             found.rig.stop()

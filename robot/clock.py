@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -49,10 +49,13 @@ def drive(arms: Mapping[str, Driven], timeout: float) -> None:
 
 
 class WallClock:
-    """Ticks at a fixed rate. A period that is missed is not made up for, but counted."""
+    """Ticks at a fixed rate. A period that is missed is not made up for, but counted.
 
-    def __init__(self, period: float) -> None:
-        self._period = period
+    catch_up: waits until what is simulated, if anything is, has seen where the arms are now.
+    """
+
+    def __init__(self, period: float, catch_up: Callable[[], None] | None = None) -> None:
+        self._period, self._catch_up = period, catch_up
         self._deadline: float | None = None
         self.periods: list[float] = []  # of the last ticks [s]
         self.late = 0
@@ -79,6 +82,8 @@ class WallClock:
 
     def look(self) -> None:
         """Lets packages and pictures of what just happened arrive: one period, at least 0.1 s."""
+        if self._catch_up is not None:
+            self._catch_up()
         time.sleep(max(0.1, self._period))
 
     def restart(self) -> None:

@@ -113,9 +113,14 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
         cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
         fed = {name: camera for name, camera in cameras.items() if name in bench.cameras}
         lock_step = facts.lock_step and not real and bench.simulated
-        clock = LockStep(facts.period, arms, fed, bench) if lock_step else WallClock(facts.period)
-        if bench.simulated and not lock_step:
+        clock: LockStep | WallClock
+        if lock_step:
+            clock = LockStep(facts.period, arms, fed, bench)
+        elif bench.simulated:
             bench.run_free()
+            clock = WallClock(facts.period, bench.catch_up)
+        else:
+            clock = WallClock(facts.period)
         normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
         task = facts.task
         start = GuidedStart(

@@ -54,6 +54,7 @@ class MockBench:
         self._stop = threading.Event()
         self._free: threading.Thread | None = None
         self._failure: Exception | None = None
+        self._looks = 0  # while running free
         self._mocked = {
             name: arm for name, arm in facts.arms.items() if isinstance(arm, UrArmFacts) and arm.mock is not None
         }
@@ -191,6 +192,17 @@ class MockBench:
             self._free = threading.Thread(target=self._follow, name="mock bench", daemon=True)
             self._free.start()
 
+    def catch_up(self) -> None:
+        """While running free: waits until the bench has looked at the arms anew, from now on. An approach that did not
+        wait would go on while the simulator is still busy with the first touch.
+
+        Raises DeviceError if it follows no more.
+        """
+        wanted = self._looks + 2  # the look under way may have begun before
+        while self._looks < wanted:
+            self.check()
+            time.sleep(FREE_RUN)
+
     def check(self) -> None:
         """Raises DeviceError if the thread that follows the arms has failed."""
         if self._failure is not None:
@@ -200,6 +212,7 @@ class MockBench:
         try:
             while not self._stop.wait(FREE_RUN):
                 self.step()
+                self._looks += 1
         except Exception as failure:
             if not self._stop.is_set():
                 self._failure = failure

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
 from robot import clock as clocks
 from robot.clock import Driven, LockStep, WallClock, drive
 from robot.errors import DeviceError, ProtectiveStop
+from robot.mock.bench import MockBench
 from tacsim.interface import Pose
 
 PERIOD = 0.1  # [s]
@@ -149,3 +152,27 @@ def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Tim
     clock.tick()
     assert log == [("step", 4, clocks.SETTLED), ("picture", 17)]
     assert clock.period == PERIOD and clock.diagnostics() == {}
+
+
+def test_a_look_waits_for_the_simulator_first() -> None:
+    """Else an approach would go on while the simulator is busy with the first touch."""
+    seen: list[str] = []
+    WallClock(PERIOD, lambda: seen.append("caught up")).look()
+    assert seen == ["caught up"]
+
+
+def test_catching_up_needs_a_look_that_began_afterwards_and_tells_of_a_failure() -> None:
+    bench = object.__new__(MockBench)
+    bench._looks, bench._failure = 5, None
+
+    def look() -> None:
+        bench._looks += 1
+
+    timers = [threading.Timer(0.05 * k, look) for k in (1, 2)]
+    for timer in timers:
+        timer.start()
+    bench.catch_up()
+    assert bench._looks == 7
+    bench._failure = RuntimeError("no more")
+    with pytest.raises(DeviceError, match="no more"):
+        bench.catch_up()

@@ -90,7 +90,7 @@ def _truth(world: World) -> Truth:
 
 
 CASES = (
-    Case("squeeze", "slab", "tacsim", PRESETS["draft"], partial(slab, "draft")),
+    Case("squeeze", "slab", "tacsim", PRESETS["draft"], partial(slab, "draft"), long=True),
     Case("squeeze", "slab", "tacsim", PRESETS["standard"], partial(slab, "standard"), long=True),
     Case("squeeze", "sheared_rest", "tacsim", PRESETS["draft"], partial(sheared_rest, "draft"), long=True),
 )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from robot.errors import DeviceError
 from tacsim import pose as se3
-from tacsim.hardware import CameraSensorFacts, UrArmFacts
 from tacsim.interface import ArmState, FloatArray, Pose
-from tacsim.rigfile import RigFacts
 
 
 class NotAligned(DeviceError):
@@ -33,23 +30,6 @@ class AlignedState:
     state: ArmState  # interpolated; `time` is the time that was asked for
     error: float  # to the nearer of the two states it is made of; 0 at one of them [s]
     gap: float  # between these two; 0 where it was carried on from the newest alone [s]
-
-
-@dataclass(frozen=True, slots=True)
-class Latencies:
-    """From the event (exposure, measurement) to its arrival in this program, by device [s]: what `tacsim calibrate
-    latency` measures and the rig file keeps."""
-
-    arms: Mapping[str, float]
-    sensors: Mapping[str, float]
-
-    @classmethod
-    def of(cls, facts: RigFacts) -> Latencies:
-        """Those of a rig file; devices without latency (simulated, recorded) have 0."""
-        return cls(
-            arms={n: arm.latency if isinstance(arm, UrArmFacts) else 0.0 for n, arm in facts.arms.items()},
-            sensors={n: s.latency if isinstance(s, CameraSensorFacts) else 0.0 for n, s in facts.sensors.items()},
-        )
 
 
 class ArmHistory:

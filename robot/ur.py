@@ -141,23 +141,6 @@ class URArm:
         """The last packages, oldest first, at most `number`; two seconds are kept. Also those of a lost link."""
         return [self._state(record) for record in self._packages(number)]
 
-    def pose_at(self, moment: float) -> Pose:
-        """world_from_sensor at a past `moment` [s], between the two packages round it.
-
-        Raises StaleObservationError outside what is kept: packages come later than what they tell of.
-        """
-        packages = self._packages(HISTORY - 1)
-        times = packages["time"] - self.facts.latency
-        after = int(np.searchsorted(times, moment))
-        if not len(times) or after == len(times) or moment < times[0]:
-            span = f"{times[0]:.4f} to {times[-1]:.4f} s" if len(times) else "nothing"
-            raise StaleObservationError(f"arm '{self.name}' has no pose of {moment:.4f} s; it keeps {span}")
-        late = self._state(packages[after]).pose
-        if after == 0 or times[after] == moment:
-            return late
-        early = self._state(packages[after - 1]).pose
-        return se3.interpolate(early, late, float((moment - times[after - 1]) / (times[after] - times[after - 1])))
-
     def at_rest(self) -> bool:
         """True if neither the servo target nor the arm itself moves."""
         record = self._record()

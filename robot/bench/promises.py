@@ -166,7 +166,6 @@ PROMISES: tuple[Promise, ...] = (
         (
             UR + "all_fields_of_a_state_are_of_one_instant",
             UR + "a_hundred_thousand_looks_and_none_is_torn",
-            UR + "pose_between_packages",
             "robot/test_snapshot.py::test_no_torn_read_in_a_hundred_thousand",
             "robot/test_align.py::test_injected_latencies_leave_less_than_a_millisecond_of_motion",
         ),

@@ -61,7 +61,7 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
         root = apply(root, RigFacts, override, reading)
     root = _settle_scene(root, own_scene, reading)
     facts = _validate(RigFacts, root, reading)
-    if overrides:
+    if overrides and any(isinstance(arm, UrArmFacts) and arm.mock is None for arm in facts.arms.values()):
         _require_limits(facts, load_rig(rig, task=task).facts)
     text = "# A rig, resolved: every reference and default written out, SI units.\n" + dump(
         facts.model_dump(mode="json")
@@ -76,13 +76,12 @@ def _require_limits(facts: RigFacts, file: RigFacts) -> None:
         there = file.arms.get(name)
         if isinstance(arm, UrArmFacts) and isinstance(there, UrArmFacts) and arm.mock is None:
             problems += [f"arms.{name}.{what}" for what in loosened(there, arm)]
-    if any(isinstance(arm, UrArmFacts) and arm.mock is None for arm in facts.arms.values()):
-        kept = {frozenset(apart.arms): apart.distance for apart in facts.keep_out}
-        problems += [
-            f"keep_out of {' and '.join(apart.arms)}: less than {apart.distance:g} m"
-            for apart in file.keep_out
-            if kept.get(frozenset(apart.arms), 0.0) < apart.distance
-        ]
+    kept = {frozenset(apart.arms): apart.distance for apart in facts.keep_out}
+    problems += [
+        f"keep_out of {' and '.join(apart.arms)}: less than {apart.distance:g} m"
+        for apart in file.keep_out
+        if kept.get(frozenset(apart.arms), 0.0) < apart.distance
+    ]
     if problems:
         words = "would loosen the limits of a real arm; write it into the rig file"
         raise ConfigError([Problem(Place("--set"), "", f"{what}: {words}") for what in problems])

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robot.align import ArmHistory, Latencies, NotAligned
+from robot.align import ArmHistory, NotAligned
 from tacsim import pose as se3
 from tacsim.interface import ArmState, Pose
-from tacsim.rigfile import RigFacts
 
 AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
 
@@ -170,27 +169,3 @@ def test_one_thread_may_append_while_others_ask() -> None:
     for thread in asking:
         thread.join()
     assert failures == []
-
-
-def test_the_table_of_a_rig_file() -> None:
-    facts = RigFacts.model_validate(
-        {
-            "name": "bench",
-            "clock": "wall",
-            "arms": {
-                "upper": {
-                    "driver": "ur",
-                    "host": "127.0.0.2",
-                    "world_from_base": {},
-                    "limits": {"workspace": {"lower": [-1, -1, -1], "upper": [1, 1, 1]}},
-                    "latency": "10 ms",
-                }
-            },
-            "sensors": {
-                "upper": {"driver": "camera", "source": "http://127.0.0.2/", "arm": "upper", "latency": 0.125},
-                "lower": {"driver": "replay", "source": "x.mcap"},
-            },
-        }
-    )
-    table = Latencies.of(facts)
-    assert table.arms == {"upper": 0.010} and table.sensors == {"upper": 0.125, "lower": 0.0}

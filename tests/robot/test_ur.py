@@ -235,18 +235,6 @@ def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm) -> None:
     assert len(packages) > 100
 
 
-def test_pose_between_packages(arm: URArm) -> None:
-    start = arm.state().pose
-    in_motion(arm, moved(start, x=0.05))
-    a, b = arm.history()[-2:]
-    middle = arm.pose_at(0.5 * (a.time + b.time))
-    assert np.allclose(middle.position, 0.5 * (a.pose.position + b.pose.position), atol=1e-9)
-    with pytest.raises(StaleObservationError, match="has no pose of"):
-        arm.pose_at(time.monotonic() + 100.0)
-    with pytest.raises(StaleObservationError, match="has no pose of"):
-        arm.pose_at(b.time - 1000.0)
-
-
 # -- limits on the wire ----------------------------------------------------------------------------------------------
 
 

@@ -34,7 +34,7 @@ class Check:
 def examine() -> list[Check]:
     """All checks, in the order in which problems should be mended. A check that itself breaks is a `fail`."""
     checks: list[Check] = []
-    for look in (python, packages, second_opencv, opencv, taichi, ur_rtde, processors, working_directory):
+    for look in (python, packages, second_opencv, opencv, taichi, ur_rtde, processors, realtime, working_directory):
         checks += _guarded(look)
     return checks
 
@@ -156,6 +156,19 @@ def processors() -> list[Check]:
     if count > 1:
         return [Check("processors", "ok", f"{count}")]
     return [Check("processors", "warn", f"{count}", "simulation is built for two or more; expect it to be slow")]
+
+
+def realtime() -> list[Check]:
+    """Whether the processes that talk to arms may run before all others."""
+    from robot.realtime import allowed
+
+    if allowed():
+        return [Check("real-time priority", "ok", "allowed")]
+    advice = (
+        "only arms need it: their 2 ms loop then waits for other programs. Allow it by `USER - rtprio 20` in "
+        "/etc/security/limits.conf (then log in again), or CAP_SYS_NICE for a container"
+    )
+    return [Check("real-time priority", "warn", "not allowed", advice)]
 
 
 def working_directory() -> list[Check]:

@@ -6,6 +6,8 @@ Errors of one device name it in their text. Those that stop an arm (:class:`Prot
 
 from __future__ import annotations
 
+from tacsim.limits import LimitExceeded
+
 
 class DeviceError(RuntimeError):
     """A device did not do what was asked of it. Base of all errors here."""
@@ -27,7 +29,7 @@ class StaleObservationError(DeviceError):
     """What the device delivers is older than its limit: nothing may be decided by it."""
 
 
-class SafetyViolation(DeviceError):
+class SafetyViolation(DeviceError, LimitExceeded):
     """A limit of the rig (force, workspace, keep-out, depth, shear) was broken or would have been; the arm stopped."""
 
 

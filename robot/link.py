@@ -21,6 +21,7 @@ from tacsim.interface import FloatArray
 
 HISTORY = 1024  # state records that are kept: two seconds
 COMMANDS = 8
+TOUCHES = 8
 
 
 class ArmStatus(IntEnum):
@@ -31,10 +32,12 @@ class ArmStatus(IntEnum):
     HOLD = 2  # stands: nothing was asked, or stop() was, or no action came within action_timeout
     OUT_OF_REACH = 3  # stands, or slows down: joints, their speed or a singularity keep it from its target
     WAITING = 4  # stands: the other arm of a keep-out is not connected, or not well
+    BLIND = 5  # stands: what its sensors showed last is older than observation_timeout
     FORCE_LIMIT = 10
     WORKSPACE_LIMIT = 11
     KEEP_OUT = 12  # came too near to the other arm
     PARTNER_STOPPED = 13  # the other arm of a keep-out stopped, or cannot be seen
+    GEL_LIMIT = 14  # its gel was pressed or dragged too far
     PROGRAM_STOPPED = 20  # on the controller: its watchdog, the pendant, or power
     PROTECTIVE_STOP = 21
     EMERGENCY_STOP = 22  # also a safeguard stop, a safety violation, a fault
@@ -63,10 +66,13 @@ _TEXTS = {
     ArmStatus.HOLD: "stands still: no fresh action",
     ArmStatus.OUT_OF_REACH: "cannot go on towards its target: a joint, its speed or a singularity forbids it",
     ArmStatus.WAITING: "stands still: the other arm of a keep-out is not connected, or not well",
+    ArmStatus.BLIND: "stands still: the last observation is older than observation_timeout; see the cameras",
     ArmStatus.FORCE_LIMIT: "felt more than limits.force or limits.torque and stopped; look why, then recover()",
     ArmStatus.WORKSPACE_LIMIT: "is outside its workspace and stopped; bring it back with the pendant, then recover()",
     ArmStatus.KEEP_OUT: "came too near to the other arm and stopped; look why, then recover()",
     ArmStatus.PARTNER_STOPPED: "stopped because the other arm did; recover() that one, then this",
+    ArmStatus.GEL_LIMIT: "pressed or dragged its gel farther than limits.depth or limits.shear and stopped; move it "
+    "away, then recover()",
     ArmStatus.PROGRAM_STOPPED: "has no running program any more (watchdog, pendant or power); look why, then recover()",
     ArmStatus.PROTECTIVE_STOP: "made a protective stop; look why, then recover()",
     ArmStatus.EMERGENCY_STOP: "has an emergency or safeguard stop; a person must release it, then recover()",
@@ -123,6 +129,9 @@ STATE = np.dtype(
     ]
 )
 COMMAND = np.dtype([("time", np.float64), ("kind", np.int64), ("pose", np.float64, 7)])  # position, quaternion x y z w
+# What the sensors show, told by the driver after every observation: when the oldest picture was exposed, and how deep
+# and how far the arm's own gel is pressed and dragged (NaN: it cannot tell). A `seen` of NaN: not watched by now.
+TOUCH = np.dtype([("seen", np.float64), ("depth", np.float64), ("shear", np.float64)])
 
 
 @dataclass(frozen=True)
@@ -159,8 +168,11 @@ class Orders:
     joint_speed: float
     force: float
     torque: float
+    depth: float | None
+    shear: float | None
     link_timeout: float
     action_timeout: float
+    observation_timeout: float
     watchdog: float
     lookahead: float
     gain: float
@@ -176,15 +188,17 @@ class Orders:
 
 
 class Link:
-    """The shared memory of one arm: states from its worker, commands from its driver."""
+    """The shared memory of one arm: states from its worker; commands, and what its sensors show, from its driver."""
 
     _STATES = snapshot.Ring.size(STATE, HISTORY)
-    SIZE = _STATES + snapshot.Ring.size(COMMAND, COMMANDS)
+    _BOTH = _STATES + snapshot.Ring.size(COMMAND, COMMANDS)
+    SIZE = _BOTH + snapshot.Ring.size(TOUCH, TOUCHES)
 
     def __init__(self, segment: snapshot.Segment) -> None:
         view = memoryview(segment.memory)
         self.states = snapshot.Ring(view[: self._STATES], STATE, HISTORY)
-        self.commands = snapshot.Ring(view[self._STATES :], COMMAND, COMMANDS)
+        self.commands = snapshot.Ring(view[self._STATES : self._BOTH], COMMAND, COMMANDS)
+        self.touches = snapshot.Ring(view[self._BOTH :], TOUCH, TOUCHES)
 
 
 def command(time: float, kind: Kind, pose: FloatArray | None = None) -> snapshot.Record:
@@ -193,4 +207,11 @@ def command(time: float, kind: Kind, pose: FloatArray | None = None) -> snapshot
     record["time"], record["kind"] = time, kind
     if pose is not None:
         record["pose"] = pose
+    return record
+
+
+def touch(seen: float, depth: float, shear: float) -> snapshot.Record:
+    """A touch record; see TOUCH."""
+    record = np.zeros((), TOUCH)
+    record["seen"], record["depth"], record["shear"] = seen, depth, shear
     return record

@@ -16,6 +16,7 @@ from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts, RigFacts, SimArmFa
 
 if TYPE_CHECKING:
     from tacsim.env import TacsimEnv
+    from tacsim.guard import GelWatch
     from tacsim.optics.geometry import CanonicalGrid
     from tacsim.physics.world import World
     from tacsim.record.replay import ReplayClock, ReplaySensor
@@ -129,8 +130,11 @@ def _open_sim(facts: RigFacts) -> Rig:
     arms: dict[str, Arm] = {}
     for name, arm in facts.arms.items():
         assert isinstance(arm, SimArmFacts)
-        longest, widest = arm.speed * facts.period, arm.turn_rate * facts.period
-        arms[name] = SimArm(world, clock, frames[name], longest, widest)
+        limits = arm.limits
+        speed = arm.speed if limits is None else min(arm.speed, limits.speed)
+        turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
+        apart = [(frames[other], distance) for other, distance in facts.kept_out(name).items()]
+        arms[name] = SimArm(world, clock, frames[name], speed * facts.period, turn_rate * facts.period, limits, apart)
     task = facts.task
     return Rig(
         name=facts.name,
@@ -143,7 +147,20 @@ def _open_sim(facts: RigFacts) -> Rig:
         start=SimStart(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
+        watch=_gel_watch(facts, sensors),
     )
+
+
+def _gel_watch(facts: RigFacts, sensors: Mapping[str, SimSensor]) -> GelWatch | None:
+    from tacsim.guard import GelWatch
+
+    limits = {
+        name: arm.limits for name, arm in facts.arms.items() if isinstance(arm, SimArmFacts) and arm.limits is not None
+    }
+    try:
+        return GelWatch({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
+    except ValueError as failure:
+        raise CannotOpen(f"rig '{facts.name}': {failure}") from None
 
 
 def _driven_frames(facts: RigFacts, scene: Scene) -> dict[str, str]:

@@ -27,6 +27,7 @@ from robot.trajectory import PERIOD, Motion, braking, resting, stopping_point, t
 from tacsim.interface import FloatArray
 from tacsim.limits import (
     braking_end,
+    exceeds,
     finite_targets,
     joint_step_excess,
     overload,
@@ -58,7 +59,7 @@ def frames_of(orders: Orders) -> ArmFrames:
 class Servo:
     """The servo target of one arm and what keeps it from moving. `status` is its judgement after each call."""
 
-    def __init__(self, orders: Orders, taken: int = 0) -> None:
+    def __init__(self, orders: Orders, taken: int = 0, touches: int = 0) -> None:
         self.orders, self.frames = orders, frames_of(orders)
         self.kinematics = Kinematics(orders.model)  # type: ignore[arg-type]  # a Model, from JSON
         self.region = region(orders.lower, orders.upper, [(point, normal) for point, normal in orders.planes])
@@ -69,6 +70,7 @@ class Servo:
         self._sent: FloatArray | None = None  # joints
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position, rotation
         self._goal_time = -math.inf
+        self._touches, self._seen = touches, math.nan  # records read; exposure of the oldest picture [s]
         self._hard = max(HARD, orders.acceleration), max(HARD_TURN, orders.turn_acceleration)
 
     @property
@@ -109,6 +111,17 @@ class Servo:
                 if approach > 0.0 and not self.resting:
                     self.fault(ArmStatus.KEEP_OUT, now)
 
+    def look(self, number: int, touch: Record | None, now: Measured) -> None:
+        """Takes the newest that the sensors showed, once: a gel that is pressed or dragged too far stops the arm."""
+        if touch is None or number == self._touches:
+            return
+        self._touches, self._seen = number, float(touch["seen"])
+        orders = self.orders
+        if not math.isnan(self._seen) and (
+            exceeds(float(touch["depth"]), orders.depth) or exceeds(float(touch["shear"]), orders.shear)
+        ):
+            self.fault(ArmStatus.GEL_LIMIT, now)
+
     def hear(self, number: int, command: Record | None) -> None:
         """Takes the newest command, once; what is no pose, or too late to be followed, is not."""
         if command is None or number == self.taken:
@@ -130,12 +143,16 @@ class Servo:
 
     def step(self, time: float, now: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to be sent in this period; None: nothing, the controller holds by itself."""
-        goal = self._goal if time - self._goal_time <= self.orders.action_timeout else None
-        if self.status.is_fault or goal is None:
+        orders = self.orders
+        goal = self._goal if time - self._goal_time <= orders.action_timeout else None
+        blind = time - self._seen > orders.observation_timeout  # False where nothing is watched
+        if self.status.is_fault or goal is None or blind:
             if not self.status.is_fault and self.status != ArmStatus.WAITING:
-                self.status = ArmStatus.HOLD
+                self.status = ArmStatus.HOLD if goal is None else ArmStatus.BLIND
             return self._slow_down(now)
-        if self.motion is None or (self.status == ArmStatus.HOLD and self._was_moved(self.motion, now)):
+        if self.motion is None or (
+            self.status in (ArmStatus.HOLD, ArmStatus.BLIND) and self._was_moved(self.motion, now)
+        ):
             self.motion, self._sent = resting(now.sensor[:3, 3], now.sensor[:3, :3]), now.joints
             goal = self._cut_at_walls(self.motion) or goal
         gaps = self._gaps(self.motion, partners)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import math
 import os
 import subprocess
 import sys
@@ -32,10 +33,11 @@ from robot.errors import (
 )
 from robot.frames import pose_of
 from robot.kinematics import Kinematics, pose
-from robot.link import HISTORY, ArmStatus, Kind, Link, Orders, Partner, command
+from robot.link import HISTORY, ArmStatus, Kind, Link, Orders, Partner, command, touch
 from robot.mock import MOCK_SERIAL
 from robot.servo import frames_of, measured
 from tacsim import pose as se3
+from tacsim.guard import Touch
 from tacsim.hardware import UrArmFacts
 from tacsim.interface import Action, ArmState, Pose
 from tacsim.limits import ActionError, admit, check_action, region
@@ -191,6 +193,14 @@ class URArm:
         with self._lock:
             if not self._closed:
                 self._send(Kind.HOLD)
+
+    def tell(self, shown: Touch | None) -> None:
+        """What the sensors show by now: beyond limits.depth or limits.shear the arm stops, and it stands once the last
+        picture is older than `observation_timeout`. None: nobody looks by now, and neither is watched."""
+        with self._lock:
+            if not self._closed:
+                known = Touch(math.nan) if shown is None else shown
+                self._link.touches.write(touch(known.seen, known.depth, known.shear))
 
     def zero_wrench(self) -> None:
         """Makes the present force the zero. The arm must stand, and touch nothing.
@@ -448,8 +458,11 @@ def _orders(facts: UrArmFacts, name: str, segment: str, keep_out: Mapping[str, f
         joint_speed=limits.joint_speed,
         force=limits.force,
         torque=limits.torque,
+        depth=limits.depth,
+        shear=limits.shear,
         link_timeout=facts.link_timeout,
         action_timeout=facts.action_timeout,
+        observation_timeout=facts.observation_timeout,
         watchdog=facts.watchdog,
         lookahead=facts.lookahead,
         gain=facts.gain,

@@ -9,8 +9,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from robot.align import ArmHistory
 from robot.camera import Camera
 from robot.clock import Driven, LockStep, WallClock
@@ -21,8 +19,9 @@ from robot.trajectory import PERIOD
 from robot.twin_sensor import TwinSensor
 from robot.ur import URArm
 from tacsim import pose as se3
-from tacsim.hardware import ArmLimits, CameraSensorFacts, UrArmFacts
-from tacsim.interface import ArmState, Normaliser, Pose, TactileObservation, TactileSource
+from tacsim.guard import GelWatch
+from tacsim.hardware import CameraSensorFacts, UrArmFacts
+from tacsim.interface import ArmState, Normaliser, Pose, TactileSource
 from tacsim.limits import ActionError
 from tacsim.record.timing import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
@@ -107,7 +106,7 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
         arms: dict[str, Driven] = {}
         for name, arm in facts.arms.items():
             assert isinstance(arm, UrArmFacts)
-            opened = URArm(arm, name, keep_out=_keep_out(facts, name))
+            opened = URArm(arm, name, keep_out=facts.kept_out(name))
             stack.callback(opened.close)
             arms[name] = Driven(opened)
         cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
@@ -152,7 +151,7 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
             truth=bench.truth if bench.simulated and facts.scene is not None and facts.scene.body is not None else None,
             diagnostics=diagnostics,
             beside=bench.close,
-            watch=_watch(facts, sensors),
+            watch=_watch(facts, sensors, arms),
         )
         stack.pop_all()
         return rig
@@ -166,16 +165,6 @@ def _sensor(name: str, facts: object, bench: MockBench) -> TactileSource:
         return camera
     assert isinstance(facts, SimSensorFacts)
     return TwinSensor(bench, name, facts)
-
-
-def _keep_out(facts: RigFacts, name: str) -> dict[str, float]:
-    """Least distances to the other arms [m]."""
-    found: dict[str, float] = {}
-    for apart in facts.keep_out:
-        if name in apart.arms:
-            other = apart.arms[1 - apart.arms.index(name)]
-            found[other] = max(apart.distance, found.get(other, 0.0))
-    return found
 
 
 def _starts(facts: RigFacts, bench: MockBench) -> dict[str, Pose]:
@@ -215,45 +204,15 @@ def _feel(
     return felt
 
 
-def _watch(
-    facts: RigFacts, sensors: Mapping[str, TactileSource]
-) -> Callable[[Mapping[str, TactileObservation]], None] | None:
-    """Guards the gels by what they show: how deep they are pressed, how far they are dragged.
-
-    Raises DeviceError for a limit that cannot be watched, because its sensor delivers no height or flow.
-    """
-    guards: list[tuple[str, str, ArmLimits]] = []
-    for name, sensor in facts.sensors.items():
-        arm = None if sensor.arm is None else facts.arms[sensor.arm]
-        if isinstance(arm, UrArmFacts) and (arm.limits.depth is not None or arm.limits.shear is not None):
-            spec, limits = sensors[name].spec, arm.limits
-            for limit, there, what in ((limits.depth, spec.height, "depth"), (limits.shear, spec.flow, "shear")):
-                if limit is not None and not there:
-                    raise DeviceError(
-                        f"arms.{sensor.arm}.limits.{what}: sensor '{name}' cannot tell it (no calibration, or no "
-                        "markers); leave it out, or calibrate the sensor"
-                    )
-            guards.append((name, str(sensor.arm), arm.limits))
-    if not guards:
-        return None
-
-    def watch(tactile: Mapping[str, TactileObservation]) -> None:
-        for name, arm, limits in guards:
-            touch = tactile[name]
-            if limits.depth is not None and touch.height is not None:
-                _require(float(touch.height.max(where=touch.valid, initial=0.0)), limits.depth, name, arm, "depth")
-            if limits.shear is not None and touch.flow is not None:
-                _require(float(np.nanmax(np.linalg.norm(touch.flow, axis=-1))), limits.shear, name, arm, "shear")
-
-    return watch
-
-
-def _require(found: float, limit: float, sensor: str, arm: str, what: str) -> None:
-    if found > limit:
-        raise SafetyViolation(
-            f"gel of sensor '{sensor}': {what} {1e3 * found:.3g} mm, limits.{what} of arm '{arm}' is "
-            f"{1e3 * limit:.3g} mm; the arms are stopped. Move them apart, then begin a new episode"
-        )
+def _watch(facts: RigFacts, sensors: Mapping[str, TactileSource], arms: Mapping[str, Driven]) -> GelWatch:
+    """Tells the arms what their gels show, and guards those by it. Raises DeviceError for a limit that cannot be
+    watched, because its sensor delivers no height or flow."""
+    limits = {name: arm.limits for name, arm in facts.arms.items() if isinstance(arm, UrArmFacts)}
+    tell = {name: driven.arm.tell for name, driven in arms.items()}
+    try:
+        return GelWatch({name: sensor.spec for name, sensor in sensors.items()}, limits, tell, SafetyViolation)
+    except ValueError as failure:
+        raise DeviceError(str(failure)) from None
 
 
 def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:

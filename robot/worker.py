@@ -2,10 +2,10 @@
 
 The only importer of ur_rtde, and for that reason a process of its own: the library may crash, hang, or hold the
 interpreter's lock while it waits for a silent controller. It is never asked to reconnect; a worker that lost its link
-ends, and another one is started.
+ends, and another one is started. It asks for real-time priority and runs on without (robot.realtime).
 
 The loop, each 2 ms and in this order: read the newest package as one snapshot, publish it; is the driver alive; is the
-package fresh; safety bits, force; a fault is published before anything that may wait; the newest command; limits,
+package fresh; safety bits, force, gels; a fault is published before anything that may wait; the newest command; limits,
 trajectory, walls, other arms, reach; the servo call.
 """
 
@@ -28,6 +28,7 @@ from robot.dashboard import Dashboard
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from robot.kinematics import Kinematics, motion
 from robot.link import STATE, ArmStatus, Link, Orders
+from robot.realtime import WORKER, ask_for_realtime
 from robot.servo import Servo, frames_of, measured, well
 from robot.trajectory import PERIOD
 
@@ -68,7 +69,7 @@ class Worker:
         self.record = np.zeros((), STATE)
         self.record["top_speed"] = orders.speed
         self.partners: list[Link | None] = [None] * len(orders.partners)
-        self.servo = Servo(orders, taken=self.link.commands.count)
+        self.servo = Servo(orders, taken=self.link.commands.count, touches=self.link.touches.count)
         self._periods = np.full(WINDOW, PERIOD)
         self._last = 0.0  # when the last period ended
         self._looks = 0  # at one package
@@ -177,6 +178,7 @@ class Worker:
             if stopped is not None:
                 self.servo.fault(stopped, None)
             self.servo.watch(self.state, partners)
+            self.servo.look(*self.link.touches.newest(), self.state)
             if self.servo.status != before:
                 self._publish(self.servo.status)
             self.servo.hear(*self.link.commands.newest())
@@ -317,6 +319,7 @@ def main() -> NoReturn:
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which stops the arm gently
     orders = Orders.from_json(sys.stdin.read())
+    ask_for_realtime(WORKER)  # before the library starts its threads
     try:
         worker = Worker(orders)
         worker.connect()

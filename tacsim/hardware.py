@@ -106,6 +106,8 @@ class UrArmFacts(Facts):
     start: Placement | None = None  # world_from_sensor, clear of everything; None: where the scene of a mock rig says
     link_timeout: Annotated[Time, Field(ge=0.01, le=2.0)] = 50e-3  # no package for so long: the link is lost [s]
     action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # no action for so long: the arm holds [s]
+    # The newest observation is older: the arm holds, whatever is asked of it [s].
+    observation_timeout: Annotated[Time, Field(ge=0.02, le=600.0)] = 1.0
     watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
@@ -201,7 +203,7 @@ def loosened(before: UrArmFacts, after: UrArmFacts) -> list[str]:
         found.append("limits.workspace: reaches farther")
     if not set(before.limits.planes) <= set(after.limits.planes):
         found.append("limits.planes: one is gone")
-    for key in ("link_timeout", "action_timeout"):
+    for key in ("link_timeout", "action_timeout", "observation_timeout"):
         old, new = getattr(before, key), getattr(after, key)
         if new > old:
             found.append(f"{key}: {old:g} -> {new:g}")

@@ -22,6 +22,10 @@ class ActionError(ValueError):
     """An action that a rig cannot take: unknown arm, wrong shape or type, a number not finite or out of range."""
 
 
+class LimitExceeded(RuntimeError):
+    """A limit of an arm (force, torque, depth, shear) was exceeded: the arm follows nothing until `recover`."""
+
+
 def check_action(action: object, movable: Collection[str], rig: str) -> Action:
     """`action`, if rig `rig` can take it: an Action that addresses only `movable` arms, each with a Pose or None.
 
@@ -175,10 +179,13 @@ def way_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: flo
     return 1.0 if root <= 0.0 else min(1.0, gap / (-along + float(np.sqrt(root))))
 
 
-def admit(target: Pose, now: Pose, inside: Region, apart: Iterable[tuple[ArrayLike, float]] = ()) -> tuple[Pose, float]:
-    """`target` itself if the whole straight way from `now` lies `inside` and keeps clear of the spheres `apart` (centre
-    (3,), distance [m]); otherwise the farthest pose on it that does. Also the fraction of the way that is left."""
-    share = way_inside(now.position, target.position, inside)
+def admit(
+    target: Pose, now: Pose, inside: Region | None, apart: Iterable[tuple[ArrayLike, float]] = ()
+) -> tuple[Pose, float]:
+    """`target` itself if the whole straight way from `now` lies `inside` (None: anywhere) and keeps clear of the
+    spheres `apart` (centre (3,), distance [m]); otherwise the farthest pose on it that does. Also the fraction of the
+    way that is left."""
+    share = 1.0 if inside is None else way_inside(now.position, target.position, inside)
     for centre, distance in apart:
         share = min(share, way_clear(now.position, target.position, centre, distance))
     if share >= 1.0:
@@ -206,6 +213,11 @@ def overload(wrench: ArrayLike, force: float, torque: float) -> bool:
     """True if `wrench` (6,) is heavier than `force` [N] or `torque` [N m], or is not a number: then nothing guards."""
     load = np.asarray(wrench, dtype=np.float64)
     return not (float(np.linalg.norm(load[:3])) <= force and float(np.linalg.norm(load[3:])) <= torque)
+
+
+def exceeds(value: float, limit: float | None) -> bool:
+    """True if `value` is more than `limit`, or is not a number: then nothing guards. A limit of None is not watched."""
+    return limit is not None and not value <= limit
 
 
 def joint_step_excess(before: ArrayLike, after: ArrayLike, speed: float, period: float) -> float:

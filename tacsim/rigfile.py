@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from tacsim.hardware import CameraSensorFacts, HardwareStart, KeepOut, Name, UrArmFacts
+from tacsim.hardware import ArmLimits, CameraSensorFacts, HardwareStart, KeepOut, Name, UrArmFacts
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
 from tacsim.quantity import Facts, Force, Length, Speed, Time
 from tacsim.scene import Scene
@@ -19,6 +19,9 @@ class SimArmFacts(Facts):
     driver: Literal["sim"]
     speed: Annotated[Speed, Field(gt=0)] = 20e-3  # longest way of a control period / period [m/s]
     turn_rate: Annotated[float, Field(gt=0)] = 0.5  # the same for rotation [rad/s]
+    # Those of the real arm, for a policy that shall meet them in simulation too: workspace, planes, speed, turn_rate,
+    # force, torque, depth, shear. (Accelerations and joints are not simulated; the state is looked at once a period.)
+    limits: ArmLimits | None = None
 
 
 class ReplayArmFacts(Facts):
@@ -126,3 +129,12 @@ class RigFacts(Facts):
                         {"arm": name, "arms": ", ".join(self.arms) or "(none)", "at": ("keep_out", index, "arms")},
                     )
         return self
+
+    def kept_out(self, arm: str) -> dict[str, float]:
+        """Least distances [m] of `arm` to other arms, by their names."""
+        found: dict[str, float] = {}
+        for apart in self.keep_out:
+            if arm in apart.arms:
+                other = apart.arms[1 - apart.arms.index(arm)]
+                found[other] = max(apart.distance, found.get(other, 0.0))
+        return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
+from tacsim.hardware import ArmLimits
 from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap, TactileFrame, Truth
-from tacsim.limits import shorten
+from tacsim.limits import LimitExceeded, admit, overload, region, shorten
 from tacsim.physics.world import MoveStats, World
 from tacsim.scene import GelSurface
 
@@ -57,6 +58,10 @@ class SimClock:
         """Where `frame` shall be at the end of the period, and whether a guard has changed that."""
         self._targets[frame] = pose
         self._limited[frame] = limited
+
+    def asked(self, frame: str, otherwise: Pose) -> Pose:
+        """Where `frame` was told to be at the end of this period; `otherwise` if it was not."""
+        return self._targets.get(frame, otherwise)
 
     def forget(self) -> None:
         """Drops what was commanded and not yet driven."""
@@ -103,11 +108,25 @@ class SimArm:
     """Carries one frame of the world (a sensor, or "indenter") exactly where it is told.
 
     `longest` [m] and `widest` [rad] bound the motion of one control period; what is beyond is shortened, and counted.
+    With `limits` it is guarded as a real arm is (robot.ur), by the same functions: targets are shortened at its walls
+    and at the spheres round the frames `apart` (frame, distance [m]), and too much force or torque stops it.
     """
 
-    def __init__(self, world: World, clock: SimClock, frame: str, longest: float, widest: float) -> None:
+    def __init__(
+        self,
+        world: World,
+        clock: SimClock,
+        frame: str,
+        longest: float,
+        widest: float,
+        limits: ArmLimits | None = None,
+        apart: Iterable[tuple[str, float]] = (),
+    ) -> None:
         self._world, self._clock, self._frame = world, clock, frame
         self._longest, self._widest = longest, widest
+        self._limits, self._apart = limits, tuple(apart)
+        walls = None if limits is None else [(wall.point, wall.normal) for wall in limits.planes]
+        self._region = None if limits is None else region(limits.workspace.lower, limits.workspace.upper, walls or ())
 
     def state(self, at: float | None = None) -> ArmState:
         """Pictures and arms are of one instant in simulation, so `at` makes no difference."""
@@ -132,10 +151,14 @@ class SimArm:
         return reaction
 
     def command(self, target: Pose | None) -> Pose | None:
-        """Takes effect at the next tick; None holds. Returns the pose after the limits."""
+        """Takes effect at the next tick; None holds. Returns the pose after the limits. Raises LimitExceeded."""
+        self._feel()
         if target is None:
             return None
-        allowed = shorten(target, self._world.pose(self._frame), self._longest, self._widest)
+        now, allowed = self._world.pose(self._frame), target
+        if self._region is not None or self._apart:
+            allowed, _ = admit(target, now, self._region, self._spheres())
+        allowed = shorten(allowed, now, self._longest, self._widest)
         self._clock.target(self._frame, allowed, limited=allowed is not target)
         return allowed
 
@@ -143,7 +166,30 @@ class SimArm:
         self._clock.forget()
 
     def recover(self) -> None:
-        """A simulated arm has no faults to recover from."""
+        """Drops what was asked; an arm that feels too much stays stopped as long as it does."""
+        self.stop()
+
+    def _spheres(self) -> list[tuple[FloatArray, float]]:
+        """Where the frames to stay away from are, and where they go in this period as far as that is known."""
+        spheres = []
+        for frame, distance in self._apart:
+            here = self._world.pose(frame)
+            spheres += [(here.position, distance), (self._clock.asked(frame, here).position, distance)]
+        return spheres
+
+    def _feel(self) -> None:
+        limits = self._limits
+        if limits is None:
+            return
+        wrench = self._wrench()
+        if overload(wrench, limits.force, limits.torque):
+            self.stop()
+            force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1)
+            raise LimitExceeded(
+                f"arm of '{self._frame}' felt more than limits.force or limits.torque and stopped ({force:.1f} of "
+                f"{limits.force:g} N, {torque:.2f} of {limits.torque:g} N m); begin a new episode, or move the other "
+                "sensor away"
+            )
 
     def close(self) -> None:
         """Nothing is held open."""

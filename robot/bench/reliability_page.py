@@ -111,7 +111,11 @@ def _logic(index: int) -> str:
 
 def _busy(report: Report) -> str:
     machine = report.metadata.machine
+    priority = ""
+    if machine.realtime is not None:
+        granted = "allowed" if machine.realtime else "not allowed"
+        priority = f" Real-time priority, which workers and mock controllers ask for, was {granted}."
     loads = [each[0] for each in (machine.load_before, machine.load_after) if each is not None]
     if loads and max(loads) > 0.5 * machine.cores:
-        return " **The machine was not idle**: take the times as upper bounds."
-    return " The machine was idle otherwise." if loads else ""
+        return priority + " **The machine was not idle**: take the times as upper bounds."
+    return priority + (" The machine was idle otherwise." if loads else "")

@@ -24,6 +24,7 @@ from pathlib import Path
 from robot.bench.cache import fingerprint
 from robot.bench.measure import Measurement, forget_peak_memory, peak_memory
 from robot.bench.schema import Failure, Group, Machine, Metadata, Report, Row
+from robot.realtime import allowed
 
 EXIT = 10.0  # [s] a process may take to end after its last word
 PACKAGES = ("tacsim", "taichi", "numpy", "scipy")
@@ -209,7 +210,13 @@ def _machine(load_before: list[float] | None) -> Machine:
         memory = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
     system = f"{platform.system()} {platform.machine()}"
     return Machine(
-        cpu=_cpu(), cores=cores, memory_gb=memory, system=system, load_before=load_before, load_after=_load()
+        cpu=_cpu(),
+        cores=cores,
+        memory_gb=memory,
+        system=system,
+        load_before=load_before,
+        load_after=_load(),
+        realtime=allowed(),
     )
 
 

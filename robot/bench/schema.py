@@ -57,6 +57,7 @@ class Machine(_Frozen):
     system: str
     load_before: list[float] | None  # load averages of 1, 5 and 15 minutes; None where the system has none
     load_after: list[float] | None
+    realtime: bool | None = None  # workers and mock controllers were real-time processes; None: not recorded
 
 
 class Metadata(_Frozen):

@@ -22,6 +22,7 @@ from robot.mock.controller import SERIAL, Controller, Facts
 from robot.mock.door import DOOR_PORT
 from robot.mock.faults import FaultDoor
 from robot.mock.ur import VERSION, check_hosts
+from robot.realtime import CONTROLLER, ask_for_realtime
 
 if TYPE_CHECKING:
     from tacsim.hardware import Model
@@ -34,6 +35,7 @@ def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> N
     ended: list[str] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.append("signal"))
+    ask_for_realtime(CONTROLLER)
     with selectors.DefaultSelector() as selector:
         controllers: list[Controller] = []
         doors: list[FaultDoor] = []

@@ -9,7 +9,7 @@ import pytest
 
 from robot.frames import pose_of
 from robot.kinematics import Kinematics, pose, rotation
-from robot.link import STATE, ArmStatus, Kind, Orders, Partner, command
+from robot.link import STATE, ArmStatus, Kind, Orders, Partner, command, touch
 from robot.servo import HARD, Servo, measured
 from robot.snapshot import Record
 from robot.trajectory import PERIOD
@@ -47,8 +47,11 @@ def orders(**changes: object) -> Orders:
         "joint_speed": 1.0,
         "force": 30.0,
         "torque": 3.0,
+        "depth": None,
+        "shear": None,
         "link_timeout": 0.05,
         "action_timeout": 0.2,
+        "observation_timeout": 0.5,
         "watchdog": 10.0,
         "lookahead": 0.03,
         "gain": 600.0,
@@ -340,3 +343,51 @@ def test_a_worse_fault_replaces_a_lesser_one() -> None:
 def test_orders_travel_as_json() -> None:
     given = orders(partners=[Partner("a", 0.1)], planes=[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     assert Orders.from_json(given.to_json()) == given
+
+
+def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
+    for shown, stops in (
+        ((0.9e-3, 0.4e-3), False),
+        ((1.1e-3, 0.0), True),
+        ((0.0, 0.6e-3), True),
+        ((math.nan, 0), True),
+    ):
+        bench = Bench(action_timeout=60.0, depth=1e-3, shear=0.5e-3)
+        bench.ask(shifted(bench.at, 0.0, 0.0, -0.05))
+        bench.run(100)
+        bench.servo.look(1, touch(bench.time, *shown), bench.now)
+        here = bench.at.position[2]
+        bench.run(100)
+        assert (bench.servo.status == ArmStatus.GEL_LIMIT) == stops
+        assert (bench.at.position[2] < here - 0.12**2 / (2 * HARD) - 1e-4) == (not stops)
+
+
+def test_what_was_shown_to_a_worker_before_is_not_held_against_this_one() -> None:
+    servo = Servo(orders(depth=1e-3), touches=7)
+    bench = Bench()
+    servo.look(7, touch(0.0, 2e-3, 0.0), bench.now)
+    assert not servo.status.is_fault
+    servo.look(8, touch(math.nan, 2e-3, 0.0), bench.now)  # nobody looks by now
+    assert not servo.status.is_fault
+    servo.look(9, touch(0.0, 2e-3, 0.0), bench.now)
+    assert servo.status == ArmStatus.GEL_LIMIT
+
+
+def test_no_action_is_followed_on_an_old_observation() -> None:
+    bench = Bench(action_timeout=60.0, observation_timeout=0.5)
+    bench.ask(shifted(bench.at, 0.02))
+    bench.run(20)
+    bench.servo.look(1, touch(bench.time, math.nan, math.nan), bench.now)
+    bench.run(200)
+    assert bench.servo.status == ArmStatus.OK
+    bench.run(100)  # 0.6 s without another picture
+    assert bench.servo.status == ArmStatus.BLIND
+    bench.run(200)
+    held = bench.at.position.copy()
+    bench.ask(shifted(bench.at, 0.02))
+    bench.run(100)
+    assert np.abs(bench.at.position - held).max() < 1e-5
+    bench.servo.look(2, touch(bench.time, math.nan, math.nan), bench.now)  # it sees again, and goes on by itself
+    bench.run(100)
+    assert bench.servo.status == ArmStatus.OK
+    assert bench.at.position[0] - held[0] > 5e-3

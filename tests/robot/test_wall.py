@@ -120,7 +120,8 @@ def cameras_of(facts: RigFacts) -> Iterator[dict[str, MockCamera]]:
 def opened(rig: Path | str, *overrides: str, dry_run: bool = False, link_timeout: float = 20.0) -> Iterator[Opened]:
     """No time-out of the arms depends on how busy the machine is; `link_timeout` [s] is long for the same reason."""
     facts = load_rig(rig, overrides=overrides).facts
-    slow = {"link_timeout": link_timeout, "watchdog": 0.05, "action_timeout": 5.0}  # model_copy does not validate
+    patient = {"watchdog": 0.05, "action_timeout": 5.0, "observation_timeout": 60.0}  # model_copy does not validate
+    slow = {"link_timeout": link_timeout, **patient}
     facts = facts.model_copy(update={"arms": {name: arm.model_copy(update=slow) for name, arm in facts.arms.items()}})
     benches: list[MockBench] = []
 
@@ -229,6 +230,17 @@ def test_arms_never_come_nearer_than_the_keep_out(bare: Opened) -> None:
         assert all(pose is not None and np.abs(pose.position - middle).max() > 1e-3 for pose in sent.values())
     assert min(gaps) > 19.9e-3  # to the arm's own precision
     assert gaps[-1] < 29e-3  # they did go as far as they may
+
+
+def test_arms_are_told_what_is_seen_from_the_first_observation_on(bare: Opened) -> None:
+    links = [arm._driven.arm._link for arm in bare.rig.arms.values()]  # type: ignore[attr-defined]
+    observation, _ = bare.rig.step(Action())
+    oldest = min(touch.time for touch in observation.tactile.values())
+    shown = [link.touches.latest() for link in links]
+    assert [float(touch["seen"]) for touch in shown] == [oldest, oldest]
+    assert all(np.isnan(touch["depth"]) for touch in shown)  # grey pictures tell of no height
+    bare.rig._start.clear(0)
+    assert all(np.isnan(link.touches.latest()["seen"]) for link in links)
 
 
 def test_a_start_aside_is_drawn_from_the_seed(shared: Opened) -> None:

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacsim.hardware import ArmLimits, Workspace
 from tacsim.interface import Action, Pose, SensorSpec
+from tacsim.limits import LimitExceeded
 from tacsim.physics.world import MoveStats
 from tacsim.sensor import TOUCH_TOLERANCE, NoTouch, SimArm, SimClock, SimSensor, SimStart, approach
 
@@ -206,3 +208,42 @@ def test_a_dynamic_clock_gives_every_period_its_own_time(spring_world: Any) -> N
     clock.tick()
     assert spring_world.durations == [0.1, 0.1]
     assert clock.now() == pytest.approx(0.2)
+
+
+def guarded(world: Any, **changes: Any) -> tuple[SimClock, SimArm, SimArm]:
+    """Two arms 10 mm apart in a box that ends 1 mm below the upper one; 8 mm of their way are kept out."""
+    box = Workspace(lower=(-0.01, -0.01, -0.001), upper=(0.01, 0.01, 0.02))
+    limits = ArmLimits(workspace=box, **changes)
+    clock = SimClock(world, 0.1)
+    apart = {"lower": [("upper", 8e-3)], "upper": [("lower", 8e-3)]}
+    lower, upper = (SimArm(world, clock, name, 1.0, 1.0, limits, apart[name]) for name in ("lower", "upper"))
+    return clock, lower, upper
+
+
+def test_a_simulated_arm_stays_inside_its_workspace_and_away_from_the_other(spring_world: Any) -> None:
+    clock, lower, upper = guarded(spring_world)
+    start = spring_world.pose("upper")
+    aside = upper.command(shifted(start, x=0.02))
+    assert aside is not None
+    assert aside.position[0] == pytest.approx(0.01)  # the wall
+    clock.forget()
+    gap = float(start.position[2]) - 8e-3
+    assert gap > 0
+    near = [lower.command(shifted(Pose(), z=0.8 * gap)), upper.command(shifted(start, z=-0.8 * gap))]
+    assert near[0] is not None
+    assert near[1] is not None
+    assert near[1].position[2] - near[0].position[2] == pytest.approx(8e-3)  # the second knows where the first goes
+    clock.tick()
+    assert clock.diagnostics()["shortened"] == 1.0
+
+
+def test_a_simulated_arm_that_feels_too_much_follows_nothing(spring_world: Any) -> None:
+    clock, lower, upper = guarded(spring_world, force=3.0)
+    approach(spring_world, 4.0)
+    with pytest.raises(LimitExceeded, match=r"arm of 'upper' felt more than limits.force .* of 3 N"):
+        upper.command(shifted(spring_world.pose("upper"), z=-1e-4))
+    moved = len(spring_world.moves)
+    clock.tick()
+    assert len(spring_world.moves) == moved
+    with pytest.raises(LimitExceeded):
+        lower.command(None)

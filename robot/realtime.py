@@ -1,0 +1,33 @@
+"""Time-critical processes ask the system to be run first."""
+
+from __future__ import annotations
+
+import os
+
+WORKER, CONTROLLER = 10, 11  # priorities: the stand-in for a controller's own hardware comes before who talks to it
+
+
+def ask_for_realtime(priority: int) -> bool:
+    """Makes this process a real-time one (SCHED_RR), so that no ordinary process can keep it waiting; the threads that
+    it starts later are too. False where the system has no such thing, or does not allow it: then it runs as any other.
+
+    On Linux it is allowed for root, with CAP_SYS_NICE, or by `rtprio` in /etc/security/limits.conf.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        return False
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def allowed() -> bool:
+    """True if a process may become a real-time one here; this process is left as it is."""
+    if not hasattr(os, "sched_setscheduler"):
+        return False
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    granted = ask_for_realtime(WORKER)
+    if granted:
+        os.sched_setscheduler(0, policy, parameters)
+    return granted

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tacsim import encode
 from tacsim.gymnasium_plugin import register_envs
 from tacsim.interface import Needs, Observation, Pose, Truth
+from tacsim.limits import LimitExceeded
 from tacsim.physics.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.tasks.task import Task, judge
@@ -74,18 +75,21 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         return self._flat, self._judged()[1]
 
     def step(self, action: NDArray[np.float32]) -> tuple[encode.Flat, float, bool, bool, dict[str, Any]]:
-        """Raises ActionError for an action outside the space, ResetNeeded after a diverged simulation."""
+        """A limit of an arm that is exceeded ends the episode (terminated, `info["limit"]` says which); a simulation that
+        diverges cuts it off (truncated, `info["diverged"]`). Raises ActionError for an action outside the space,
+        ResetNeeded after either."""
         if self._finished:
             raise ResetNeeded("call reset() before step(): no episode is running")
         asked = encode.action_from(action, self.task.axes, self.task.facts.max_step, self._targets)
         self._count += 1
         try:
             observation, sent = self.rig.step(asked)
-        except SimulationDiverged as failure:
+        except (LimitExceeded, SimulationDiverged) as failure:
             self._finished = True
+            exceeded = isinstance(failure, LimitExceeded)
             reward, info = self._judged()
             flat = {key: value.copy() for key, value in self._flat.items()}
-            return flat, reward, False, True, info | {"diverged": str(failure)}
+            return flat, reward, exceeded, not exceeded, info | {"limit" if exceeded else "diverged": str(failure)}
         self._targets |= {name: pose for name, pose in sent.items() if pose is not None}
         self._see(observation)
         reward, info = self._judged()

@@ -133,6 +133,23 @@ def test_divergence_truncates_and_says_why(open_springs: Any, monkeypatch: pytes
     assert env.step(STILL)[3] is False
 
 
+def test_a_limit_that_is_exceeded_ends_the_episode_and_says_which(open_springs: Any) -> None:
+    box = "workspace: {lower: [-1 m, -1 m, -1 m], upper: [1 m, 1 m, 1 m]}"
+    rig = open_springs("squeeze", f"arms.upper.limits={{{box}, force: 1 N}}")
+    env = TacsimEnv(rig, make_task(SqueezeFacts(kind="squeeze", steps=100)))
+    env.reset(seed=0)
+    for _ in range(60):
+        _, reward, terminated, truncated, info = env.step(np.array([1.0, -1.0], np.float32))
+        if terminated:
+            break
+    assert terminated
+    assert not truncated
+    assert "limits.force" in info["limit"]
+    assert np.isfinite(reward)
+    with pytest.raises(ResetNeeded):
+        env.step(STILL)
+
+
 def test_step_before_reset_is_refused(open_springs: Any) -> None:
     with pytest.raises(ResetNeeded):
         make_env(open_springs).step(STILL)

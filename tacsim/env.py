@@ -75,9 +75,9 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         return self._flat, self._judged()[1]
 
     def step(self, action: NDArray[np.float32]) -> tuple[encode.Flat, float, bool, bool, dict[str, Any]]:
-        """A limit of an arm that is exceeded ends the episode (terminated, `info["limit"]` says which); a simulation that
-        diverges cuts it off (truncated, `info["diverged"]`). Raises ActionError for an action outside the space,
-        ResetNeeded after either."""
+        """A limit of an arm that is exceeded ends the episode (terminated; `info["limit"]` says which), a simulation that
+        diverges cuts it off (truncated; `info["diverged"]`). Raises ActionError for an action outside the space, and
+        ResetNeeded after either end."""
         if self._finished:
             raise ResetNeeded("call reset() before step(): no episode is running")
         asked = encode.action_from(action, self.task.axes, self.task.facts.max_step, self._targets)

@@ -75,7 +75,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         return self._flat, self._judged()[1]
 
     def step(self, action: NDArray[np.float32]) -> tuple[encode.Flat, float, bool, bool, dict[str, Any]]:
-        """A limit of an arm that is exceeded ends the episode (terminated; `info["limit"]` says which), a simulation that
+        """An arm limit that is exceeded ends the episode (terminated; `info["limit"]` says which), a simulation that
         diverges cuts it off (truncated; `info["diverged"]`). Raises ActionError for an action outside the space, and
         ResetNeeded after either end."""
         if self._finished:

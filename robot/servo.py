@@ -40,6 +40,9 @@ HARD = 5.0  # least deceleration after a fault [m/s^2]
 HARD_TURN = 50.0  # the same of rotations [rad/s^2]
 BARRIER = 0.5e-3  # so far beyond a wall the arm itself may come to rest; the target never goes beyond [m]
 LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches: nearer to a singularity it only may move away
+# The least singular value changes by no more than so much for each radian that a joint turns: each of the six columns
+# has a length of at most sqrt(2) in these units, and turns with the joints before it.
+STEEPEST = math.sqrt(12.0)
 RESTING, RESTING_TURN = 1e-3, 10e-3  # slower than this an arm stands [m/s, rad/s]
 MOVED, MOVED_TURN = 0.2e-3, 2e-3  # farther than this from where it was held, something moved it [m, rad]
 SKEW = 2 * PERIOD  # between the loops of two arms [s]
@@ -71,6 +74,7 @@ class Servo:
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position, rotation
         self._goal_time = -math.inf
         self._touches, self._seen = touches, math.nan  # records read; exposure of the oldest picture [s]
+        self._clear: tuple[FloatArray, float] | None = None  # joints far from a singularity, and how far
         self._hard = max(HARD, orders.acceleration), max(HARD_TURN, orders.turn_acceleration)
 
     @property
@@ -155,6 +159,9 @@ class Servo:
         ):
             self.motion, self._sent = resting(now.sensor[:3, 3], now.sensor[:3, :3]), now.joints
             goal = self._cut_at_walls(self.motion) or goal
+        elif self._sent is not None and self.motion.at_rest and _is_at(self.motion, goal):
+            self.status = ArmStatus.OK
+            return self._sent  # nothing is left to be computed
         gaps = self._gaps(self.motion, partners)
 
         def admissible(motion: Motion) -> bool:
@@ -210,10 +217,18 @@ class Servo:
         joints = self.kinematics.inverse(wanted @ nominal, self._sent)
         if joints is None or joint_step_excess(self._sent, joints, self.orders.joint_speed, PERIOD) > 1.0:
             return None
+        return None if self._nears_singularity(joints) else joints
+
+    def _nears_singularity(self, joints: FloatArray) -> bool:
+        """True if `joints` are too near to a singularity, and nearer than those that were sent last."""
+        assert self._sent is not None
+        if self._clear is not None:
+            there, room = self._clear
+            if STEEPEST * float(np.abs(joints - there).sum()) < room:
+                return False
         distance = self.kinematics.singularity(joints)
-        if distance < LEAST_SINGULAR_VALUE and distance < self.kinematics.singularity(self._sent):
-            return None
-        return joints
+        self._clear = joints, distance - LEAST_SINGULAR_VALUE
+        return distance < LEAST_SINGULAR_VALUE and distance < self.kinematics.singularity(self._sent)
 
     def _gaps(self, motion: Motion, partners: Sequence[Record | None]) -> list[float]:
         """Room [m] between the braking way of `motion` and that of each other arm, beyond what is to be kept. What the
@@ -247,6 +262,11 @@ def well(other: Record | None) -> bool:
         return False
     status = ArmStatus(int(other["status"]))
     return not status.is_fault and status != ArmStatus.CONNECTING
+
+
+def _is_at(motion: Motion, goal: tuple[FloatArray, FloatArray]) -> bool:
+    position, rotation = goal
+    return np.array_equal(motion.position, position) and np.array_equal(motion.rotation, rotation)
 
 
 def _rotation(quaternion: FloatArray) -> FloatArray:

@@ -69,6 +69,7 @@ def untimed(facts: RigFacts, arm: str, sensor: str) -> RigFacts:
     return facts.model_copy(
         update={
             "lock_step": False,  # a picture that waits for the arm tells no latency
+            "contact": "hertz",  # nor does one that waits for a simulation; of mocks only
             "arms": {**facts.arms, arm: there.model_copy(update={"latency": 0.0})},
             "sensors": {**facts.sensors, sensor: eye.model_copy(update={"latency": 0.0})},
         }

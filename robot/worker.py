@@ -104,7 +104,7 @@ class Worker:
             ) from failure
         try:
             self.receive: Any = rtde_receive.RTDEReceiveInterface(orders.host, 500.0, VARIABLES)
-            self.control: Any = rtde_control.RTDEControlInterface(orders.host, 500.0)
+            self.control: Any = rtde_control.RTDEControlInterface(orders.host, 125.0)
         except Exception as failure:  # the library raises RuntimeError for all that can happen
             if "in use" in str(failure).lower():
                 raise DeviceBusyError(

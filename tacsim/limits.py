@@ -6,6 +6,7 @@ shortened on the straight way there, and the caller tells what was really sent.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -211,8 +212,8 @@ def braking_end(position: ArrayLike, velocity: ArrayLike, deceleration: float) -
 
 def overload(wrench: ArrayLike, force: float, torque: float) -> bool:
     """True if `wrench` (6,) is heavier than `force` [N] or `torque` [N m], or is not a number: then nothing guards."""
-    load = np.asarray(wrench, dtype=np.float64)
-    return not (float(np.linalg.norm(load[:3])) <= force and float(np.linalg.norm(load[3:])) <= torque)
+    load = np.asarray(wrench, dtype=np.float64).tolist()
+    return not (math.hypot(*load[:3]) <= force and math.hypot(*load[3:]) <= torque)
 
 
 def exceeds(value: float, limit: float | None) -> bool:

@@ -103,6 +103,9 @@ class RigFacts(Facts):
     dynamic: bool = False
     # Mock rigs: a control period ends when the arms rest and the twin has drawn the picture for just that pose.
     lock_step: bool = True
+    # Mock rigs: what arms feel and cameras see is simulated; or it is a ball's contact in closed form, in real time but
+    # without a body, for tests of timing.
+    contact: Literal["simulated", "hertz"] = "simulated"
     keep_out: tuple[KeepOut, ...] = Field(default=(), max_length=16)
     start: HardwareStart = HardwareStart()  # of rigs that go by the wall clock
 

@@ -14,6 +14,7 @@ from typing import Self
 from urllib.parse import urlsplit
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robot.errors import DeviceError
 from robot.frames import ArmFrames, pose_of
@@ -50,6 +51,7 @@ class MockBench:
         self.start: dict[str, Pose] = {}
         self._twin: Twin | None = None
         self._scenery: Scenery | None = None
+        self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
         self._lock = threading.Lock()  # of the twin
         self._stop = threading.Event()
         self._free: threading.Thread | None = None
@@ -63,7 +65,7 @@ class MockBench:
             stack.callback(self.close)
             models = self._models()
             if facts.scene is not None and models:
-                self._twin = Twin(facts.scene, models, facts.canonical)
+                self._twin = Twin(facts.scene, models, facts.canonical, facts.contact)
             for name, sensor in facts.sensors.items():
                 if isinstance(sensor, CameraSensorFacts) and sensor.mock is not None:
                     self.cameras[name] = _camera(name, sensor)
@@ -97,7 +99,7 @@ class MockBench:
         if arm.start is not None:
             return arm.start.pose
         sensor = self._carried(name)
-        if self._twin is None or sensor not in self._twin.initial:
+        if self._twin is None or sensor is None or sensor not in self._twin.initial:
             raise DeviceError(
                 f"arms.{name}.start: where does an episode begin? No scene says it; give the sensor's pose"
             )
@@ -124,6 +126,13 @@ class MockBench:
     @property
     def simulated(self) -> bool:
         return self._twin is not None
+
+    @property
+    def knows_truth(self) -> bool:
+        """True if there is a simulated body."""
+        scene = self._facts.scene
+        simulated = self._twin is not None and self._facts.contact == "simulated"
+        return simulated and scene is not None and scene.body is not None
 
     @property
     def scenery(self) -> Scenery | None:
@@ -165,7 +174,11 @@ class MockBench:
             if sensor is not None and sensor in scenery.wrenches:
                 door.wrench(self._at_tool(name, scenery.wrenches[sensor]).tolist())
         time.sleep(pause)
-        return {name: camera.push(scenery.images[name]) for name, camera in self.cameras.items()}
+        for name, camera in self.cameras.items():  # which go on showing their last picture
+            picture = scenery.images[name]
+            if name not in self._pushed or not np.array_equal(self._pushed[name][0], picture):
+                self._pushed[name] = picture, camera.push(picture)
+        return {name: number for name, (_, number) in self._pushed.items()}
 
     def _at_tool(self, name: str, wrench: FloatArray) -> FloatArray:
         """A wrench (6,) about the sensor, in its axes, as the controller has it: about the TCP, in the base's axes."""

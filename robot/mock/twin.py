@@ -19,10 +19,10 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +66,16 @@ class Twin:
     Args:
         models: what is rendered of each sensor.
         grid: on which surfaces are sampled.
+        contact: the scene's gels and body, or a ball before each gel in closed form (robot.mock.hertz).
     """
 
-    def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        models: Mapping[str, SensorModel],
+        grid: CanonicalGrid,
+        contact: Literal["simulated", "hertz"] = "simulated",
+    ) -> None:
         self._index = 0
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
@@ -81,9 +88,8 @@ class Twin:
         self.pid = self._process.pid
         try:
             facts = {name: model.model_dump(mode="json") for name, model in models.items()}
-            said, _ = self._ask(
-                {"do": "open", "scene": scene.model_dump(mode="json"), "models": facts, "grid": grid.model_dump()}
-            )
+            scenery = {"scene": scene.model_dump(mode="json"), "models": facts, "grid": grid.model_dump()}
+            said, _ = self._ask({"do": "open", "contact": contact, **scenery})
         except BaseException:
             self.close()
             raise
@@ -213,64 +219,94 @@ def _pose(numbers: list[float]) -> Pose:
 # ------------------------------------------------------------------- process
 
 
-class _Bench:
-    """The world and its renderers, in the process."""
+class Bench(Protocol):
+    """What the process holds: simulated (:class:`WorldBench`), or in closed form (robot.mock.hertz)."""
 
-    def __init__(self, scene: Mapping[str, Any], models: Mapping[str, Any], grid: Mapping[str, Any]) -> None:
-        from tacsim.optics.geometry import CanonicalGrid, SensorModel
+    @property
+    def stats(self) -> Mapping[str, float]: ...
+    def poses(self) -> Mapping[str, Pose]: ...
+    def place(self, poses: Mapping[str, Pose]) -> None: ...
+    def move(self, poses: Mapping[str, Pose]) -> None: ...
+    def wrench(self, name: str) -> FloatArray: ...
+    def look(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]: ...
+    def truth(self) -> Truth | None: ...
+
+
+class WorldBench:
+    """The simulated world and its renderers."""
+
+    def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
         from tacsim.optics.render import Renderer
         from tacsim.physics.world import make_world
-        from tacsim.scene import Scene
 
-        facts = Scene.model_validate_json(json.dumps(scene))
-        self.world: World = make_world(facts)
+        self.world: World = make_world(scene)
         self._initial = self.world.snapshot()
-        self._grid = CanonicalGrid.model_validate(grid)
-        self._models = {name: SensorModel.model_validate_json(json.dumps(model)) for name, model in models.items()}
-        self._renderers = {name: Renderer(model, facts.gel.size[:2]) for name, model in self._models.items()}
-        self._stats: dict[str, float] = {}
+        self._models, self._grid = models, grid
+        self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
+        self.stats: dict[str, float] = {}
 
-    def poses(self) -> dict[str, list[float]]:
-        return {name: _numbers(self.world.pose(name)) for name in self.world.sensors}
+    def poses(self) -> dict[str, Pose]:
+        return {name: self.world.pose(name) for name in self.world.sensors}
 
-    def place(self, poses: Mapping[str, list[float]]) -> None:
+    def place(self, poses: Mapping[str, Pose]) -> None:
         self.world.restore(self._initial)
         self.move(poses)
 
-    def move(self, poses: Mapping[str, list[float]]) -> None:
+    def move(self, poses: Mapping[str, Pose]) -> None:
         from tacsim.pose import distance
 
         targets = {}
-        for name, numbers in poses.items():
-            metres, radians = distance(self.world.pose(name), _pose(numbers))
+        for name, pose in poses.items():
+            metres, radians = distance(self.world.pose(name), pose)
             if max(metres, 0.1 * radians) > SAME:
-                targets[name] = _pose(numbers)
+                targets[name] = pose
         if targets:
-            self._stats = {key: float(value) for key, value in asdict(self.world.move(targets)).items()}
+            self.stats = {key: float(value) for key, value in asdict(self.world.move(targets)).items()}
 
-    def scenery(self, seconds: float) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    def wrench(self, name: str) -> FloatArray:
+        return self.world.wrench(name)
+
+    def look(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
         from tacsim.optics.surface import surface_map
 
-        world, truth = self.world, self.world.truth()
-        arrays: dict[str, NDArray[Any]] = {}
-        for name, render in self._renderers.items():
-            surface = world.surface(name)
-            sampled = surface_map(surface, self._grid, self._models[name].markers)
-            arrays |= {f"image.{name}": render(surface), f"height.{name}": sampled.height}
-            arrays[f"gradient.{name}"] = sampled.gradient
-            if sampled.flow is not None:
-                arrays[f"flow.{name}"] = sampled.flow
-        said: dict[str, Any] = {
-            "wrenches": {name: world.wrench(name).tolist() for name in world.sensors},
-            "stats": self._stats,
-            "seconds": seconds,
-            "truth": None,
-        }
-        if truth is not None:
-            poses = {name: _numbers(pose) for name, pose in truth.poses.items()}
-            said["truth"] = {"height": truth.height, "position": truth.position.tolist(), "poses": poses}
-            arrays["points"] = truth.points
-        return said, arrays
+        surface = self.world.surface(name)
+        return self._renderers[name](surface), surface_map(surface, self._grid, self._models[name].markers)
+
+    def truth(self) -> Truth | None:
+        return self.world.truth()
+
+
+def _open(request: Mapping[str, Any]) -> tuple[Bench, list[str]]:
+    """The bench that is asked for, and the sensors that are looked at."""
+    from robot.mock.hertz import HertzBench
+    from tacsim.optics.geometry import CanonicalGrid, SensorModel
+    from tacsim.scene import Scene
+
+    scene = Scene.model_validate_json(json.dumps(request["scene"]))
+    models = {name: SensorModel.model_validate_json(json.dumps(model)) for name, model in request["models"].items()}
+    kind: Callable[..., Bench] = HertzBench if request["contact"] == "hertz" else WorldBench
+    return kind(scene, models, CanonicalGrid.model_validate(request["grid"])), list(models)
+
+
+def _scenery(bench: Bench, seen: list[str], seconds: float) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    arrays: dict[str, NDArray[Any]] = {}
+    for name in seen:
+        arrays[f"image.{name}"], surface = bench.look(name)
+        arrays |= {f"height.{name}": surface.height, f"gradient.{name}": surface.gradient}
+        if surface.flow is not None:
+            arrays[f"flow.{name}"] = surface.flow
+    said: dict[str, Any] = {
+        "wrenches": {name: bench.wrench(name).tolist() for name in bench.poses()},
+        "stats": dict(bench.stats),
+        "seconds": seconds,
+        "truth": None,
+    }
+    truth = bench.truth()
+    if truth is not None:
+        poses = {name: _numbers(pose) for name, pose in truth.poses.items()}
+        said["truth"] = {"height": truth.height, "position": truth.position.tolist(), "poses": poses}
+        arrays["points"] = truth.points
+    return said, arrays
 
 
 def main() -> None:
@@ -280,18 +316,20 @@ def main() -> None:
     os.dup2(2, 1)  # whoever prints shall not break a message
     os.nice(NICENESS)
     requests = sys.stdin.buffer
-    bench: _Bench | None = None
+    bench: Bench | None = None
+    seen: list[str] = []
     while (message := read_message(requests)) is not None:
         request, _ = message
         try:
             began = time.perf_counter()
             if request["do"] == "open":
-                bench = _Bench(request["scene"], request["models"], request["grid"])
-                write_message(answers, {"poses": bench.poses()})
+                bench, seen = _open(request)
+                write_message(answers, {"poses": {name: _numbers(pose) for name, pose in bench.poses().items()}})
                 continue
             assert bench is not None
-            (bench.place if request["do"] == "place" else bench.move)(request["poses"])
-            write_message(answers, *bench.scenery(time.perf_counter() - began))
+            poses = {name: _pose(numbers) for name, numbers in request["poses"].items()}
+            (bench.place if request["do"] == "place" else bench.move)(poses)
+            write_message(answers, *_scenery(bench, seen, time.perf_counter() - began))
         except Exception as failure:  # whatever it is, the other side says it
             write_message(answers, {"error": f"{type(failure).__name__}: {failure}"})
 

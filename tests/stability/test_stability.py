@@ -20,6 +20,8 @@ Facts = dict[str, float]
 LONG = {"loaded rest, long": 600, "unstressed rest, long": 400, "unstressed rest, long, press": 100}  # [s]
 SECONDS = 60.0
 
+pytestmark = pytest.mark.timeout(420)  # the first case of a process has 300 s on top, for kernels to be compiled
+
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[Worker]:
@@ -157,7 +159,7 @@ def test_a_step_beyond_the_limit_changes_no_result(
 
 
 def test_a_case_that_kills_the_process_fails_alone() -> None:
-    with Worker() as worker:
+    with Worker(start=0.0) as worker:
         with pytest.raises(CaseDied, match=r"'death' with physics 'press' ended the process \(exit code"):
             worker.run("death", "press", SECONDS)
         assert worker.deaths == 1

@@ -199,9 +199,9 @@ def test_a_file_that_is_not_there_lists_the_names() -> None:
 
 
 def quick(source: str = "a.yaml", seconds: float = 10.0) -> str:
-    start = time.monotonic()
+    start = time.process_time()
     text = complaint(load_scene, source)
-    assert time.monotonic() - start < seconds
+    assert time.process_time() - start < seconds
     assert len(text) < 2000
     return text
 
@@ -232,9 +232,9 @@ def test_a_bomb_of_references(folder: Path) -> None:
     (folder / "big.yaml").write_text("extends: ideal\nlighting: {lights: [" + "{direction: [0, 0, -1]}, " * 2000 + "]}")
     sensors = "\n".join(f"  s{i}: {{driver: sim, arm: upper, model: big.yaml}}" for i in range(2000))
     (folder / "rig.yaml").write_text(f"extends: sim\nsensors:\n{sensors}")
-    start = time.monotonic()
+    start = time.process_time()
     assert "too many values; at most 20000 are allowed" in complaint(load_rig, "rig.yaml")
-    assert time.monotonic() - start < 20
+    assert time.process_time() - start < 20
 
 
 def test_a_large_file_is_not_even_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

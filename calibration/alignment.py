@@ -145,5 +145,5 @@ def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
 
 
 def _strength(change: Float32) -> Float32:
-    wide = np.asarray(change, dtype=np.float64)
-    return np.linalg.norm(wide - untouched_change(wide), axis=2).astype(np.float32)
+    away = change - untouched_change(change)
+    return np.sqrt(np.einsum("ijk,ijk->ij", away, away)).astype(np.float32)

@@ -89,6 +89,7 @@ class Pair:
     null: Numbers  # the same of A's reference
     flags: tuple[str, ...]
     region: Mask  # (H, W) contact in either, in the pixels of B
+    contact_b: metrics.Patch | None  # contact of B alone, in its pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +202,7 @@ class _Judge:
     """Scores pairs in the pixels of B."""
 
     def __init__(self, a: Side, b: Side, alignment: Alignment, grid: CanonicalGrid) -> None:
-        self._a, self._b, self._alignment, self._grid = a, b, alignment, grid
+        self._b, self._alignment, self._grid = b, alignment, grid
         self._covered = alignment.covered
         self._whole = None if self._covered.all() else self._covered
         self._reference_a = alignment(a.reference)
@@ -224,9 +225,12 @@ class _Judge:
         if region.any():
             self._plain.append(numbers["contact_ncc"])
             self._swapped.append(metrics.correlation(change_a[..., ::-1], change_b, region))
-        flags = [f"{side}: {words}" for side, shot, of in (("A", a, self._a), ("B", b, self._b))
-                 for words in doubts(shot, of)]  # fmt: skip
-        return Pair(a, b, numbers, null, tuple(flags), region)
+        reference_b = self._b.reference.astype(np.float32)
+        flags = [
+            *(f"A: {words}" for words in doubts(seen_a, self._reference_a, contact_a)),
+            *(f"B: {words}" for words in doubts(seen_b, reference_b, contact_b)),
+        ]
+        return Pair(a, b, numbers, null, tuple(flags), region, metrics.patch_of(contact_b))
 
     def against_reference(self, shot: Shot, region: Mask) -> Numbers:
         """An untouched frame of B against B's reference, where a pair has contact."""
@@ -379,7 +383,7 @@ def _few(count: int) -> list[str]:
 
 
 def _mean(values: Sequence[float] | Float64) -> float:
-    """Mean of what is finite; NaN if nothing is."""
+    """Mean of what is known; NaN if nothing is. Infinite where one is: the PSNR of equal pictures."""
     array = np.asarray(values, dtype=np.float64)
-    known = array[np.isfinite(array)]
+    known = array[~np.isnan(array)]
     return float(known.mean()) if known.size else math.nan

@@ -22,6 +22,7 @@ BLUR = 2.0  # of a change of colour before contact is looked for in it [px]: noi
 LEAST_CHANGE = 5.0  # a smoothed change below this is no contact [grey levels]
 NOISES = 6.0  # ... nor one below so many times the noise of the picture
 SHARE = 0.25  # contact reaches down to this share of the strongest change, or (pressed surfaces: 1/2) of the depth
+ENOUGH = 10000  # pixels tell a median
 SMALLEST = 30  # pixels: a smaller patch is dirt
 HIDDEN = 3.0  # holes in a contact that are filled: the flat middle of a press has the colour of the untouched gel
 
@@ -130,10 +131,12 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     strongest change, so it means the same in a bright and in a dim picture; its holes are filled, as the flat middle
     of a press has the colour of the untouched gel.
     """
-    from scipy.ndimage import binary_closing, binary_fill_holes, gaussian_filter, label
+    import cv2
+    from scipy.ndimage import binary_closing, binary_fill_holes, label
 
-    smooth = gaussian_filter(np.asarray(change, dtype=np.float64), (BLUR, BLUR, 0))
-    strength = np.abs(smooth - untouched_change(smooth)).max(axis=2)
+    smooth = np.asarray(cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), BLUR), dtype=np.float32)
+    red, green, blue = (np.abs(smooth[..., k] - level) for k, level in enumerate(untouched_change(smooth)))
+    strength = np.maximum(np.maximum(red, green), blue)
     limit = max(LEAST_CHANGE, NOISES * _noise(strength), SHARE * float(np.percentile(strength, 99.8)))
     found = strength > limit
     reach = int(HIDDEN)
@@ -145,9 +148,10 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     return np.asarray(sizes[parts] >= SMALLEST)
 
 
-def untouched_change(change: Float64) -> Float64:
+def untouched_change(change: NDArray[np.floating]) -> NDArray[np.floating]:
     """(3,) change of colour of the untouched gel: the median over (H, W, 3), then over the half nearest to it."""
     pixels = change.reshape(-1, change.shape[2])
+    pixels = pixels[:: max(1, len(pixels) // ENOUGH)]
     level = np.median(pixels, axis=0)
     away = np.abs(pixels - level).max(axis=1)
     return np.asarray(np.median(pixels[away <= np.median(away)], axis=0))
@@ -168,7 +172,7 @@ def patch_of(region: Mask) -> Patch | None:
     return Patch(float(columns.mean()), float(rows.mean()), math.sqrt(len(rows) / math.pi))
 
 
-def _noise(strength: Float64) -> float:
+def _noise(strength: NDArray[np.floating]) -> float:
     """Spread of the half of the pixels that changes least, taken for that of noise."""
     return 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
 

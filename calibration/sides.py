@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from calibration.frames import MEDIAN_OF, UNTOUCHED
 from calibration.lens import BadCorners, Corners
-from calibration.metrics import contact_region
 from calibration.reference import SATURATED
 from tacsim.interface import SurfaceMap
 from tacsim.record.episode import EpisodeError
@@ -86,19 +85,17 @@ def read_side(path: Path, reference: Path | None = None, sensor: str = "") -> Si
         raise BadSide(str(error)) from None
 
 
-def doubts(shot: Shot, side: Side) -> list[str]:
-    """What is wrong with a frame of a side, in words."""
-    change = shot.image.astype(np.float64) - side.reference
-    contact = contact_region(change)
+def doubts(image: NDArray[np.floating], reference: NDArray[np.floating], contact: NDArray[np.bool_]) -> list[str]:
+    """What is wrong with a frame, in words: its picture and reference (H, W, 3) [grey levels], its contact (H, W)."""
     found = []
     if not contact.any():
         found.append("no contact")
     else:
-        burnt = float((shot.image[contact] >= SATURATED).any(axis=1).mean())
+        burnt = float((image[contact] >= SATURATED).any(axis=1).mean())
         if burnt > BURNT:
             found.append(f"saturated: {burnt:.0%} of the contact")
-    outside = change[~contact]
-    if len(outside) and (drift := float(np.abs(np.median(outside, axis=0)).max())) > DRIFTED:
+    change = (image - reference)[~contact]
+    if len(change) and (drift := float(np.abs(np.median(change, axis=0)).max())) > DRIFTED:
         found.append(f"stale reference: the untouched gel has changed by {drift:.0f} grey levels")
     return found
 

@@ -45,7 +45,11 @@ class Touch:
 
 
 def touches(
-    side: Side, shots: Sequence[Shot], calibration: Calibration | None, grid: CanonicalGrid, reference: Image | None = None
+    side: Side,
+    shots: Sequence[Shot],
+    calibration: Calibration | None,
+    grid: CanonicalGrid,
+    reference: Image | None = None,
 ) -> tuple[tuple[Touch, ...] | None, str]:
     """The surfaces of some frames of a side; or None, and why not.
 

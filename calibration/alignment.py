@@ -84,8 +84,8 @@ def by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
     across, down = source[1] / shape[1], source[0] / shape[0]
     if abs(across / down - 1) > ASPECT:
         raise BadSide(
-            f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. Give "
-            "the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
+            f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. "
+            "Give the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
             "--corners-b)"
         )
     # pixel centres are whole numbers, so a picture begins at -1/2
@@ -132,13 +132,13 @@ def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
     patches = [patch_of(contact_region(change)) for change in (a, b)]
     if patches[0] is None or patches[1] is None:
         return None
-    strengths = [_strength(change) for change in (b, a)]
+    template, moved = _strength(b), _strength(a)
     start = np.eye(2, 3, dtype=np.float32)
     start[:, 2] = patches[0].x - patches[1].x, patches[0].y - patches[1].y
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, STEPS, SMALL)
-    mask = np.ones(strengths[1].shape, dtype=np.uint8)
+    mask = np.ones(moved.shape, dtype=np.uint8)
     try:
-        _, warp = cv2.findTransformECC(*strengths, start, cv2.MOTION_TRANSLATION, criteria, mask, SMOOTH)
+        _, warp = cv2.findTransformECC(template, moved, start, cv2.MOTION_TRANSLATION, criteria, mask, SMOOTH)
     except cv2.error:  # it does not converge: these pictures do not show the same
         return None
     return float(warp[0, 2]), float(warp[1, 2])
@@ -146,4 +146,5 @@ def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
 
 def _strength(change: Float32) -> Float32:
     away = change - untouched_change(change)
-    return np.sqrt(np.einsum("ijk,ijk->ij", away, away)).astype(np.float32)
+    strength: Float32 = np.sqrt(np.einsum("ijk,ijk->ij", away, away)).astype(np.float32)
+    return strength

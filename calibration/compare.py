@@ -34,6 +34,7 @@ LOOKED_AT = 40  # pairs that the shift is found from, at most
 NOISE_FRAMES = 5  # untouched frames that the floor is made from, at most
 DRAWS = 2000  # of the bootstrap
 FEWEST = 3  # pairs: fewer have no interval
+GRID = CanonicalGrid()  # the usual one
 SWAPPED = 0.2  # by so much, red and blue exchanged must correlate better to be called so
 
 
@@ -129,7 +130,10 @@ class Options:
 
     pairing: Pairing = Pairing.auto
     shift: bool = True  # look for the shift between the two
-    grid: CanonicalGrid = CanonicalGrid()  # on which surfaces are compared
+    grid: CanonicalGrid = GRID  # on which surfaces are compared
+
+
+USUAL = Options()
 
 
 def compare(
@@ -137,7 +141,7 @@ def compare(
     b: Side,
     calibration_a: Calibration | None = None,
     calibration_b: Calibration | None = None,
-    options: Options = Options(),
+    options: Options = USUAL,
     on_pair: Callable[[int, int], None] = lambda done, total: None,
 ) -> Comparison:
     """Compares A with B.
@@ -162,7 +166,8 @@ def compare(
     pairs = []
     for k, (shot_a, shot_b) in enumerate(couples):
         on_pair(k, len(couples))
-        pairs.append(judge.pair(shot_a, shot_b, found_a and found_a[k], found_b and found_b[k]))
+        touch_a, touch_b = (None if found is None else found[k] for found in (found_a, found_b))
+        pairs.append(judge.pair(shot_a, shot_b, touch_a, touch_b))
     floor, said = _floor(judge, b, pairs, calibration_b, options.grid)
     overall = {metric.key: _overall(metric, pairs, floor.get(metric.key, math.nan)) for metric in METRICS}
     notes += [*left, *said, *judge.swapped(), *_few(len(pairs))]

@@ -169,7 +169,8 @@ def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
 
 
 def _grey(image: Image, base: Image) -> Image:
-    return np.clip(128.0 + (image.astype(np.float32) - base), 0, 255).astype(np.uint8)
+    grey: Image = np.clip(128.0 + (image.astype(np.float32) - base), 0, 255).astype(np.uint8)
+    return grey
 
 
 def _coloured(field: NDArray[np.floating], full: float) -> Image:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibration import metrics
 from calibration.bundle import Calibration
-from calibration.compare import DRAWS, Comparison, Pair
+from calibration.compare import DRAWS, GRID, Comparison, Pair
 from calibration.sides import BadSide, Image
 from calibration.touched import Touch, touches
 from tacsim.optics.geometry import CanonicalGrid
@@ -66,7 +66,8 @@ class Change:
 
     def __call__(self, image: Image) -> Image:
         changed = image * np.array(self.gain, dtype=np.float32) + np.float32(self.offset)
-        return np.rint(np.clip(changed, 0, 255)).astype(np.uint8)
+        image = np.rint(np.clip(changed, 0, 255)).astype(np.uint8)
+        return image
 
 
 CHANGES = (
@@ -101,7 +102,7 @@ class Report:
 def invariance(
     comparison: Comparison,
     calibration_b: Calibration | None = None,
-    grid: CanonicalGrid = CanonicalGrid(),
+    grid: CanonicalGrid = GRID,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
     """Of a finished comparison. Gradient and height need surfaces on both sides, the drift table B's calibration.
@@ -117,12 +118,13 @@ def invariance(
     patches, words = _patches(comparison, touched, calibration_b, grid)
     order = np.argsort([patch.radius for patch in touched.values()])
     steps = len(patches) + len(CHANGES)
-    views = []
+    views: list[Invariance] = []
     for name, (of_a, of_b, signal) in patches.items():
         on_step(len(views), steps)
         views.append(_view(name, of_a, of_b, signal, order))
     notes = [] if "height" in patches else ["gradient and height are left out: no surfaces on both sides"]
-    angle, drifts = math.nan, []
+    angle = math.nan
+    drifts: list[Drift] = []
     if comparison.touched_a is None or calibration_b is None:
         notes.append("no drift table: it needs surfaces of A and the calibration of B")
     else:

@@ -218,4 +218,5 @@ def _side(
 
 
 def _median(shots: list[Shot]) -> Image:
-    return np.median(np.stack([shot.image for shot in shots]), axis=0).astype(np.uint8)
+    median: Image = np.median(np.stack([shot.image for shot in shots]), axis=0).astype(np.uint8)
+    return median

@@ -32,7 +32,6 @@ def press_like(
     real: Side,
     scene: Scene,
     sensor: SensorModel,
-    gel_size: tuple[float, float],
     grid: CanonicalGrid,
     on_press: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Side, list[str]]:
@@ -42,7 +41,6 @@ def press_like(
         real: frames of a ball's presses.
         scene: with that ball as its indenter.
         sensor: makes the pictures, of the size of the real ones: that of the sensor's calibration.
-        gel_size: x, y of the gel [m].
         grid: on which the surfaces are kept.
 
     Raises BadSide for a scene without ball, pictures of another size, or no contact at all; SimulationDiverged.
@@ -54,9 +52,7 @@ def press_like(
             f"{real.name} is {real.shape[1]} x {real.shape[0]} px, the calibration is of "
             f"{sensor.geometry.width} x {sensor.geometry.height}; it belongs to another sensor or setting"
         )
-    thickness = scene.gel.size[2]
-    sized = scene.model_copy(update={"gel": scene.gel.model_copy(update={"size": (*gel_size, thickness)})})
-    bench = _Bench(sized, scene.indenter.geometry.radius, sensor, grid)
+    bench = _Bench(scene, scene.indenter.geometry.radius, sensor, grid)
     circles, notes = _circles(real, bench.ball / sensor.geometry.pixel_pitch)
     done: dict[str, Shot] = {}
     # from the widest contact down to none would peel; upwards the gel is only ever pressed farther
@@ -71,7 +67,8 @@ def press_like(
 
 
 class _Bench:
-    """One gel under a ball. It is pressed in the middle, and seen by a camera that is moved."""
+    """One gel under a ball. It is pressed in the middle and its surface moved under the camera: what happens near the
+    border of a gel is not told."""
 
     def __init__(self, scene: Scene, ball: float, sensor: SensorModel, grid: CanonicalGrid) -> None:
         self.ball, self._sensor, self._grid = ball, sensor, grid

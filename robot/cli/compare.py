@@ -133,7 +133,7 @@ def _is_scene(a: str) -> bool:
 
 def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) -> Side:
     """A's frames by the simulator."""
-    from calibration.bundle import read_bundle, sensor_model
+    from calibration.bundle import sensor_model
     from calibration.sides import BadSide
     from tacsim.config import load_scene
     from tacsim.optics.geometry import CanonicalGrid
@@ -141,14 +141,13 @@ def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) 
     if bundle is None:
         raise BadSide("a scene is seen through the light of B: give B's calibration (--calibration-b)")
     scene = load_scene(name, ["preset=standard", *overrides])
-    calibration, _ = read_bundle(bundle)
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
     from robot.twin_press import press_like
 
     with progress() as bar:
         row = bar.add_task("pressing", total=None)
         made, said = press_like(
-            truth, scene, sensor_model(bundle), calibration.gel_size, CanonicalGrid(),
+            truth, scene, sensor_model(bundle), CanonicalGrid(),
             lambda done, total: bar.update(row, completed=done, total=total),
         )  # fmt: skip
     for words in said:

@@ -156,8 +156,10 @@ def classifier_scores(of_a: Float64, of_b: Float64) -> tuple[Float64, Float64]:
     for number in range(min(count, FOLDS)):
         held = fold == number
         middle = rows[~held].mean(axis=0)
-        axes = np.linalg.svd(rows[~held] - middle, full_matrices=False)[2][:COMPONENTS]
-        seen = (rows - middle) @ axes.T
+        away = rows - middle
+        # principal components through the products of the few presses, not of their many pixels
+        _, vectors = np.linalg.eigh(away[~held] @ away[~held].T)
+        seen = away @ (away[~held].T @ vectors[:, : -COMPONENTS - 1 : -1])
         spread = seen[~held].std(axis=0)
         seen = np.column_stack([seen / np.where(spread > 0, spread, 1.0), np.ones(len(seen))])
         square = seen[~held].T @ seen[~held] + RIDGE * np.eye(seen.shape[1])

@@ -52,8 +52,9 @@ def press_like(
             f"{real.name} is {real.shape[1]} x {real.shape[0]} px, the calibration is of "
             f"{sensor.geometry.width} x {sensor.geometry.height}; it belongs to another sensor or setting"
         )
-    bench = _Bench(scene, scene.indenter.geometry.radius, sensor, grid)
-    circles, notes = _circles(real, bench.ball / sensor.geometry.pixel_pitch)
+    ball = scene.indenter.geometry.radius
+    circles, notes = _circles(real, ball / sensor.geometry.pixel_pitch)
+    bench = _Bench(scene, ball, sensor, grid)
     done: dict[str, Shot] = {}
     # from the widest contact down to none would peel; upwards the gel is only ever pressed farther
     for name, circle in sorted(circles.items(), key=lambda item: item[1].radius):

@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from calibration.ballpress import calibrate_light
+from calibration.bundle import Calibration, Provenance
 from calibration.sides import Shot, Side
-from tests.calibration.presses import HiddenSensor
+from tacsim.optics.geometry import SensorGeometry
+from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 PLACES = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50)]
 DEPTHS = [0.5e-3, 0.35e-3, 0.65e-3, 0.45e-3, 0.55e-3, 0.3e-3]
@@ -53,3 +56,23 @@ def save(of: Side, folder: Path, reference: str = "background.png") -> Path:
     for name, image in ((reference, of.reference), *((shot.name, shot.image) for shot in (*of.shots, *of.untouched))):
         Image.fromarray(image).save(folder / name)
     return folder
+
+
+def calibrated(sensor: HiddenSensor) -> tuple[Calibration, np.ndarray]:
+    """The calibration of a made-up sensor from presses of its own, and its reference."""
+    frames = [(f"{k}.png", made.image) for k, made in enumerate(sensor.presses(8))]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    return Calibration(
+        format=1,
+        serial="made",
+        geometry=SensorGeometry(width=COLUMNS, height=ROWS, pixel_pitch=PITCH),
+        gel_size=(COLUMNS * PITCH, ROWS * PITCH),
+        forward=fit.forward,
+        inverse=fit.inverse,
+        skirt_length=fit.skirt.length * PITCH,
+        skirt_fraction=fit.skirt.fraction,
+        provenance=Provenance(
+            made="2026-01-01T00:00:00+00:00", software="tacsim", ball_radius=BALL, frames=tuple(n for n, _ in frames)
+        ),
+        reference="0" * 64,
+    ), fit.reference

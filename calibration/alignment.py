@@ -48,7 +48,7 @@ class Alignment:
                           & (y <= self.source[0] - 1 + near))  # fmt: skip
 
     def __call__(self, picture: NDArray[Any]) -> Float32:
-        """(rows, columns, 3) what a picture of A, 0..255, shows at the pixels of B; its border where it shows nothing."""
+        """(rows, columns, 3) what a picture of A, 0..255, shows at the pixels of B; its border where it ends."""
         import cv2
 
         picture = np.asarray(picture, dtype=np.float32)

@@ -66,8 +66,8 @@ class Change:
 
     def __call__(self, image: Image) -> Image:
         changed = image * np.array(self.gain, dtype=np.float32) + np.float32(self.offset)
-        image = np.rint(np.clip(changed, 0, 255)).astype(np.uint8)
-        return image
+        grey: Image = np.rint(np.clip(changed, 0, 255)).astype(np.uint8)
+        return grey
 
 
 CHANGES = (

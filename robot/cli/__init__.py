@@ -8,6 +8,7 @@ import typer
 
 from robot.cli.bench import bench
 from robot.cli.calibrate import calibrate
+from robot.cli.compare import compare
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
 from robot.cli.latency import latency
@@ -28,7 +29,7 @@ app = typer.Typer(
 )
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {
-    app: (run, press, reproduce, replay, mock, bench, debug, schema, doctor),
+    app: (run, press, reproduce, replay, mock, bench, compare, debug, schema, doctor),
     calibrate: (latency,),
 }
 for group, commands in COMMANDS.items():

@@ -26,7 +26,7 @@ from tacsim.interface import IncompatibleRig, TactileFrame
 from tacsim.record.episode import EpisodeError
 from tacsim.record.reader import read_episode
 
-COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", "bench", "mock")
+COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", "bench", "mock", "compare")
 TINY = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")  # a world of seconds
 START = (sys.executable, "-c", "from robot.cli import main; main()")
 

@@ -1,0 +1,193 @@
+"""Numbers that say how alike two tactile pictures, or two surfaces, are. Arrays in, numbers out.
+
+Pictures are (H, W, 3) on the grey scale 0..255; `where` (H, W) limits a number to some pixels, such as those in
+contact. A number that nothing can be said of (no pixel, no contact) is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8] | NDArray[np.floating]
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WHITE = 255.0  # grey level
+WINDOW = 7  # side of the window of SSIM [px]
+BLUR = 2.0  # of a change of colour before contact is looked for in it [px]: noise of a camera must not look like touch
+LEAST_CHANGE = 5.0  # a smoothed change below this is no contact [grey levels]
+NOISES = 6.0  # ... nor one below so many times the noise of the picture
+SHARE = 0.25  # contact reaches down to this share of the strongest change, or (pressed surfaces: 1/2) of the depth
+ENOUGH = 10000  # pixels tell a median
+SMALLEST = 30  # pixels: a smaller patch is dirt
+HIDDEN = 3.0  # holes in a contact that are filled: the flat middle of a press has the colour of the untouched gel
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A contact as a circle of the same area."""
+
+    x: float  # of the centroid; columns, to the right
+    y: float  # rows, down
+    radius: float
+
+
+def mean_absolute_error(one: Picture, other: Picture, where: Mask | None = None) -> float:
+    """Mean |one - other| over pixels and channels [grey levels]."""
+    return _mean(np.abs(_difference(one, other)), where)
+
+
+def peak_signal_to_noise(one: Picture, other: Picture, where: Mask | None = None) -> float:
+    """10 log10(255^2 / mean square error) [dB]; infinite for equal pictures."""
+    square = _mean(_difference(one, other) ** 2, where)
+    if math.isnan(square):
+        return math.nan
+    return 10.0 * math.log10(WHITE**2 / square) if square > 0 else math.inf
+
+
+def similarity_map(one: Picture, other: Picture) -> Float64:
+    """(H, W) SSIM (Wang et al., IEEE TIP 2004), mean over channels: uniform window of 7 x 7, sample covariance,
+    reflecting border. scikit-image's `structural_similarity` gives the same numbers."""
+    import cv2
+
+    _difference(one, other)  # the same shape?
+    a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    if min(a.shape[:2]) < WINDOW:
+        raise ValueError(f"pictures of {a.shape[1]} x {a.shape[0]} px are smaller than SSIM's window of {WINDOW} px")
+
+    def mean(picture: Float64) -> Float64:
+        return np.asarray(cv2.blur(picture, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT), dtype=np.float64)
+
+    unbiased = WINDOW**2 / (WINDOW**2 - 1.0)
+    mean_a, mean_b = mean(a), mean(b)
+    variance_a = unbiased * (mean(a * a) - mean_a * mean_a)
+    variance_b = unbiased * (mean(b * b) - mean_b * mean_b)
+    covariance = unbiased * (mean(a * b) - mean_a * mean_b)
+    c1, c2 = (0.01 * WHITE) ** 2, (0.03 * WHITE) ** 2
+    above = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    below = (mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2)
+    return np.asarray((above / below).reshape(*a.shape[:2], -1).mean(axis=-1))
+
+
+def structural_similarity(one: Picture, other: Picture, where: Mask | None = None) -> float:
+    """Mean of :func:`similarity_map`, over `where` or over all but the border that half a window reaches."""
+    similarity = similarity_map(one, other)
+    if where is None:
+        rim = WINDOW // 2
+        return float(similarity[rim:-rim, rim:-rim].mean())
+    return _mean(similarity, where)
+
+
+def correlation(one: Picture, other: Picture, where: Mask | None = None) -> float:
+    """Pearson's correlation of two changes of colour (normalised cross-correlation without shift), over pixels and
+    channels; 0 if either does not vary: a picture without contact tells nothing of one with."""
+    _difference(one, other)
+    a, b = (_chosen(np.asarray(picture, dtype=np.float64), where).ravel() for picture in (one, other))
+    if a.size == 0:
+        return math.nan
+    a, b = a - a.mean(), b - b.mean()
+    power = math.sqrt(float(a @ a) * float(b @ b))
+    return float(a @ b) / power if power > 1e-9 * a.size else 0.0
+
+
+def gradient_angle(one: NDArray[np.floating], other: NDArray[np.floating], where: Mask | None = None) -> float:
+    """Mean angle between the surface normals of two fields of slopes (h, w, 2) [degrees]."""
+    a, b = (np.asarray(slopes, dtype=np.float64) for slopes in (one, other))
+    if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 2:
+        raise ValueError(f"slopes must be (h, w, 2) and alike, got {a.shape} and {b.shape}")
+    # by the cross product too: the arc cosine alone loses angles below 1e-6
+    dot = 1.0 + (a * b).sum(axis=-1)
+    cross = np.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0], a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]])
+    return _mean(np.degrees(np.arctan2(np.sqrt((cross**2).sum(axis=0)), dot)), where)
+
+
+def height_error(one: NDArray[np.floating], other: NDArray[np.floating], where: Mask | None = None) -> float:
+    """Root mean square difference of two height maps (h, w), in their unit."""
+    return math.sqrt(_mean(_difference(one, other) ** 2, where))
+
+
+def overlap(one: Mask, other: Mask) -> float:
+    """Intersection over union of two masks; NaN if both are empty."""
+    if one.shape != other.shape:
+        raise ValueError(f"masks differ in shape: {one.shape} and {other.shape}")
+    union = int((one | other).sum())
+    return float((one & other).sum() / union) if union else math.nan
+
+
+def end_point_error(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Mean distance of the ends of two displacement fields (m, n, 2) of the same markers, in their unit. A marker that
+    either has not found (NaN) is left out."""
+    return _mean(np.sqrt((_difference(one, other) ** 2).sum(axis=-1)), None)
+
+
+def contact_region(change: NDArray[np.floating]) -> Mask:
+    """(H, W) where a change of colour (H, W, 3) [grey levels] shows contact.
+
+    What has changed everywhere (drift of the light) is no contact. The region reaches down to a quarter of the
+    strongest change, so it means the same in a bright and in a dim picture; its holes are filled, as the flat middle
+    of a press has the colour of the untouched gel.
+    """
+    import cv2
+    from scipy.ndimage import binary_closing, binary_fill_holes, label
+
+    smooth = np.asarray(cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), BLUR), dtype=np.float32)
+    red, green, blue = (np.abs(smooth[..., k] - level) for k, level in enumerate(untouched_change(smooth)))
+    strength = np.maximum(np.maximum(red, green), blue)
+    limit = max(LEAST_CHANGE, NOISES * _noise(strength), SHARE * float(np.percentile(strength, 99.8)))
+    found = strength > limit
+    reach = int(HIDDEN)
+    padded = np.pad(found, reach)  # closing eats what touches the border
+    closed = binary_closing(padded, iterations=reach)[reach:-reach, reach:-reach]
+    parts, _ = label(binary_fill_holes(closed | found))
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return np.asarray(sizes[parts] >= SMALLEST)
+
+
+def untouched_change(change: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(3,) change of colour of the untouched gel: the median over (H, W, 3), then over the half nearest to it."""
+    pixels = change.reshape(-1, change.shape[2])
+    pixels = pixels[:: max(1, len(pixels) // ENOUGH)]
+    level = np.median(pixels, axis=0)
+    away = np.abs(pixels - level).max(axis=1)
+    return np.asarray(np.median(pixels[away <= np.median(away)], axis=0))
+
+
+def pressed_region(height: NDArray[np.floating], least: float) -> Mask:
+    """(h, w) where a surface is pressed in by more than half of its depth, if that is deeper than `least` (same unit).
+    Under a ball on a half-space this is the contact circle (Hertz: half the depth at its rim)."""
+    deepest = float(height.max(initial=0.0))
+    return np.asarray(height > 0.5 * deepest) if deepest > least else np.zeros(height.shape, dtype=np.bool_)
+
+
+def patch_of(region: Mask) -> Patch | None:
+    """The circle of a region (H, W) [px]; None when it is empty."""
+    rows, columns = np.nonzero(region)
+    if len(rows) == 0:
+        return None
+    return Patch(float(columns.mean()), float(rows.mean()), math.sqrt(len(rows) / math.pi))
+
+
+def _noise(strength: NDArray[np.floating]) -> float:
+    """Spread of the half of the pixels that changes least, taken for that of noise."""
+    return 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
+
+
+def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Float64:
+    if one.shape != other.shape:
+        raise ValueError(f"shapes differ: {one.shape} and {other.shape}; align them first")
+    return np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+
+
+def _chosen(values: Float64, where: Mask | None) -> Float64:
+    return values if where is None else values[where]
+
+
+def _mean(values: Float64, where: Mask | None) -> float:
+    chosen = _chosen(values, where)
+    known = chosen[np.isfinite(chosen)]
+    return float(known.mean()) if known.size else math.nan

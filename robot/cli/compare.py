@@ -1,0 +1,297 @@
+"""`tacsim compare`: how alike two sources of tactile frames are."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from robot.cli.errors import complain
+from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results, say_files, writing
+
+if TYPE_CHECKING:
+    from calibration.bundle import Calibration
+    from calibration.compare import Comparison
+    from calibration.invariance import Report
+    from calibration.sides import Side
+
+Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
+LENGTHS = ("height_rmse", "surface_radius", "surface_centroid", "marker_error")  # figures that may carry a unit
+Limit = tuple[str, float, bool]  # name, value, True: above it is a failure
+
+
+class Pair(StrEnum):
+    """Which frames belong together."""
+
+    auto = "auto"
+    name = "name"
+    order = "order"
+
+
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="Folder of pictures, video, episode, or scene with a ball.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Folder, video or episode that is taken for the truth.")],
+    reference_a: Annotated[
+        Path | None,
+        typer.Option(help="A without contact.", show_default="background.png or the like, the episode's, or a median"),
+    ] = None,
+    reference_b: Annotated[Path | None, typer.Option(help="B without contact.", show_default="as for A")] = None,
+    calibration_a: Annotated[
+        Path | None, typer.Option(metavar="BUNDLE", help="A's calibration: metres, and height in its pictures.")
+    ] = None,
+    calibration_b: Annotated[Path | None, typer.Option(metavar="BUNDLE", help="B's calibration.")] = None,
+    corners_a: Annotated[
+        str | None, typer.Option(metavar="U,V U,V U,V U,V", help="The gel's corners in A, clockwise from the top left.")
+    ] = None,
+    corners_b: Annotated[str | None, typer.Option(metavar="U,V U,V U,V U,V", help="The same in B.")] = None,
+    sensor_a: Annotated[str, typer.Option(help="Sensor of A, if its episode has more than one.")] = "",
+    sensor_b: Annotated[str, typer.Option(help="The same for B.")] = "",
+    pair: Annotated[Pair, typer.Option(help="auto: by name where all names are the same, else in order.")] = Pair.auto,
+    shift: Annotated[bool, typer.Option("--shift/--no-shift", help="Find the shift between A and B.")] = True,
+    invariance: Annotated[
+        bool, typer.Option("--invariance", help="Also: can a policy tell A from B? (rho, AUC, drift of the light)")
+    ] = False,
+    fail_above: Annotated[
+        list[str] | None, typer.Option(metavar="METRIC=VALUE", help="Exit code 1 if above; may be repeated.")
+    ] = None,
+    fail_below: Annotated[
+        list[str] | None, typer.Option(metavar="METRIC=VALUE", help="Exit code 1 if below; may be repeated.")
+    ] = None,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Compare frames of A with frames of B, each number beside what no contact and mere noise would score.
+
+    Writes compare.json, compare.csv and compare.html. A may be a scene with a ball (press): then the ball is pressed in
+    the simulator where B's frames show a contact, and seen through B's calibration; --set changes that scene.
+
+    Example: tacsim compare sim real --calibration-b bundle --fail-above contact_mae=8
+    """
+    folder = new_directory(out, "compare")
+    with busy("loading"):
+        from calibration.compare import Options, Pairing
+        from calibration.compare import compare as run
+        from calibration.comparison_report import figures, write
+        from calibration.lens import BadCorners
+        from calibration.sides import BadSide
+    limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
+    bundles = [None if path is None else _calibration(path) for path in (calibration_a, calibration_b)]
+    try:
+        truth = _read(b, reference_b, sensor_b)
+        if _is_scene(a):
+            if corners_a or corners_b or reference_a or sensor_a:
+                raise BadSide(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
+            made = _pressed(a, truth, calibration_b, set_ or [])
+        else:
+            if set_:
+                raise BadSide(f"--set changes a scene, but A is no scene: {a}")
+            made = _read(Path(a), reference_a, sensor_a)
+        made, truth = _straight(made, truth, (corners_a, corners_b), bundles)
+        with progress() as bar:
+            row = bar.add_task("comparing", total=None)
+            result = run(
+                made, truth, bundles[0], bundles[1], Options(Pairing(pair.value), shift),
+                lambda done, total: bar.update(row, completed=done, total=total),
+            )  # fmt: skip
+        report = _invariance(result, bundles[1]) if invariance else None
+    except (BadSide, BadCorners) as error:
+        raise typer.BadParameter(str(error), param_hint="A B") from None
+    values = figures(result, report)
+    _refuse_unknown(limits, values)
+    with writing(make(folder)), busy("writing"):
+        written = write(folder, result, report)
+    _show(result, report)
+    say_files(*written)
+    if _broken(limits, values):
+        raise typer.Exit(1)
+
+
+def _calibration(path: Path) -> Calibration:
+    from calibration.bundle import BadBundle, read_bundle
+
+    try:
+        return read_bundle(path)[0]
+    except BadBundle as error:
+        raise typer.BadParameter(str(error), param_hint="--calibration-a, --calibration-b") from None
+
+
+def _read(path: Path, reference: Path | None, sensor: str) -> Side:
+    from calibration.sides import read_side
+
+    with busy(f"reading {path}"):
+        return read_side(path, reference, sensor)
+
+
+def _is_scene(a: str) -> bool:
+    """True for the name of a shipped scene that is no file or folder here, and for a .yaml file."""
+    from tacsim.config import names
+
+    return a.lower().endswith((".yaml", ".yml")) or (not Path(a).exists() and a in names("scene"))
+
+
+def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) -> Side:
+    """A's frames by the simulator."""
+    from calibration.bundle import sensor_model
+    from calibration.sides import BadSide
+    from tacsim.config import load_scene
+    from tacsim.optics.geometry import CanonicalGrid
+
+    if bundle is None:
+        raise BadSide("a scene is seen through the light of B: give B's calibration (--calibration-b)")
+    scene = load_scene(name, ["preset=standard", *overrides])
+    notes.print("pressing (the first run compiles the kernels, up to half a minute)")
+    from robot.twin_press import press_like
+
+    with progress() as bar:
+        row = bar.add_task("pressing", total=None)
+        made, said = press_like(
+            truth, scene, sensor_model(bundle), CanonicalGrid(),
+            lambda done, total: bar.update(row, completed=done, total=total),
+        )  # fmt: skip
+    for words in said:
+        notes.print(f"look at this: {words}", markup=False)
+    return made
+
+
+def _straight(
+    a: Side, b: Side, texts: tuple[str | None, str | None], bundles: list[Calibration | None]
+) -> tuple[Side, Side]:
+    """Both sides seen straight on, where the corners of the gel are given: B's size counts."""
+    from calibration.sides import BadSide, rectangle, through_corners
+
+    corners = [None if text is None else _corners(text) for text in texts]
+    for side, given, bundle in zip("ab", corners, bundles, strict=True):
+        if given is not None and bundle is not None:
+            raise BadSide(
+                f"--corners-{side} and --calibration-{side}: a calibration knows where the gel lies; give one"
+            )
+    shape = b.shape if corners[1] is None else rectangle(corners[1])
+    straight_b = b if corners[1] is None else through_corners(b, corners[1], shape)
+    return (a if corners[0] is None else through_corners(a, corners[0], shape)), straight_b
+
+
+def _corners(text: str) -> Corners:
+    try:
+        points = [tuple(float(number) for number in point.split(",")) for point in text.split()]
+    except ValueError:
+        points = []
+    if len(points) != 4 or any(len(point) != 2 for point in points):
+        raise typer.BadParameter(
+            f"'{text}' is not four points; for example \"67,68 465,113 475,383 73,437\"",
+            param_hint="--corners-a, --corners-b",
+        )
+    return tuple(points)  # type: ignore[return-value]
+
+
+def _invariance(result: Comparison, calibration: Calibration | None) -> Report:
+    from calibration.invariance import invariance
+
+    with progress() as bar:
+        row = bar.add_task("invariance", total=None)
+        return invariance(result, calibration, on_step=lambda done, total: bar.update(row, completed=done, total=total))
+
+
+def _limits(texts: list[str] | None, option: str) -> list[Limit]:
+    """Parsed METRIC=VALUE. A length may carry its unit."""
+    from calibration.comparison_report import names
+    from tacsim.quantity import parse
+
+    found = []
+    for text in texts or []:
+        name, equals, value = text.partition("=")
+        if name not in names():
+            raise typer.BadParameter(f"'{name}' is no figure; there are: {', '.join(names())}", param_hint=option)
+        try:
+            number = parse(value.strip(), "length") if name in LENGTHS else float(value)
+        except ValueError as error:
+            raise typer.BadParameter(f"'{text}': {error}", param_hint=option) from None
+        if not equals or number != number:
+            raise typer.BadParameter(f"'{text}' is not METRIC=VALUE", param_hint=option)
+        found.append((name, number, option == "--fail-above"))
+    return found
+
+
+def _refuse_unknown(limits: list[Limit], values: dict[str, float]) -> None:
+    """A limit of something that could not be told must not look like a pass."""
+    unknown = [name for name, _, _ in limits if values[name] != values[name]]
+    if unknown:
+        raise typer.BadParameter(
+            f"not known of these frames: {', '.join(unknown)}. Surfaces need the calibrations of both sides (or "
+            "recordings of simulations), rho, auc and drift need --invariance",
+            param_hint="--fail-above, --fail-below",
+        )
+
+
+def _broken(limits: list[Limit], values: dict[str, float]) -> bool:
+    broken = [
+        f"{name} is {values[name]:.4g}, {'above' if above else 'below'} {limit:g}"
+        for name, limit, above in limits
+        if (values[name] > limit if above else values[name] < limit)
+    ]
+    for words in broken:
+        complain(words)
+    return bool(broken)
+
+
+def _show(result: Comparison, report: Report | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from calibration.comparison_report import rows, shown, verdict
+
+    console = Console(width=None if results.is_terminal else 160, highlight=False)
+    table = Table(box=None, padding=(0, 1), title=f"{len(result.pairs)} pairs", title_justify="left")
+    table.add_column("metric")
+    for column in ("A against B", "95 % interval", "null", "floor", "than null"):
+        table.add_column(column, justify="right")
+    for metric, overall in rows(result):
+        table.add_row(
+            f"{metric.label} ({metric.unit})" if metric.unit else metric.label,
+            shown(overall.mean, metric),
+            f"{shown(overall.low, metric)} to {shown(overall.high, metric)}",
+            shown(overall.null, metric), shown(overall.floor, metric), verdict(overall),
+        )  # fmt: skip
+    console.print(table)
+    if report is not None:
+        _show_invariance(report, console)
+    notes.print(result.alignment.said, markup=False)
+    for words in result.notes:
+        notes.print(f"look at this: {words}", markup=False)
+    flagged = [pair for pair in result.pairs if pair.flags]
+    for pair in flagged[:10]:
+        notes.print(f"look at this: {pair.a.name} / {pair.b.name}: {'; '.join(pair.flags)}", markup=False)
+    if len(flagged) > 10:
+        notes.print(f"... and {len(flagged) - 10} more flagged pairs, in the files")
+
+
+def _show_invariance(report: Report, console: object) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    assert isinstance(console, Console)
+    table = Table(
+        box=None, padding=(0, 1), title=f"Invariance, {report.presses} presses, patch {report.patch}",
+        title_justify="left",
+    )  # fmt: skip
+    for column in ("view", "rho", "95 %", "AUC", "95 %"):
+        table.add_column(column, justify="left" if column == "view" else "right")
+    for view in report.views:
+        table.add_row(
+            view.view, f"{view.rho:.2f}", f"{view.rho_low:.2f} to {view.rho_high:.2f}",
+            f"{view.auc:.2f}", f"{view.auc_low:.2f} to {view.auc_high:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    if report.drifts:
+        drift = Table(
+            box=None, padding=(0, 1), title=f"Extra gradient error under drift (°), beyond {report.angle:.1f}",
+            title_justify="left",
+        )  # fmt: skip
+        for column in ("change", "fresh reference", "stale"):
+            drift.add_column(column, justify="left" if column == "change" else "right")
+        for row in report.drifts:
+            drift.add_row(row.change.name, f"{row.fresh:.2f}", f"{row.stale:.2f}")
+        console.print(drift)
+    for words in report.notes:
+        notes.print(f"look at this: {words}", markup=False)

@@ -1,0 +1,78 @@
+"""Made-up sources: the same presses of a ball, as one hidden sensor sees them, and in a simulation of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from calibration.ballpress import calibrate_light
+from calibration.bundle import Calibration, Provenance
+from calibration.sides import Shot, Side
+from tacsim.optics.geometry import SensorGeometry
+from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
+
+PLACES = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50)]
+DEPTHS = [0.5e-3, 0.35e-3, 0.65e-3, 0.45e-3, 0.55e-3, 0.3e-3]
+
+
+def side(sensor: HiddenSensor, count: int = 5, name: str = "made", places: list[tuple[int, int]] | None = None) -> Side:
+    """Presses, the same for every sensor, and two more pictures without contact."""
+    presses = [
+        sensor.press(depth, x, y) for depth, (x, y) in zip(DEPTHS[:count], (places or PLACES)[:count], strict=True)
+    ]
+    shots = tuple(Shot(f"press_{k}.png", press.image) for k, press in enumerate(presses))
+    still = tuple(Shot(f"background_{k}.png", sensor.empty()) for k in (2, 3))
+    return Side(name, sensor.empty(), "made up", shots, still)
+
+
+def changed(of: Side, change: object, what: str = "shots") -> Side:
+    """The side with `change` (image -> image) applied to all its pictures; `what`: "all" also changes its reference."""
+    assert callable(change)
+    shots = tuple(Shot(shot.name, change(shot.image)) for shot in of.shots)
+    reference = change(of.reference) if what == "all" else of.reference
+    return Side(of.name, reference, of.reference_from, shots, of.untouched if what == "shots" else ())
+
+
+def blank(like: Side) -> Side:
+    """A simulation that draws no contact at all."""
+    return Side("blank", like.reference, "made up", tuple(Shot(shot.name, like.reference) for shot in like.shots))
+
+
+def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
+    """The picture moved right by x and down by y [px], by Fourier's shift theorem: exact, and unlike any resampling of
+    the code under test. Wraps round."""
+    frequency_y = np.fft.fftfreq(image.shape[0])[:, None, None]
+    frequency_x = np.fft.fftfreq(image.shape[1])[None, :, None]
+    spectrum = np.fft.fft2(image.astype(float), axes=(0, 1))
+    moved = np.fft.ifft2(spectrum * np.exp(-2j * np.pi * (frequency_x * x + frequency_y * y)), axes=(0, 1)).real
+    return np.clip(np.rint(moved), 0, 255).astype(np.uint8)
+
+
+def save(of: Side, folder: Path, reference: str = "background.png") -> Path:
+    """Writes a side as a folder of pictures."""
+    folder.mkdir(parents=True)
+    for name, image in ((reference, of.reference), *((shot.name, shot.image) for shot in (*of.shots, *of.untouched))):
+        Image.fromarray(image).save(folder / name)
+    return folder
+
+
+def calibrated(sensor: HiddenSensor) -> tuple[Calibration, np.ndarray]:
+    """The calibration of a made-up sensor from presses of its own, and its reference."""
+    frames = [(f"{k}.png", made.image) for k, made in enumerate(sensor.presses(8))]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    return Calibration(
+        format=1,
+        serial="made",
+        geometry=SensorGeometry(width=COLUMNS, height=ROWS, pixel_pitch=PITCH),
+        gel_size=(COLUMNS * PITCH, ROWS * PITCH),
+        forward=fit.forward,
+        inverse=fit.inverse,
+        skirt_length=fit.skirt.length * PITCH,
+        skirt_fraction=fit.skirt.fraction,
+        provenance=Provenance(
+            made="2026-01-01T00:00:00+00:00", software="tacsim", ball_radius=BALL, frames=tuple(n for n, _ in frames)
+        ),
+        reference="0" * 64,
+    ), fit.reference

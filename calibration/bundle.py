@@ -17,6 +17,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field
 
+from calibration.errors import Unusable
 from calibration.inverse import InverseModel
 from tacsim.config import ConfigError, load
 from tacsim.hardware import Placement
@@ -34,7 +35,7 @@ Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class BadBundle(ValueError):
+class BadBundle(Unusable):
     """A calibration that cannot be used: which, why, and what to do."""
 
 

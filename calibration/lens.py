@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.errors import Unusable
 from tacsim.optics.geometry import SensorGeometry
 from tacsim.optics.grid import PixelGrid
 
@@ -21,7 +22,7 @@ Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], t
 LARGEST_FACTOR = 16  # look-ups along each side of one canonical pixel
 
 
-class BadCorners(ValueError):
+class BadCorners(Unusable):
     """The four corners are no picture of a rectangle."""
 
 

@@ -10,6 +10,7 @@ from robot.cli.bench import bench
 from robot.cli.calibrate import calibrate
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
+from robot.cli.frames import hand_eye, touch
 from robot.cli.latency import latency
 from robot.cli.look import doctor, schema
 from robot.cli.mock import mock
@@ -29,7 +30,7 @@ app = typer.Typer(
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {
     app: (run, press, reproduce, replay, mock, bench, debug, schema, doctor),
-    calibrate: (latency,),
+    calibrate: (latency, touch, hand_eye),
 }
 for group, commands in COMMANDS.items():
     for command in commands:

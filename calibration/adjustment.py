@@ -54,7 +54,7 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
 
     # Cauchy's loss hardly pulls from afar: sums of absolute values lead near, from the most promising starts.
     promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:PROMISING]
-    rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac") for start in promising]
+    rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3) for start in promising]
     best = min(rough, key=lambda fit: float(fit.cost))
     found = least_squares(flat, best.x, loss="cauchy", x_scale="jac").x
     used = np.ones(len(residuals(found)), dtype=np.bool_)

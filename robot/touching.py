@@ -52,7 +52,7 @@ class TouchPlan:
     spread: float = 3e-3  # contacts lie at most so far from the middle of the gel [m]
     depth: float = 0.4e-3  # pressed so deep [m]
     lift: float = 6e-3  # back along the sensor's axis between touches [m]
-    step: float = 50e-6  # of the approach, between two looks at the gel [m]
+    step: float = 0.1e-3  # of the approach, between two looks at the gel [m]
 
 
 def alone(facts: RigFacts, arm: str, sensor: str) -> RigFacts:

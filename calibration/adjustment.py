@@ -54,9 +54,9 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
 
     # Cauchy's loss hardly pulls from afar: sums of absolute values lead near, from the most promising starts.
     promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:PROMISING]
-    rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3) for start in promising]
+    rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3, max_nfev=30) for start in promising]
     best = min(rough, key=lambda fit: float(fit.cost))
-    found = least_squares(flat, best.x, loss="cauchy", x_scale="jac").x
+    found = least_squares(flat, best.x, loss="cauchy", x_scale="jac", max_nfev=60).x
     used = np.ones(len(residuals(found)), dtype=np.bool_)
     for _ in range(ROUNDS):
         apart = np.sqrt((residuals(found) ** 2).sum(axis=1))
@@ -73,7 +73,7 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
         if (used == before).all():
             break
     everything = residuals(found)
-    jacobian = least_squares(lambda p: residuals(p)[used].ravel(), found, x_scale="jac").jac
+    jacobian = least_squares(lambda p: residuals(p)[used].ravel(), found, method="lm", x_scale="jac").jac
     information = jacobian.T @ jacobian
     if np.linalg.matrix_rank(_scaled(information), tol=1e-10) < len(found):
         raise BadMeasurements(f"{what} leave something free: vary places and tilts more")
@@ -96,7 +96,7 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
 
 
 def _plain(residuals: Residuals, start: FloatArray, keep: np.ndarray) -> FloatArray:
-    fit = least_squares(lambda p: residuals(p)[keep].ravel(), start, x_scale="jac")
+    fit = least_squares(lambda p: residuals(p)[keep].ravel(), start, method="lm", x_scale="jac")
     return np.asarray(fit.x, dtype=np.float64)
 
 

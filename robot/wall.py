@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.errors import naming
 from robot.align import ArmHistory
 from robot.camera import Camera
 from robot.clock import Driven, LockStep, WallClock
@@ -267,10 +268,17 @@ def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, *, re
 
 
 def _normaliser(name: str, facts: object, rig: RigFacts) -> FrameNormaliser:
-    from calibration.normaliser import for_camera, for_simulated
+    from calibration.normaliser import for_simulated
 
-    assert isinstance(facts, CameraSensorFacts | SimSensorFacts)
     if isinstance(facts, CameraSensorFacts):
-        return for_camera(facts, facts.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical)
-    assert rig.scene is not None
+        return camera_normaliser(name, facts, rig)
+    assert isinstance(facts, SimSensorFacts) and rig.scene is not None
     return for_simulated(facts.model, rig.scene.gel.size[:2], rig.canonical)
+
+
+def camera_normaliser(name: str, facts: CameraSensorFacts, rig: RigFacts) -> FrameNormaliser:
+    """The normaliser of one camera of a rig. Raises calibration.errors.Unusable, naming the sensor; ValueError."""
+    from calibration.normaliser import for_camera
+
+    with naming(f"sensors.{name}"):
+        return for_camera(facts, facts.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical)

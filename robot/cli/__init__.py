@@ -12,6 +12,7 @@ from robot.cli.debug import debug
 from robot.cli.errors import Guarded
 from robot.cli.frames import hand_eye, touch
 from robot.cli.latency import latency
+from robot.cli.lens import lens
 from robot.cli.look import doctor, schema
 from robot.cli.mock import mock
 from robot.cli.run import replay, run
@@ -30,7 +31,7 @@ app = typer.Typer(
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {
     app: (run, press, reproduce, replay, mock, bench, debug, schema, doctor),
-    calibrate: (latency, touch, hand_eye),
+    calibrate: (latency, lens, touch, hand_eye),
 }
 for group, commands in COMMANDS.items():
     for command in commands:

@@ -29,14 +29,14 @@ def test_without_noise_the_truth_comes_back_from_any_mounting() -> None:
 
 def test_errors_are_those_of_the_bound_and_as_stated() -> None:
     errors = []
-    for seed in range(40):
+    for seed in range(25):
         touches, sensor, _ = made_touches(np.random.default_rng(seed))
         fit = fit_touches(touches, BALL_RADIUS)
         errors.append((*se3.distance(fit.tool_from_sensor, sensor), *fit.best_deviation, *fit.deviation, fit.scatter))
         assert all(fit.used)
     metres, radians, best, best_turn, stated, stated_turn, scatter = np.sqrt((np.array(errors) ** 2).mean(axis=0))
-    # 40 sets of 3 axes each: a ratio has a standard deviation of 7 to 10 %
-    assert metres / best < 1.25 and radians / best_turn < 1.25
+    # 25 sets of 3 axes each: a ratio has a standard deviation of 8 to 12 %
+    assert metres / best < 1.3 and radians / best_turn < 1.3
     assert metres / best > 0.75 and radians / best_turn > 0.75
     assert best <= stated < 1.1 * best and best_turn <= stated_turn < 1.1 * best_turn
     assert scatter == pytest.approx(1.0, abs=0.05)

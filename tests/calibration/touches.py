@@ -21,9 +21,7 @@ def made_touches(
     random: np.random.Generator, number: int = 24, tilt: float = 25.0, noise: tuple[float, float, float] = NOISE
 ) -> tuple[list[Touch], Pose, np.ndarray]:
     """Touches, tool_from_sensor, and the ball's centre [m]. `tilt`: standard deviation about each axis [degrees]."""
-    sensor = posed(
-        Rotation.from_rotvec(np.array([0.2, -0.1, 0.4]) + 0.05 * random.normal(size=3)), [1e-3, 2e-3, 60e-3]
-    )
+    sensor = posed(Rotation.from_rotvec(np.array([0.2, -0.1, 0.4]) + 0.05 * random.normal(size=3)), [1e-3, 2e-3, 60e-3])
     ball = np.array([0.4, 0.1, 0.05])
     touches = []
     for _ in range(number):

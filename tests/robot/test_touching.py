@@ -101,7 +101,10 @@ def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
         ([str(few), "--rig", "mock"], "either a file of recorded poses, or --rig"),
         (["--rig", "mock"], "--arm, --sensor and --ball-radius"),
         (["--rig", "sim", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"], "no arm of hardware"),
-        (["--rig", "mock", "--arm", "upper", "--sensor", "lower", "--ball-radius", "4 mm"], "carries no sensor 'lower'"),
+        (
+            ["--rig", "mock", "--arm", "upper", "--sensor", "lower", "--ball-radius", "4 mm"],
+            "carries no sensor 'lower'",
+        ),
         (["--rig", "mock", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 m"], "allowed: 0.0005 to 0.05"),
     ):
         done = CliRunner().invoke(app, ["calibrate", "touch", *words, "--out", str(tmp_path / "out")], env=NARROW)

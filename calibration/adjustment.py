@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -68,16 +70,16 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
                 f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others; what is said to be fixed must "
                 "be so, the poses must be those of the pictures, and lengths in metres"
             )
-        found, before = _plain(residuals, found, keep), used
+        found, before = _plain(residuals, found, keep).x, used
         used = keep
         if (used == before).all():
             break
     everything = residuals(found)
-    jacobian = least_squares(lambda p: residuals(p)[used].ravel(), found, method="lm", x_scale="jac").jac
-    information = jacobian.T @ jacobian
+    jacobian = np.asarray(_plain(residuals, found, used).jac, dtype=np.float64)
+    information: FloatArray = jacobian.T @ jacobian
     if np.linalg.matrix_rank(_scaled(information), tol=1e-10) < len(found):
         raise BadMeasurements(f"{what} leave something free: vary places and tilts more")
-    bound = np.linalg.inv(information)
+    bound: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
     free = everything[used].size - len(found)
     scatter = float(np.sqrt((everything[used] ** 2).sum() / free)) if free > 0 else 0.0
     if scatter > DISAGREE:
@@ -95,9 +97,11 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
     )
 
 
-def _plain(residuals: Residuals, start: FloatArray, keep: np.ndarray) -> FloatArray:
-    fit = least_squares(lambda p: residuals(p)[keep].ravel(), start, method="lm", x_scale="jac")
-    return np.asarray(fit.x, dtype=np.float64)
+def _plain(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> Any:
+    def flat(parameters: FloatArray) -> FloatArray:
+        return residuals(parameters)[keep].ravel()
+
+    return least_squares(flat, start, method="lm", x_scale="jac")
 
 
 def _scaled(information: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ at one scale, and several scales are tried.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -73,9 +73,9 @@ def parse_board(text: str) -> Board:
         raise BadBoard(f"'{text}': {error}") from None
     if not all(1e-5 <= each <= 1.0 for each in metres) or (len(metres) == 2 and metres[1] >= metres[0]):
         raise BadBoard(f"'{text}': lengths must lie within 0.01 mm and 1 m, and a marker inside its square")
-    board = Board(parts[0], columns, rows, *metres)
-    if len(parts) == 5:
-        board = Board(parts[0], columns, rows, metres[0], metres[1], parts[4])
+    board = Board(parts[0], columns, rows, metres[0])
+    if board.kind == "charuco":
+        board = replace(board, marker=metres[1], dictionary=parts[4] if len(parts) == 5 else board.dictionary)
     if board.kind == "charuco":
         _charuco(board)  # an unknown dictionary is told now
     return board
@@ -140,6 +140,8 @@ def _lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray
             if not done:
                 continue
             lattice = np.asarray(centres, dtype=np.float64).reshape(rows, columns, 2)
+            if not _even(lattice):
+                continue
             if abs(_mean_step(lattice, 1)[0]) < abs(_mean_step(lattice, 0)[0]):
                 lattice = lattice.swapaxes(0, 1)
             lattice = lattice if _mean_step(lattice, 1)[0] > 0 else lattice[:, ::-1]
@@ -147,8 +149,18 @@ def _lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray
     return len(blobs)
 
 
+def _even(lattice: FloatArray) -> bool:
+    """True if each step from dot to dot is much like the one before: OpenCV at times takes a dot of the next row."""
+    for axis in (0, 1):
+        steps = np.diff(lattice, axis=axis)
+        change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
+        if (change > SAME * np.linalg.norm(steps, axis=-1).mean()).any():
+            return False
+    return True
+
+
 def _mean_step(lattice: FloatArray, axis: int) -> FloatArray:
-    return np.diff(lattice, axis=axis).reshape(-1, 2).mean(axis=0)
+    return np.asarray(np.diff(lattice, axis=axis).reshape(-1, 2).mean(axis=0), dtype=np.float64)
 
 
 def _require_whole(lattice: FloatArray, blobs: FloatArray, board: Board) -> None:
@@ -209,7 +221,8 @@ def _find_charuco(image: NDArray[np.uint8], board: Board) -> Points:
 
     printed = _charuco(board)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    corners, names, _, markers = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
+    found: Any = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
+    corners, names, _, markers = found  # each None where nothing is seen
     count = 0 if names is None else len(names)
     if count < FEWEST_CORNERS:
         seen = 0 if markers is None else len(markers)

@@ -160,7 +160,10 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
 
 
 def sensor_model(path: Path) -> SensorModel:
-    """The simulated twin of a calibrated sensor, with its rectified picture: its geometry, its untouched picture, its light. Raises BadBundle."""
+    """The simulated twin of a calibrated sensor, as its rectified picture shows it: geometry, untouched picture, light.
+
+    Raises BadBundle.
+    """
     calibration, _ = read_bundle(path)
     folder = path if path.is_dir() else path.parent
     return SensorModel(

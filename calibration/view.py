@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from calibration.board import Points
 from calibration.errors import Unusable
@@ -24,6 +25,7 @@ from tacsim.quantity import Facts, Length
 FEWEST_PICTURES = 6  # for a lens
 LARGEST_RESIDUAL = 1.5  # of a lens, root mean square [px]
 LARGEST_DOUBT = 0.03  # standard deviation of the focal length over itself
+LEAST_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]
 LARGEST_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
 FEWEST_POINTS = 6  # of a plane
 
@@ -136,10 +138,10 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
     on_board = [np.pad(each.board, ((0, 0), (0, 1))).astype(np.float32) for each in pictures.values()]
     seen = [each.image.astype(np.float32).reshape(-1, 1, 2) for each in pictures.values()]
     # k3 needs more of a fish-eye than these cameras have
-    answer: Any = cv2.calibrateCameraExtended(  # type: ignore[call-overload]
+    answer: Any = cv2.calibrateCameraExtended(
         on_board, seen, (columns, rows), np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
     )
-    residual, matrix, distortion, _, _, doubt, _, each = answer
+    residual, matrix, distortion, turns, _, doubt, _, each = answer
     found = dict(zip(pictures, np.ravel(each).tolist(), strict=True))
     if not residual <= LARGEST_RESIDUAL:
         worst = max(found, key=found.__getitem__)
@@ -147,6 +149,13 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
             f"the pictures do not fit one lens and one flat board: {residual:.2f} px root mean square, "
             f"{LARGEST_RESIDUAL:g} at most (worst: {worst}, {found[worst]:.2f} px). Is the board flat, its size right, "
             "and the focus fixed?"
+        )
+    tilt = _tilt(Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2])
+    if not tilt >= LEAST_TILT:
+        raise BadView(
+            f"the board is tilted by only {np.degrees(tilt):.1f} degrees between pictures (root mean square), "
+            f"{np.degrees(LEAST_TILT):.0f} are needed to tell its distance from the focal length: tilt the board more, "
+            "by 20 to 40 degrees to all sides"
         )
     unsure = float(np.max(np.ravel(doubt)[:2] / np.diag(matrix)[:2]))
     if not unsure <= LARGEST_DOUBT:
@@ -164,6 +173,13 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
         residual=float(residual),
     )
     return lens, found
+
+
+def _tilt(normals: FloatArray) -> float:
+    """Root mean square of the angles between normals (n, 3) and their mean [rad]."""
+    mean = normals.mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    return float(np.sqrt((np.arccos(np.clip(normals @ mean, -1.0, 1.0)) ** 2).mean()))
 
 
 def board_pose(lens: Lens, points: Points) -> tuple[Pose, float]:
@@ -207,7 +223,7 @@ def fit_view(
             "one setting of the camera"
         )
     middle = points.board.mean(axis=0)
-    local = points.board - middle
+    local: FloatArray = np.asarray(points.board - middle, dtype=np.float64)
     if lens is not None:
         perspective, missed = _plane(lens, local, points.image), np.zeros(0)
     else:
@@ -220,7 +236,7 @@ def fit_view(
             f"neighbours are {points.spacing:.0f} px apart ({LARGEST_MISFIT:.0%} at most). Is the board flat on the "
             "gel, and its number of rows and columns right?"
         )
-    back = np.linalg.inv(perspective)
+    back: FloatArray = np.asarray(np.linalg.inv(perspective), dtype=np.float64)
     axis = ((columns - 1) / 2, (rows - 1) / 2) if centre is None else centre
     near = lens.directions(np.array([axis, (axis[0] + 1.0, axis[1]), (axis[0], axis[1] + 1.0)]))
     origin, right, below = _seen(back, near)
@@ -241,7 +257,7 @@ def fit_view(
     p /= p[2, 2]
     return GelView(
         lens=lens,
-        perspective=tuple(tuple(float(value) for value in row) for row in p),  # type: ignore[arg-type]
+        perspective=tuple(tuple(float(value) for value in row) for row in p),
         size=size,
         pixel_pitch=pitch,
         residual=residual,
@@ -264,7 +280,7 @@ def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int,
     along = np.linalg.norm(middle[1:] - middle[0], axis=1)  # [px / um]
     return GelView(
         lens=lens,
-        perspective=tuple(tuple(float(value) for value in row) for row in perspective),  # type: ignore[arg-type]
+        perspective=tuple(tuple(float(value) for value in row) for row in perspective),
         size=size,
         pixel_pitch=1e-6 / float(np.sqrt(along[0] * along[1])),
         board="four corners",
@@ -305,7 +321,7 @@ def _distorted(on_board: FloatArray, pixels: FloatArray, image_shape: tuple[int,
 
         fit = least_squares(missed, start[: 8 + terms], x_scale="jac", method="lm")
         # left-out residuals of a linear fit (Allen's PRESS): r / (1 - leverage)
-        leverage = (np.linalg.qr(fit.jac)[0] ** 2).sum(axis=1)
+        leverage = (np.linalg.qr(np.asarray(fit.jac))[0] ** 2).sum(axis=1)
         left_out = float(np.sqrt(((fit.fun / np.maximum(1e-6, 1 - leverage)) ** 2).mean()))
         start[: 8 + terms] = fit.x
         if best is None or left_out < 0.97 * best[0]:

@@ -214,7 +214,7 @@ class _Toucher:
             time.sleep(max(0.0, due - time.monotonic()))
         seen = self._observe(SETTLE)
         assert seen.height is not None
-        contact, depth = touch_seen(seen.height, seen.valid, self._pitch, self._plan.ball_radius)
+        contact, depth = touch_seen(seen.height.astype(np.float64), seen.valid, self._pitch, self._plan.ball_radius)
         return contact, depth, self._rig.arms[self._arm].state().pose
 
     def _observe(self, settle: float) -> TactileObservation:

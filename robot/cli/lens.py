@@ -147,8 +147,8 @@ def _tell_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
 
     geometry = view.geometry
     results.print(
-        f"residual {view.residual:.2f} px, {1e3 * view.residual_length:.3f} mm; {1e3 * view.pixel_pitch:.4f} mm a pixel "
-        f"on the sensor's axis; the gel, {1e3 * view.size[0]:.2f} x {1e3 * view.size[1]:.2f} mm, becomes "
+        f"residual {view.residual:.2f} px, {1e3 * view.residual_length:.3f} mm; {1e3 * view.pixel_pitch:.4f} mm a "
+        f"pixel on the sensor's axis; the gel, {1e3 * view.size[0]:.2f} x {1e3 * view.size[1]:.2f} mm, becomes "
         f"{geometry.width} x {geometry.height} px"
     )
     with writing(make(folder)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -98,7 +97,7 @@ def _anchored(root: Node) -> Node:
     for name, sensor in sensors.items.items():
         path = sensor.items.get("calibration")
         if path is not None and isinstance(path.value, str) and path.value:
-            there = replace(path, value=os.path.abspath(path.folder / path.value))
+            there = replace(path, value=str((path.folder / path.value).resolve()))
             sensor = replace(sensor, value={**sensor.items, "calibration": there})
         anchored[name] = sensor
     return replace(root, value={**root.items, "sensors": replace(sensors, value=anchored)})

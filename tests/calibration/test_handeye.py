@@ -1,4 +1,4 @@
-"""Where a camera sits: against hidden truth, with the noise of the notes, bad poses, and an OpenCV without its solver."""
+"""Where a camera sits: against hidden truth, with noise and bad poses, and with an OpenCV that lacks its solver."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,7 @@ from robot.errors import DeviceError
 from robot.start import NoTouch
 from tacsim import pose as se3
 from tacsim.hardware import CameraSensorFacts, UrArmFacts
-from tacsim.interface import FloatArray, Pose, TactileObservation
+from tacsim.interface import ArmState, FloatArray, Pose, TactileObservation
 from tacsim.limits import ActionError
 from tacsim.rig import Rig
 from tacsim.rigfile import RigFacts
@@ -147,6 +148,32 @@ class Shortened(ValueError):
     """A pose of the plan lies outside the arm's limits."""
 
 
+class Mover(Protocol):
+    """What `go` needs of an arm."""
+
+    def command(self, target: Pose | None) -> Pose | None: ...
+    def state(self) -> ArmState: ...
+    def stop(self) -> None: ...
+
+
+def go(mover: Mover, name: str, target: Pose, timeout: float) -> None:
+    """Drives an arm to a pose of its sensor and waits for rest. Raises Shortened, ActionError for what is out of reach,
+    DeviceError after `timeout` [s] and for what stops an arm."""
+    deadline = time.monotonic() + timeout
+    while True:
+        sent = mover.command(target)
+        if sent is not None and max(se3.distance(sent, target)) > 1e-6:
+            mover.stop()
+            raise Shortened("the way leads out of the arm's limits (workspace, planes or keep_out)")
+        state = mover.state()
+        metres, radians = se3.distance(state.pose, target)
+        if metres < CLOSE and radians < TURNED and np.linalg.norm(state.twist[:3]) < STILL:
+            return
+        if time.monotonic() > deadline:
+            raise DeviceError(f"arm '{name}' did not come to its target within {timeout:g} s")
+        time.sleep(LOOK)
+
+
 MISSES = (NoTouch, BadMeasurements, ActionError, Shortened)  # what spoils one touch, and no more
 
 
@@ -161,33 +188,19 @@ class _Toucher:
         """One touch, from `lifted` (clear of the ball) over `begin`, and back to `lifted`: contact (x, y) [m], depth
         [m], and world_from_sensor as the arm has it. Raises one of MISSES, and is lifted then, too; whatever else is
         raised leaves the arm as it is, for a person to look at."""
-        self.go(lifted, TRAVEL)
+        self._go(lifted, TRAVEL)
         try:
             self._take_reference()
-            self.go(begin, TRAVEL)
+            self._go(begin, TRAVEL)
             found = self._approach(begin, way)
         except MISSES:
-            self.go(lifted, TRAVEL)
+            self._go(lifted, TRAVEL)
             raise
-        self.go(lifted, TRAVEL)
+        self._go(lifted, TRAVEL)
         return found
 
-    def go(self, target: Pose, timeout: float) -> None:
-        """Drives there and waits for rest. Raises Shortened, DeviceError after `timeout` [s]."""
-        mover = self._rig.arms[self._arm]
-        deadline = time.monotonic() + timeout
-        while True:
-            sent = mover.command(target)
-            if sent is not None and max(se3.distance(sent, target)) > 1e-6:
-                mover.stop()
-                raise Shortened("the way leads out of the arm's limits (workspace, planes or keep_out)")
-            state = mover.state()
-            metres, radians = se3.distance(state.pose, target)
-            if metres < CLOSE and radians < TURNED and np.linalg.norm(state.twist[:3]) < STILL:
-                return
-            if time.monotonic() > deadline:
-                raise DeviceError(f"arm '{self._arm}' did not come to its target within {timeout:g} s")
-            time.sleep(LOOK)
+    def _go(self, target: Pose, timeout: float) -> None:
+        go(self._rig.arms[self._arm], self._arm, target, timeout)
 
     def _take_reference(self) -> None:
         """The gel as it is now is the gel without contact."""
@@ -210,7 +223,7 @@ class _Toucher:
                     "start above it? (start.approach_way in the rig file bounds the first approach)"
                 )
             due = time.monotonic() + self._plan.step / self._speed
-            self.go(_along(begin, gone), 5.0)
+            self._go(_along(begin, gone), 5.0)
             time.sleep(max(0.0, due - time.monotonic()))
         seen = self._observe(SETTLE)
         assert seen.height is not None

@@ -17,6 +17,7 @@ from robot.cli.run import ask
 if TYPE_CHECKING:
     from calibration.records import SightFile, TouchFile
     from calibration.touch import TouchNoise
+    from robot.sighting import SightPlan
     from tacsim.interface import Pose
     from tacsim.rigfile import RigFacts
 
@@ -77,7 +78,7 @@ def touch(
     plan = TouchPlan(
         ball_radius=_within(ball_radius, 0.5e-3, 50e-3, "--ball-radius"),
         touches=number,
-        tilt=_within(tilt, 0.05, 0.8, "--tilt"),
+        tilt=_within(tilt, 0.15, 0.8, "--tilt"),
         spread=_within(spread, 0.5e-3, 20e-3, "--spread"),
         depth=_within(depth, 0.05e-3, 2e-3, "--depth"),
         lift=_within(lift, 2e-3, 50e-3, "--lift"),
@@ -148,11 +149,25 @@ def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str, *,
 
 
 def hand_eye(
-    poses: Annotated[Path, typer.Argument(help="File of recorded poses of flange and board (YAML).")],
+    poses: Annotated[
+        Path | None, typer.Argument(help="File of recorded poses of flange and board (YAML); or give --rig.")
+    ] = None,
+    rig: Rig = None,
+    arm: Annotated[str, typer.Option("--arm", help="The arm that moves; with --rig.")] = "",
+    camera: Annotated[str, typer.Option(help="Its source, as in a rig file; with --rig.")] = "",
+    lens: Annotated[Path | None, typer.Option(help="lens.yaml of `tacsim calibrate lens`; with --rig.")] = None,
+    board: Annotated[str, typer.Option(help="charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]; with --rig.")] = "",
+    fixed: Annotated[bool, typer.Option("--fixed", help="The camera stands, the board rides; with --rig.")] = False,
+    number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20,
+    tilt: Annotated[
+        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Largest tilt about each axis.")
+    ] = "30 deg",
+    pivot: Annotated[Any, _length("How far before the sensor the point is that it turns about.")] = "0 mm",
     noise_board: Annotated[Any, _length("Standard deviation of the board's place, each axis.")] = "0.5 mm",
     noise_turn: Annotated[
         Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="The same of its direction.")
     ] = "0.15 deg",
+    set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Find where a camera sits on an arm's flange, or fixed beside the arm, from poses in which it saw one board.
@@ -160,10 +175,14 @@ def hand_eye(
     Each entry of POSES has the flange's pose in the base and the board's in the camera; `camera: fixed` says that the
     camera stands and the board rides on the flange.
 
+    With --rig the arm MOVES: from where it stands, with the board in view, it turns its sensor to all sides about a
+    point before it (--pivot: the board, for a camera that rides along), within its limits; a person is asked first.
+
     Example: tacsim calibrate hand-eye poses.yaml
     """
     import math
 
+    from calibration.errors import Unusable
     from calibration.handeye import HandEyeNoise
     from calibration.records import read_sights
 
@@ -171,7 +190,52 @@ def hand_eye(
         board=_within(noise_board, 1e-6, 0.1, "--noise-board"),
         board_turn=_within(noise_turn, 1e-6, math.radians(20.0), "--noise-turn"),
     )
-    _tell_hand_eye(read_sights(poses), noise, new_directory(out, "hand-eye"))
+    _one_source(poses, rig)
+    folder = new_directory(out, "hand-eye")
+    if poses is not None:
+        _tell_hand_eye(read_sights(poses), noise, folder)
+        return
+    from calibration.board import parse_board
+    from calibration.records import write_record
+    from calibration.view import Lens
+    from robot.sighting import SightPlan
+    from tacsim.config import load
+
+    if not (rig and arm and camera and lens and board):
+        raise typer.BadParameter("with --rig, give --arm, --camera, --lens and --board")
+    described = parse_board(board)
+    if described.kind == "dots":
+        raise Unusable("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
+    plan = SightPlan(
+        board=described,
+        lens=load(Lens, lens),
+        poses=number,
+        tilt=_within(tilt, 0.1, 1.0, "--tilt"),
+        pivot=_within(pivot, 0.0, 2.0, "--pivot"),
+    )
+    record = _sighted(rig, arm, camera, plan, set_ or [], fixed=fixed)
+    with writing_into(make(folder)):
+        notes.print(f"poses kept in {write_record(folder / 'poses.yaml', record)}", markup=False)
+    _tell_hand_eye(record, noise, folder)
+
+
+def _sighted(rig: str, arm: str, camera: str, plan: SightPlan, overrides: list[str], *, fixed: bool) -> SightFile:
+    from calibration.records import sight_file
+    from robot.sighting import open_camera, opened, record_sights
+    from tacsim.config import load_rig
+
+    facts = load_rig(rig, overrides=overrides).facts
+    _confirm(facts, f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?")
+    with Interrupt() as interrupt:
+        with progress() as bar, opened(facts, arm) as mover, open_camera(camera, plan.lens) as eye:
+            row = bar.add_task("looking", total=plan.poses)
+            taken = record_sights(mover, eye, plan, interrupt, lambda done: bar.update(row, completed=done))
+        if interrupt():
+            complain("stopped by a signal; nothing is measured")
+            raise typer.Exit(interrupt.exit_code)
+    for missed in taken.missed:
+        notes.print(f"left out: {missed}", markup=False)
+    return sight_file(taken.sights, fixed=fixed)
 
 
 def _tell_hand_eye(record: SightFile, noise: Any, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -44,16 +45,20 @@ def painted(board: Board) -> Paint:
     return squares
 
 
+@lru_cache(maxsize=4)
+def _sights(lens: Lens) -> np.ndarray:
+    """(4 H W, 2) four lines of sight in each pixel."""
+    quarter = (np.arange(2) - 0.5) / 2
+    u, v = (np.add.outer(np.arange(count), quarter).ravel() for count in (lens.width, lens.height))
+    return lens.directions(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+
+
 def photograph(
     board: Board, camera_from_board: Pose, lens: Lens = LENS, noise: float = 2.0, seed: int = 0
 ) -> np.ndarray:
     """(H, W, 3) picture; each pixel is the mean of 2 x 2 lines of sight."""
     paint, height, width = painted(board), lens.height, lens.width
-    quarter = (np.arange(2) - 0.5) / 2
-    u, v = np.meshgrid(
-        np.add.outer(np.arange(width), quarter).ravel(), np.add.outer(np.arange(height), quarter).ravel()
-    )
-    sight = lens.directions(np.stack([u, v], axis=-1).reshape(-1, 2))
+    sight = _sights(lens)
     back = se3.inverse(camera_from_board)
     lines = se3.rotate(back, np.pad(sight, ((0, 0), (0, 1)), constant_values=1.0))
     on_plane = back.position[:2] - back.position[2] * lines[:, :2] / lines[:, 2:]

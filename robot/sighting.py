@@ -116,8 +116,8 @@ def record_sights(
     spread = swing(np.stack([turn.as_matrix() for turn in schedule(plan)]))
     if spread < LEAST_SWING:
         raise CannotSee(
-            f"with a tilt of {np.degrees(plan.tilt):.0f} degrees and {plan.poses} poses one direction would swing by only "
-            f"{np.degrees(spread):.1f} degrees; {np.degrees(LEAST_SWING):.0f} are needed: give a larger --tilt"
+            f"with a tilt of {np.degrees(plan.tilt):.0f} degrees and {plan.poses} poses one direction would swing by "
+            f"only {np.degrees(spread):.1f} degrees; {np.degrees(LEAST_SWING):.0f} are needed: give a larger --tilt"
         )
     facts = arm.facts
     sensor_from_flange = se3.inverse(se3.compose(facts.flange_from_tool.pose, facts.tool_from_sensor.pose))

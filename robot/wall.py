@@ -96,9 +96,12 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
     confirm: asks a person a question before anything approaches the body; not needed where all arms are mocks.
     dry_run: connects, sees, feels, times and records, but no motion is sent, neither by reset nor by step.
 
-    Raises DeviceError for what cannot be opened, ValueError for a rig that makes no sense.
+    Raises DeviceError for what cannot be opened, calibration.errors.Unusable for a calibration, ValueError for a rig
+    that makes no sense.
     """
     real = [name for name, arm in facts.arms.items() if isinstance(arm, UrArmFacts) and arm.mock is None]
+    # first, because a wrong calibration is known before anything is connected
+    normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
     with ExitStack() as stack:
         bench = stack.enter_context(MockBench(facts))
         sensors: dict[str, TactileSource] = {}
@@ -122,7 +125,6 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
             clock = WallClock(facts.period, bench.catch_up)
         else:
             clock = WallClock(facts.period)
-        normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
         task = facts.task
         start = GuidedStart(
             arms={} if dry_run else arms,

@@ -61,14 +61,14 @@ def test_a_folder_gives_the_lens_and_a_picture_the_view(pictures: Path, tmp_path
 
 def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> None:
     made = HiddenSensor(3)
-    corners = np.array([(60.0, 45.0), (590.0, 30.0), (570.0, 440.0), (50.0, 450.0)], dtype=np.float32)
+    corners = np.array([(30.0, 22.0), (295.0, 15.0), (285.0, 220.0), (25.0, 225.0)], dtype=np.float32)
     edges = np.array([(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)], dtype=np.float32) - 0.5
     askew = cv2.getPerspectiveTransform(edges, corners)
     frames = tmp_path / "frames"
     frames.mkdir()
-    pictures = {"background": made.empty()} | {f"press{i}": press.image for i, press in enumerate(made.presses(6))}
+    pictures = {"background": made.empty()} | {f"press{i}": press.image for i, press in enumerate(made.presses(5))}
     for name, metric in pictures.items():
-        native = cv2.warpPerspective(metric, askew, (640, 480), borderMode=cv2.BORDER_REPLICATE)
+        native = cv2.warpPerspective(metric, askew, (320, 240), borderMode=cv2.BORDER_REPLICATE)
         (frames / f"{name}.png").write_bytes(encode_png(np.asarray(native)))
     four = ",".join(f"{value:g}" for value in corners.ravel())
     size = f"{COLUMNS * PITCH} m, {ROWS * PITCH} m"
@@ -83,8 +83,8 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     assert calibration.geometry == calibration.view.geometry
     assert reference.shape == (calibration.geometry.height, calibration.geometry.width, 3)
     # The perspective is gone: contacts are round and as large as the ball's depth makes them.
-    truth = {f"press{i}.png": press.circle[2] * PITCH for i, press in enumerate(HiddenSensor(3).presses(6))}
-    assert len(calibration.residuals) == 6
+    truth = {f"press{i}.png": press.circle[2] * PITCH for i, press in enumerate(HiddenSensor(3).presses(5))}
+    assert len(calibration.residuals) == 5
     for residual in calibration.residuals:
         radius = residual.circle[2] * calibration.geometry.pixel_pitch
         assert radius == pytest.approx(truth[residual.frame], rel=0.06)
@@ -93,7 +93,7 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     assert code == 2 and "either --pixel-pitch or --view" in err
     (frames / "background.png").write_bytes(encode_png(pictures["background"]))
     code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "no")
-    assert code == 2 and "the view was calibrated on 640 x 480 px" in err
+    assert code == 2 and "the view was calibrated on 320 x 240 px" in err
 
 
 def test_what_cannot_be_ends_with_2(pictures: Path, tmp_path: Path) -> None:
@@ -172,3 +172,7 @@ def test_a_wrong_calibration_is_told_with_exit_code_2(camera: str, words: str, t
     rig.write_text(RIG.replace("CAMERA", camera).replace("width: 160", "width: 320"))
     code, said = doctor(rig)
     assert code == 2 and re.search(words, said), said
+    done = CliRunner().invoke(
+        app, ["run", "--rig", str(rig), "--policy", "hold", "--out", str(tmp_path / "o")], env=WIDE
+    )
+    assert done.exit_code == 2 and re.search(words, told(done.output)), done.output

@@ -153,7 +153,7 @@ def test_a_mock_arm_finds_where_its_camera_sits(tmp_path: Path) -> None:
 
 def test_a_plan_that_would_tell_too_little_is_refused_before_anything_moves() -> None:
     plan = SightPlan(CHARUCO, LENS, poses=12, tilt=np.radians(15.0))
-    with pytest.raises(CannotSee, match="with a tilt of 15 degrees and 12 poses .* give a larger --tilt"):
+    with pytest.raises(CannotSee, match=r"with a tilt of 15 degrees and 12 poses .* give a larger --tilt"):
         record_sights(None, None, plan)  # type: ignore[arg-type]
     turns = schedule(SightPlan(CHARUCO, LENS, poses=20, tilt=np.radians(30.0)))
     assert turns[0].magnitude() == 0.0 and len(turns) == 20

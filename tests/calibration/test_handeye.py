@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.adjustment import BadMeasurements
-from calibration.handeye import HandEyeNoise, Sight, closed_form, fit_hand_eye, park
+from calibration.adjustment import BadMeasurements, invert
+from calibration.handeye import HandEyeNoise, Sight, _whitening, closed_form, fit_hand_eye, park
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tests.calibration.touches import posed
@@ -21,7 +21,13 @@ NOISE = HandEyeNoise()
 
 
 def made_sights(
-    random: np.random.Generator, number: int = 30, spread: float = 30.0, *, fixed: bool = False, noise: float = 1.0
+    random: np.random.Generator,
+    number: int = 30,
+    spread: float = 30.0,
+    *,
+    fixed: bool = False,
+    noise: float = 1.0,
+    stated: HandEyeNoise = NOISE,
 ) -> list[Sight]:
     """`spread`: standard deviation of the flange's rotation about each axis [degrees]; `noise`: of NOISE."""
 
@@ -35,7 +41,9 @@ def made_sights(
         flange = posed(turn, np.array([0.5, 0.1, 0.3]) + 0.05 * random.normal(size=3))
         carried = se3.compose(flange, BOARD if fixed else CAMERA)
         seen = se3.relative(CAMERA, carried) if fixed else se3.relative(carried, BOARD)
-        sights.append(Sight(shaken(flange, NOISE.robot, NOISE.robot_turn), shaken(seen, NOISE.board, NOISE.board_turn)))
+        sights.append(
+            Sight(shaken(flange, stated.robot, stated.robot_turn), shaken(seen, stated.board, stated.board_turn))
+        )
     return sights
 
 
@@ -60,6 +68,20 @@ def test_errors_with_the_noise_of_the_notes_are_as_stated(fixed: bool) -> None:
     assert np.degrees(np.median([each[1] for each in errors])) < 0.08
     assert 0.6 < metres / stated < 1.5 and 0.6 < radians / stated_turn < 1.5
     assert scatter == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_weights_know_the_lever_of_a_robots_rotation(fixed: bool) -> None:
+    stated = HandEyeNoise(board=0.3e-3, board_turn=np.radians(0.05), robot_turn=np.radians(0.2))
+    sights = made_sights(np.random.default_rng(5), 900, fixed=fixed, stated=stated)
+    flange, board = (np.stack([se3.to_matrix(getattr(each, name)) for each in sights]) for name in ("flange", "board"))
+    arm = invert(flange) if fixed else flange
+    camera, mount = se3.to_matrix(CAMERA), se3.to_matrix(BOARD)
+    predicted = invert(camera) @ invert(arm) @ mount
+    turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).as_rotvec()
+    missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
+    even = np.einsum("nij,nj->ni", _whitening(camera, mount, arm, stated, fixed=fixed), missed)
+    np.testing.assert_allclose(np.cov(even.T), np.eye(6), atol=0.25)  # standard deviation of an entry: 0.05
 
 
 def test_bad_poses_are_found_and_left_out() -> None:

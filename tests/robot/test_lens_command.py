@@ -172,7 +172,5 @@ def test_a_wrong_calibration_is_told_with_exit_code_2(camera: str, words: str, t
     rig.write_text(RIG.replace("CAMERA", camera).replace("width: 160", "width: 320"))
     code, said = doctor(rig)
     assert code == 2 and re.search(words, said), said
-    done = CliRunner().invoke(
-        app, ["run", "--rig", str(rig), "--policy", "hold", "--out", str(tmp_path / "o")], env=WIDE
-    )
+    done = CliRunner().invoke(app, ["run", str(rig), "--out", str(tmp_path / "o")], env=WIDE)
     assert done.exit_code == 2 and re.search(words, told(done.output)), done.output

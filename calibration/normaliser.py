@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import Calibration, read_bundle
+from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.gradient import from_model
 from calibration.inverse import PolynomialSlopes
-from calibration.lens import Rectification, from_corners, from_geometry
+from calibration.lens import Rectification, from_corners, from_geometry, from_view
 from calibration.reference import Reference, make_reference
 from calibration.surface import SurfaceFinder, seen_box, view, window
 from tacsim.hardware import CameraSensorFacts
@@ -142,7 +142,11 @@ def for_calibrated(calibration: Calibration, grid: CanonicalGrid) -> FrameNormal
     """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle."""
     geometry = calibration.geometry
     wide = view(grid, calibration.gel_size)
-    rectify = from_geometry(geometry, calibration.gel_size, wide)
+    # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
+    if calibration.view is None:
+        rectify = from_geometry(geometry, calibration.gel_size, wide)
+    else:
+        rectify = from_view(calibration.view, wide)
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
     x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
     slopes = PolynomialSlopes(calibration.inverse, x, y)
@@ -157,7 +161,7 @@ def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: C
     Raises calibration.lens.BadCorners, calibration.bundle.BadBundle.
     """
     if facts.calibration is not None:
-        return for_calibrated(read_bundle(Path(facts.calibration))[0], grid)
+        return for_calibrated(_bundle_for(facts.calibration, image_shape), grid)
     return FrameNormaliser(from_corners(facts.corners, facts.size, image_shape, canonical_image(grid)), grid)
 
 
@@ -168,11 +172,23 @@ def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: Ca
     Raises calibration.bundle.BadBundle, ValueError for a model without inverse, calibration.lens.BadCorners.
     """
     if facts.calibration is not None:
-        return for_calibrated(read_bundle(Path(facts.calibration))[0], grid)
+        return for_calibrated(_bundle_for(facts.calibration, (facts.height, facts.width)), grid)
     if facts.model is not None:
         return for_pictures(facts.model, gel_size, grid)
     shape = (facts.height, facts.width)
     return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid)
+
+
+def _bundle_for(path: str, image_shape: tuple[int, int]) -> Calibration:
+    """The calibration at `path`, for pictures of `image_shape` (rows, columns). Raises BadBundle."""
+    calibration, _ = read_bundle(Path(path))
+    if calibration.image_shape != image_shape:
+        (rows, columns), (high, wide) = image_shape, calibration.image_shape
+        raise BadBundle(
+            f"{path} was calibrated on pictures of {wide} x {high} px, this sensor delivers {columns} x {rows}: set "
+            "width and height of the sensor to those of the calibration, or calibrate again at this setting"
+        )
+    return calibration
 
 
 def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:

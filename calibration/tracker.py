@@ -1,0 +1,198 @@
+"""Dots from picture to picture: which of the dots found now is which of those at rest.
+
+Where each dot should be is told by its motion so far (constant velocity); who it is, by its neighbours at rest: across
+an edge between two neighbours the displacement changes by less than half of their distance. A frame that leaves dots
+without a partner is matched anew from other guesses (no motion, no displacement at all, a jump of the whole lattice),
+each grown outwards from its largest coherent part, and the guess that explains most dots wins. Displacements are always
+against rest, so errors don't add up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+GATE = 0.45  # a dot is at most so far from where it should be [pitches]
+NEIGHBOUR = 1.6  # dots at most so far apart at rest are neighbours: the diagonal of a square is one [pitches]
+STRETCH = 0.5  # change of displacement across an edge, at most [its length]
+FAR_AHEAD = 3  # frames over which a velocity still says something
+JUMP = 2.6  # jumps of the whole lattice that are looked for [pitches]
+WITNESSES = 3  # dots whose surroundings propose such jumps
+MISSING = 0.04  # share of dots, and of points, without a partner from which on a jump is suspected
+SUPPORT = 2  # neighbours that must be known where a dot is looked for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Where the dots are now."""
+
+    displacement: Float64  # (n, 2) against rest; that of a dot that is not seen is the mean of its neighbours'
+    seen: Mask  # (n,)
+
+    @property
+    def kept(self) -> float:
+        """Share of the dots that are seen."""
+        return float(self.seen.mean())
+
+
+class DotTracker:
+    """Follows dots, in any unit of length."""
+
+    def __init__(self, rest: Float64, pitch: float) -> None:
+        """`rest`: (n, 2) where the dots are at rest; `pitch`: usual distance of neighbours. Raises ValueError for fewer
+        than 4 dots, or dots that are no neighbours of any other."""
+        from scipy.spatial import KDTree
+
+        if len(rest) < 4:
+            raise ValueError(f"{len(rest)} dots are no lattice, at least 4 are needed")
+        pairs = KDTree(rest).query_pairs(NEIGHBOUR * pitch, output_type="ndarray")
+        self._rest, self._pitch = rest, pitch
+        self._first, self._second = pairs.T
+        self._edge = np.linalg.norm(rest[self._first] - rest[self._second], axis=1)
+        count = len(rest)
+        self._linked = np.zeros((count, count))
+        self._linked[self._first, self._second] = self._linked[self._second, self._first] = 1.0
+        if not self._linked.any(axis=1).all():
+            raise ValueError(f"some dots have no neighbour within {NEIGHBOUR:g} pitches of {pitch:.3g}: no lattice")
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to rest: what was seen so far says nothing of the next frame."""
+        self._displacement = np.zeros_like(self._rest)
+        self._velocity = np.zeros_like(self._rest)
+        self._steps: int | None = None
+
+    def __call__(self, points: Float64, ahead: int = 1) -> Tracked:
+        """The dots among `points` (k, 2), `ahead` frames after the last ones; 0 or less, or many: the past is no guide
+        to velocity."""
+        trusted = 0 < ahead <= FAR_AHEAD
+        expected = self._rest + self._displacement + (ahead * self._velocity if trusted else 0.0)
+        partner = self._match(expected, points)
+        coherent = self._largest(partner, points)
+        if not trusted or (partner < 0).any() or not coherent.all():
+            partner = self._best(expected, points, trusted)
+        seen = partner >= 0
+        displacement = np.zeros_like(self._rest)
+        displacement[seen] = points[partner[seen]] - self._rest[seen]
+        displacement = self._filled(displacement, seen)
+        self._velocity = (displacement - self._displacement) / ahead if trusted else np.zeros_like(self._rest)
+        self._displacement = displacement
+        return Tracked(displacement.copy(), seen)
+
+    def _match(self, expected: Float64, points: Float64, gate: float = GATE) -> Index:
+        """(n,) the point of each dot, -1 where none is near: as close as can be, all together (Kuhn 1955)."""
+        from scipy.optimize import linear_sum_assignment
+
+        partner = np.full(len(expected), -1, dtype=np.intp)
+        if not (len(points) and len(expected)):
+            return partner
+        reach = (gate * self._pitch) ** 2
+        away = ((expected[:, None, :] - points[None, :, :]) ** 2).sum(axis=2)
+        nearest = away.argmin(axis=1)
+        close = away[np.arange(len(expected)), nearest] < reach
+        if len(np.unique(nearest[close])) == close.sum():  # nobody wants the same: this is the best there is
+            partner[close] = nearest[close]
+            return partner
+        rows, columns = linear_sum_assignment(np.minimum(away, reach))
+        close = away[rows, columns] < reach
+        partner[rows[close]] = columns[close]
+        return partner
+
+    def _best(self, expected: Float64, points: Float64, trusted: bool) -> Index:
+        """(n,) partners by the guess that finds most; of equal ones, by the first."""
+        best = self._grown(self._match(expected, points), points)
+        if trusted and not self._jumped(best, points):
+            return best
+        for guess in (self._rest + self._displacement, self._rest):
+            best = self._better(best, guess, points)
+        if self._jumped(best, points):
+            for shift in self._jumps(points, self._rest + self._displacement):
+                best = self._better(best, self._rest + self._displacement + shift, points)
+        return best
+
+    def _better(self, best: Index, guess: Float64, points: Float64) -> Index:
+        partner = self._match(guess, points)
+        grown = self._grown(partner, points)
+        return grown if (grown >= 0).sum() > (best >= 0).sum() else best
+
+    def _grown(self, partner: Index, points: Float64) -> Index:
+        """Partners of the largest coherent part, and of all that its neighbours then lead to."""
+        partner = np.where(self._largest(partner, points), partner, -1)
+        refused = np.zeros(len(partner), dtype=np.bool_)
+        for _ in range(len(partner)):
+            known = partner >= 0
+            support = self._linked @ known
+            asked = np.flatnonzero(~known & (support >= SUPPORT) & ~refused)
+            free = np.setdiff1d(np.arange(len(points)), partner[known])
+            if not (len(asked) and len(free)):
+                break
+            there = np.where(known[:, None], points[partner] - self._rest, 0.0)
+            led = self._rest[asked] + (self._linked[asked] @ there) / support[asked, None]
+            found = self._match(led, points[free])
+            partner[asked[found >= 0]] = free[found[found >= 0]]
+            refused[asked[found < 0]] = True
+            coherent = self._largest(partner, points)
+            refused |= (partner >= 0) & ~coherent
+            partner = np.where(coherent, partner, -1)
+        return partner
+
+    def _largest(self, partner: Index, points: Float64) -> Mask:
+        """(n,) dots with a partner, in the largest part whose edges are not overstretched."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        seen = partner >= 0
+        moved = np.where(seen[:, None], points[partner] - self._rest, 0.0) if len(points) else np.zeros_like(self._rest)
+        change = moved[self._first] - moved[self._second]
+        both = seen[self._first] & seen[self._second]
+        sound = both & ((change**2).sum(axis=1) < (STRETCH * self._edge) ** 2)
+        if (sound == both).all():
+            return seen
+        first, second = self._first[sound], self._second[sound]
+        graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(len(partner), len(partner)))
+        _, part = connected_components(graph, directed=False)
+        largest = np.argmax(np.bincount(part, seen))
+        return np.asarray((part == largest) & seen)
+
+    def _filled(self, displacement: Float64, seen: Mask) -> Float64:
+        """`displacement`, with the mean of its neighbours' at each dot that is not seen (a discrete Laplace equation);
+        unchanged since the last frame where nothing at all is seen."""
+        lost = ~seen
+        if not lost.any():
+            return displacement
+        if not seen.any():
+            return self._displacement.copy()
+        laplace = np.diag(self._linked.sum(axis=1)) - self._linked
+        right = self._linked[np.ix_(lost, seen)] @ displacement[seen]
+        filled = displacement.copy()
+        filled[lost] = np.linalg.lstsq(laplace[np.ix_(lost, lost)], right, rcond=None)[0]
+        return filled
+
+    def _jumped(self, partner: Index, points: Float64) -> bool:
+        """Both dots and points without a partner: as if they belonged together."""
+        lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
+        return min(lost, spare) > max(1.0, MISSING * len(partner))
+
+    def _jumps(self, points: Float64, start: Float64) -> Float64:
+        """(2, 2) shifts of the whole lattice that bring most dots near a point, the best first."""
+        from scipy.spatial import KDTree
+
+        middle = np.argsort(((self._rest - self._rest.mean(axis=0)) ** 2).sum(axis=1))[:WITNESSES]
+        shifts = (points[None, :, :] - start[middle][:, None, :]).reshape(-1, 2)
+        length = np.linalg.norm(shifts, axis=1)
+        near = np.argsort(length)[: int((length < JUMP * self._pitch).sum())]
+        shifts = shifts[near]
+        if not len(shifts):
+            return np.zeros((0, 2))
+        away, _ = KDTree(points).query(
+            (start[None, :, :] + shifts[:, None, :]).reshape(-1, 2), distance_upper_bound=GATE / 2 * self._pitch
+        )
+        explained = np.isfinite(away).reshape(len(shifts), -1).sum(axis=1)
+        best: Float64 = shifts[np.argsort(-explained, kind="stable")[:2]]
+        return best

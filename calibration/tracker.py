@@ -66,12 +66,11 @@ class DotTracker:
         """Back to rest: what was seen so far says nothing of the next frame."""
         self._displacement = np.zeros_like(self._rest)
         self._velocity = np.zeros_like(self._rest)
-        self._steps: int | None = None
 
     def __call__(self, points: Float64, ahead: int = 1) -> Tracked:
-        """The dots among `points` (k, 2), `ahead` frames after the last ones; 0 or less, or many: the past is no guide
-        to velocity."""
-        trusted = 0 < ahead <= FAR_AHEAD
+        """The dots among `points` (k, 2), `ahead` frames after the last ones (0: the same once more); backwards or far
+        ahead the past says nothing of the velocity."""
+        trusted = 0 <= ahead <= FAR_AHEAD
         expected = self._rest + self._displacement + (ahead * self._velocity if trusted else 0.0)
         partner = self._match(expected, points)
         coherent = self._largest(partner, points)
@@ -81,7 +80,10 @@ class DotTracker:
         displacement = np.zeros_like(self._rest)
         displacement[seen] = points[partner[seen]] - self._rest[seen]
         displacement = self._filled(displacement, seen)
-        self._velocity = (displacement - self._displacement) / ahead if trusted else np.zeros_like(self._rest)
+        if ahead > 0 and trusted:
+            self._velocity = (displacement - self._displacement) / ahead
+        elif not trusted:
+            self._velocity = np.zeros_like(self._rest)
         self._displacement = displacement
         return Tracked(displacement.copy(), seen)
 

@@ -1,0 +1,188 @@
+"""Tactile flow from pictures: how far each dot printed on the gel has moved, in metres.
+
+Dots are sought on a metric grid of their own, fine enough for their size whatever the canonical grid is. The reference
+tells which dot is which row and column (:mod:`calibration.lattice`), and where it rests; :mod:`calibration.tracker`
+follows it from there. A dot that is not seen gets the mean of its neighbours' motion: flow is finite everywhere, and
+`seen` tells which of it was measured.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.dots import SMALLEST, DotFinder
+from calibration.lattice import NoLattice, find_lattice, spread, usual_pitch
+from calibration.lens import Rectification
+from calibration.reference import UnusableReference
+from calibration.tracker import DotTracker
+from tacsim.optics.geometry import Markers
+from tacsim.optics.grid import PixelGrid
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+RADIUS = 2.5  # of a dot on the grid on which dots are sought [px]
+MOST_MISSING = 0.3  # share of the dots in view that a reference may lack
+MOST_STRAY = 0.1  # dots beyond the lattice's rows and columns, in shares of its own
+LEAST_KEPT = 0.25  # share of the dots that must be seen for a flow
+
+
+class NoMarkers(UnusableReference):
+    """The reference does not show the lattice that the sensor should have."""
+
+
+class MarkersLost(RuntimeError):
+    """Too few dots are seen for a flow."""
+
+
+class MarkerFlow:
+    """The tactile flow of one sensor.
+
+    Args:
+        markers: the lattice.
+        rectify: gives the pixels of `grid`, see :func:`marker_grid`.
+        distance: from the camera's pinhole to the gel at rest [m]; None: it looks along parallel rays.
+    """
+
+    def __init__(
+        self, markers: Markers, rectify: Rectification, grid: PixelGrid, distance: float | None = None
+    ) -> None:
+        """Raises ValueError when the image shows the dots too small, or no gel."""
+        rows, columns = np.flatnonzero(rectify.valid.any(axis=1)), np.flatnonzero(rectify.valid.any(axis=0))
+        if not (len(rows) and len(columns)):
+            raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")
+        size = _native_pixels(rectify, grid) * markers.radius
+        if size < SMALLEST:
+            raise ValueError(
+                f"markers of radius {markers.radius * 1e3:g} mm are {size:.2g} px in the image, at least {SMALLEST:g} px "
+                "are needed to follow them; take a finer image, or markers: null"
+            )
+        self._markers, self._distance = markers, distance
+        self._pixels, self._factor = rectify.pixels, rectify.factor
+        self._shape, self._native, self._valid = rectify.valid.shape, rectify.image_shape, rectify.valid
+        self._pitch, self._origin = grid.pitch, np.array([grid.x0, grid.y0])
+        self._find = DotFinder(markers.radius / grid.pitch)
+        self._tracker: DotTracker | None = None
+        self._index = 0
+        self._seen: Mask = np.zeros((markers.rows, markers.columns), dtype=np.bool_)
+
+    @property
+    def seen(self) -> Mask:
+        """(rows, columns) dots that the last picture showed; the flow of the others is that of their neighbours."""
+        return self._seen
+
+    @property
+    def kept(self) -> float:
+        """Share of the reference's dots that the last picture showed."""
+        return float(self._seen.sum() / self._present.sum()) if self._tracker is not None else 0.0
+
+    def take_reference(self, image: Image, index: int = 0) -> None:
+        """Takes a native image (rows, columns, 3) without contact as rest, and forgets all motion so far. Raises
+        NoMarkers; what was the reference then stays."""
+        points = self._points(image)
+        markers = self._markers
+        expected = f"a lattice of {markers.rows} x {markers.columns} dots, {markers.pitch * 1e3:g} mm apart"
+        advice = "is the sensor's light on, is nothing touched, and are its markers those of the model or calibration?"
+        try:
+            lattice = find_lattice(points, (markers.rows, markers.columns), markers.pitch)
+        except NoLattice as nothing:
+            apart = f" {usual_pitch(points) * 1e3:.3g} mm apart" if len(points) > 1 else ""
+            raise NoMarkers(f"the reference shows {len(points)} dots{apart}, not {expected}: {advice}") from nothing
+        visible = self._in_view(lattice.positions)
+        shown = int(lattice.present.sum())
+        if shown < max(4.0, (1.0 - MOST_MISSING) * visible.sum()):
+            raise NoMarkers(f"the reference shows {shown} of {visible.sum()} dots in view of {expected}: {advice}")
+        if lattice.strays > MOST_STRAY * lattice.present.size:
+            raise NoMarkers(
+                f"the reference shows {lattice.strays} dots more than {expected}: give the true rows and columns"
+            )
+        try:
+            tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch)
+        except ValueError as error:
+            raise NoMarkers(f"the reference shows no {expected}: {error}") from error
+        self._tracker, self._index = tracker, index
+        self._rest, self._present = lattice.positions, lattice.present
+        self._seen = lattice.present.copy()
+
+    def __call__(self, image: Image, index: int, height: tuple[Float32, PixelGrid] | None = None) -> Float32:
+        """(rows, columns, 2) displacement against the reference along x, y [m] of the native image of frame `index`.
+
+        `height` (h, w) [m] on its grid: how deep the gel is pressed, for a camera whose distance is known.
+        Raises MarkersLost; ValueError without a reference, or for an image of another shape.
+        """
+        if self._tracker is None:
+            raise ValueError("no reference yet: call take_reference first")
+        tracked = self._tracker(self._points(image), index - self._index)
+        self._index = index
+        seen = self._present.copy()
+        seen[self._present] = tracked.seen
+        self._seen = seen
+        if tracked.kept < LEAST_KEPT:
+            raise MarkersLost(
+                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {LEAST_KEPT:.0%} are needed for "
+                "a flow: is the light on, and the gel whole? If so, take a fresh reference"
+            )
+        moved = np.zeros_like(self._rest)
+        moved[self._present] = tracked.displacement
+        moved = spread(moved, self._present)
+        if self._distance is not None and height is not None:
+            moved = self._onto_gel(self._rest + moved, *height) - self._rest
+        return moved.astype(np.float32)
+
+    def _points(self, image: Image) -> Float64:
+        """(n, 2) x, y of the dots in a native image [m]."""
+        import cv2
+
+        if image.dtype != np.uint8 or image.shape != (*self._native, 3):
+            raise ValueError(f"image is {image.shape} {image.dtype}, this sensor delivers {(*self._native, 3)} uint8")
+        nothing = np.empty(0, dtype=np.uint8)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        seen = cv2.remap(grey, self._pixels, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if self._factor > 1:
+            seen = cv2.resize(seen, self._shape[::-1], interpolation=cv2.INTER_AREA)
+        centres = self._find(np.asarray(seen, dtype=np.uint8)).centres
+        column, row = np.rint(centres).astype(np.intp).T
+        found: Float64 = centres[self._valid[row, column]] * self._pitch + self._origin
+        return found
+
+    def _in_view(self, points: Float64) -> Mask:
+        """(...,) whole dots at `points` (..., 2) [m] lie in the picture and on the gel."""
+        inside = np.ones(points.shape[:-1], dtype=np.bool_)
+        for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            at = (points + np.array(corner) * self._markers.radius - self._origin) / self._pitch
+            column, row = np.rint(np.moveaxis(at, -1, 0)).astype(np.intp)
+            there = (row >= 0) & (row < self._shape[0]) & (column >= 0) & (column < self._shape[1])
+            inside &= there & self._valid[row.clip(0, self._shape[0] - 1), column.clip(0, self._shape[1] - 1)]
+        return inside
+
+    def _onto_gel(self, apparent: Float64, height: Float32, grid: PixelGrid) -> Float64:
+        """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
+        import cv2
+
+        assert self._distance is not None
+        at = ((apparent - (grid.x0, grid.y0)) / grid.pitch).astype(np.float32)
+        nothing = np.empty(0, dtype=np.float32)
+        deep = cv2.remap(height, at, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        nearer: Float64 = 1.0 - np.asarray(deep, dtype=np.float64) / self._distance
+        return apparent * nearer[..., None]
+
+
+def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
+    """All of the gel (x, y [m]), so fine that a dot's radius is RADIUS pixels."""
+    pitch = markers.radius / RADIUS
+    columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)
+    return PixelGrid(rows, columns, pitch, -(columns - 1) / 2 * pitch, -(rows - 1) / 2 * pitch)
+
+
+def _native_pixels(rectify: Rectification, grid: PixelGrid) -> float:
+    """Pixels of the native image along a metre of the gel, in its middle, where they are fewest."""
+    row, column = (length * rectify.factor // 2 for length in grid.shape)
+    beside = rectify.pixels[row, column - 1] - rectify.pixels[row, column]
+    below = rectify.pixels[row - 1, column] - rectify.pixels[row, column]
+    step = grid.pitch / rectify.factor
+    return float(min(np.hypot(*beside), np.hypot(*below))) / step

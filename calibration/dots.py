@@ -67,7 +67,8 @@ class DotFinder:
         import cv2
 
         mask = (taken > level).astype(np.uint8)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+        kind = cv2.CV_16U if mask.size < 1 << 16 else cv2.CV_32S  # room for the label of every other pixel; 16 is faster
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=kind)
         area = stats[:, cv2.CC_STAT_AREA]
         width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
         large = area > LEAST_AREA * self._area

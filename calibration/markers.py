@@ -17,6 +17,7 @@ from calibration.dots import SMALLEST, DotFinder
 from calibration.lattice import NoLattice, find_lattice, spread, usual_pitch
 from calibration.lens import Rectification
 from calibration.reference import UnusableReference
+from calibration.surface import seen_box
 from calibration.tracker import DotTracker
 from tacsim.optics.geometry import Markers
 from tacsim.optics.grid import PixelGrid
@@ -53,19 +54,20 @@ class MarkerFlow:
         self, markers: Markers, rectify: Rectification, grid: PixelGrid, distance: float | None = None
     ) -> None:
         """Raises ValueError when the image shows the dots too small, or no gel."""
-        rows, columns = np.flatnonzero(rectify.valid.any(axis=1)), np.flatnonzero(rectify.valid.any(axis=0))
-        if not (len(rows) and len(columns)):
-            raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")
-        size = _native_pixels(rectify, grid) * markers.radius
-        if size < SMALLEST:
+        across = _native_pixels(rectify, grid)
+        if across * markers.radius < SMALLEST:
             raise ValueError(
-                f"markers of radius {markers.radius * 1e3:g} mm are {size:.2g} px in the image, at least {SMALLEST:g} px "
-                "are needed to follow them; take a finer image, or markers: null"
+                f"markers of radius {markers.radius * 1e3:g} mm are {across * markers.radius:.2g} px in the image, at "
+                f"least {SMALLEST:g} px are needed to follow them; take a finer image, or markers: null"
             )
         self._markers, self._distance = markers, distance
-        self._pixels, self._factor = rectify.pixels, rectify.factor
-        self._shape, self._native, self._valid = rectify.valid.shape, rectify.image_shape, rectify.valid
-        self._pitch, self._origin = grid.pitch, np.array([grid.x0, grid.y0])
+        self._native = rectify.image_shape
+        box = seen_box(rectify.valid)
+        self._valid = rectify.valid[box]
+        self._shrink = max(1, math.floor(across * grid.pitch + 1e-6))
+        self._map = _look_ups(rectify, self._shrink, box)
+        self._pitch = grid.pitch
+        self._origin = np.array([grid.x0, grid.y0]) + grid.pitch * np.array([box[1].start, box[0].start])
         self._find = DotFinder(markers.radius / grid.pitch)
         self._tracker: DotTracker | None = None
         self._index = 0
@@ -140,11 +142,12 @@ class MarkerFlow:
 
         if image.dtype != np.uint8 or image.shape != (*self._native, 3):
             raise ValueError(f"image is {image.shape} {image.dtype}, this sensor delivers {(*self._native, 3)} uint8")
-        nothing = np.empty(0, dtype=np.uint8)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        seen = cv2.remap(grey, self._pixels, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        if self._factor > 1:
-            seen = cv2.resize(seen, self._shape[::-1], interpolation=cv2.INTER_AREA)
+        if self._shrink > 1:
+            rows, columns = (length // self._shrink for length in self._native)
+            whole = grey[: rows * self._shrink, : columns * self._shrink]
+            grey = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+        seen = cv2.remap(grey, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         centres = self._find(np.asarray(seen, dtype=np.uint8)).centres
         column, row = np.rint(centres).astype(np.intp).T
         found: Float64 = centres[self._valid[row, column]] * self._pitch + self._origin
@@ -156,8 +159,8 @@ class MarkerFlow:
         for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
             at = (points + np.array(corner) * self._markers.radius - self._origin) / self._pitch
             column, row = np.rint(np.moveaxis(at, -1, 0)).astype(np.intp)
-            there = (row >= 0) & (row < self._shape[0]) & (column >= 0) & (column < self._shape[1])
-            inside &= there & self._valid[row.clip(0, self._shape[0] - 1), column.clip(0, self._shape[1] - 1)]
+            there = (row >= 0) & (row < self._valid.shape[0]) & (column >= 0) & (column < self._valid.shape[1])
+            inside &= there & self._valid[row.clip(0, self._valid.shape[0] - 1), column.clip(0, self._valid.shape[1] - 1)]
         return inside
 
     def _onto_gel(self, apparent: Float64, height: Float32, grid: PixelGrid) -> Float64:
@@ -186,3 +189,16 @@ def _native_pixels(rectify: Rectification, grid: PixelGrid) -> float:
     below = rectify.pixels[row - 1, column] - rectify.pixels[row, column]
     step = grid.pitch / rectify.factor
     return float(min(np.hypot(*beside), np.hypot(*below))) / step
+
+
+def _look_ups(
+    rectify: Rectification, shrink: int, box: tuple[slice, slice]
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Where the middle of each pixel in `box` lies in the native image made smaller, in OpenCV's fixed point."""
+    import cv2
+
+    rows, columns = rectify.valid.shape
+    parts = rectify.pixels.reshape(rows, rectify.factor, columns, rectify.factor, 2)
+    middle = (parts[box[0], :, box[1]].mean(axis=(1, 3), dtype=np.float64) - (shrink - 1) / 2) / shrink
+    whole, fraction = cv2.convertMaps(middle.astype(np.float32), np.empty(0, dtype=np.float32), cv2.CV_16SC2)
+    return np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)

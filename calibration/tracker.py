@@ -20,12 +20,20 @@ Mask = NDArray[np.bool_]
 
 GATE = 0.45  # a dot is at most so far from where it should be [pitches]
 NEIGHBOUR = 1.6  # dots at most so far apart at rest are neighbours: the diagonal of a square is one [pitches]
-STRETCH = 0.5  # change of displacement across an edge, at most [its length]
+STRETCH = 0.4  # change of displacement across an edge that nobody doubts, at most [pitches]
+TORN = 0.75  # ... and that is believed of dots that came there step by step
+SURE = 0.25  # a dot that others may start from is at most so far from where it should be [pitches]
+LED = 0.45  # a dot is at most so far from where its neighbours lead [pitches]
+LEADERS = 20  # neighbours that lead
+REACH = 1.0  # distance over which neighbours lead: the weight of those that far away is 1/e [pitches]
+STIFF = 0.02  # of the affine map that they lead by: where few are known, it is their mean
 FAR_AHEAD = 3  # frames over which a velocity still says something
 JUMP = 2.6  # jumps of the whole lattice that are looked for [pitches]
 WITNESSES = 3  # dots whose surroundings propose such jumps
 MISSING = 0.04  # share of dots, and of points, without a partner from which on a jump is suspected
 SUPPORT = 2  # neighbours that must be known where a dot is looked for
+
+TINY = 1e-9  # keeps the map of a dot without any neighbour solvable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,12 +62,17 @@ class DotTracker:
         pairs = KDTree(rest).query_pairs(NEIGHBOUR * pitch, output_type="ndarray")
         self._rest, self._pitch = rest, pitch
         self._first, self._second = pairs.T
-        self._edge = np.linalg.norm(rest[self._first] - rest[self._second], axis=1)
         count = len(rest)
         self._linked = np.zeros((count, count))
         self._linked[self._first, self._second] = self._linked[self._second, self._first] = 1.0
         if not self._linked.any(axis=1).all():
             raise ValueError(f"some dots have no neighbour within {NEIGHBOUR:g} pitches of {pitch:.3g}: no lattice")
+        near = min(LEADERS, count - 1)
+        away, index = KDTree(rest).query(rest, k=near + 1)
+        self._leaders: Index = index[:, 1:]  # nobody leads itself
+        self._weight = np.exp(-((away[:, 1:] / (REACH * pitch)) ** 2))
+        arm = (rest[self._leaders] - rest[:, None, :]) / pitch
+        self._terms = np.concatenate([np.ones((count, near, 1)), arm], axis=2)
         self.reset()
 
     def reset(self) -> None:
@@ -73,8 +86,8 @@ class DotTracker:
         trusted = 0 <= ahead <= FAR_AHEAD
         expected = self._rest + self._displacement + (ahead * self._velocity if trusted else 0.0)
         partner = self._match(expected, points)
-        coherent = self._largest(partner, points)
-        if not trusted or (partner < 0).any() or not coherent.all():
+        coherent = self._largest(partner, points, STRETCH)
+        if not trusted or self._jumped(partner, points) or (coherent != (partner >= 0)).any():
             partner = self._best(expected, points, trusted)
         seen = partner >= 0
         displacement = np.zeros_like(self._rest)
@@ -95,10 +108,10 @@ class DotTracker:
         if not (len(points) and len(expected)):
             return partner
         reach = (gate * self._pitch) ** 2
-        away = ((expected[:, None, :] - points[None, :, :]) ** 2).sum(axis=2)
+        away = (expected[:, :1] - points[:, 0]) ** 2 + (expected[:, 1:] - points[:, 1]) ** 2
         nearest = away.argmin(axis=1)
         close = away[np.arange(len(expected)), nearest] < reach
-        if len(np.unique(nearest[close])) == close.sum():  # nobody wants the same: this is the best there is
+        if np.bincount(nearest[close], minlength=1).max() <= 1:  # nobody wants the same: this is the best there is
             partner[close] = nearest[close]
             return partner
         rows, columns = linear_sum_assignment(np.minimum(away, reach))
@@ -107,53 +120,90 @@ class DotTracker:
         return partner
 
     def _best(self, expected: Float64, points: Float64, trusted: bool) -> Index:
-        """(n,) partners by the guess that finds most; of equal ones, by the first."""
-        best = self._grown(self._match(expected, points), points)
-        if trusted and not self._jumped(best, points):
-            return best
+        """(n,) partners by the guess that finds most dots; of equal ones, by the smoothest."""
+        found = [self._grown(expected, points)]
+        if trusted:
+            matched = self._match(expected, points)
+            found.append(np.where(self._largest(matched, points, TORN), matched, -1))
+            best = max(found, key=lambda partner: self._score(partner, points))
+            if not self._jumped(best, points):
+                return best
         for guess in (self._rest + self._displacement, self._rest):
-            best = self._better(best, guess, points)
+            found.append(self._grown(guess, points))
+        best = max(found, key=lambda partner: self._score(partner, points))
         if self._jumped(best, points):
             for shift in self._jumps(points, self._rest + self._displacement):
-                best = self._better(best, self._rest + self._displacement + shift, points)
+                found.append(self._grown(self._rest + self._displacement + shift, points))
+            best = max(found, key=lambda partner: self._score(partner, points))
         return best
 
-    def _better(self, best: Index, guess: Float64, points: Float64) -> Index:
-        partner = self._match(guess, points)
-        grown = self._grown(partner, points)
-        return grown if (grown >= 0).sum() > (best >= 0).sum() else best
+    def _score(self, partner: Index, points: Float64) -> tuple[int, float]:
+        """How many dots have a partner, and how little displacement changes across edges."""
+        moved, both = self._moved(partner, points)
+        change = ((moved[self._first] - moved[self._second]) ** 2).sum(axis=1)[both]
+        return int((partner >= 0).sum()), -float(change.mean()) if len(change) else 0.0
 
-    def _grown(self, partner: Index, points: Float64) -> Index:
-        """Partners of the largest coherent part, and of all that its neighbours then lead to."""
-        partner = np.where(self._largest(partner, points), partner, -1)
+    def _grown(self, guess: Float64, points: Float64) -> Index:
+        """Partners of the largest coherent part of what is surely where it is guessed, and of all that those around
+        then lead to, as an affine map of displacement through them (weighted by distance) continues it."""
+        partner = self._match(guess, points, SURE)
+        partner = self._extended(np.where(self._largest(partner, points, STRETCH), partner, -1), points)
+        smooth = self._smooth(partner, points)
+        return partner if smooth is partner else self._smooth(self._extended(smooth, points), points)
+
+    def _extended(self, partner: Index, points: Float64) -> Index:
+        """`partner`, and those found where the dots that have one lead to."""
+        partner = partner.copy()
         refused = np.zeros(len(partner), dtype=np.bool_)
         for _ in range(len(partner)):
             known = partner >= 0
-            support = self._linked @ known
-            asked = np.flatnonzero(~known & (support >= SUPPORT) & ~refused)
+            asked = np.flatnonzero(~known & (self._linked @ known >= SUPPORT) & ~refused)
             free = np.setdiff1d(np.arange(len(points)), partner[known])
             if not (len(asked) and len(free)):
                 break
-            there = np.where(known[:, None], points[partner] - self._rest, 0.0)
-            led = self._rest[asked] + (self._linked[asked] @ there) / support[asked, None]
-            found = self._match(led, points[free])
+            led = self._continued(asked, known, points[partner] - self._rest)
+            found = self._match(self._rest[asked] + led, points[free], LED)
             partner[asked[found >= 0]] = free[found[found >= 0]]
             refused[asked[found < 0]] = True
-            coherent = self._largest(partner, points)
-            refused |= (partner >= 0) & ~coherent
-            partner = np.where(coherent, partner, -1)
         return partner
 
-    def _largest(self, partner: Index, points: Float64) -> Mask:
+    def _smooth(self, partner: Index, points: Float64) -> Index:
+        """`partner` without those that the dots around contradict, the worst first."""
+        checked = partner
+        every = np.arange(len(partner))
+        while (checked >= 0).any():
+            known = checked >= 0
+            moved = np.where(known[:, None], points[checked] - self._rest, 0.0)
+            odd = np.where(known, np.linalg.norm(self._continued(every, known, moved) - moved, axis=1), 0.0)
+            if odd.max() <= LED * self._pitch:
+                break
+            checked = np.where(odd > 0.9 * odd.max(), -1, checked)
+        return checked
+
+    def _continued(self, asked: Index, known: Mask, moved: Float64) -> Float64:
+        """(k, 2) displacement of the dots `asked`, from that (n, 2) of the dots `known`."""
+        leaders, terms = self._leaders[asked], self._terms[asked]
+        weighted = (terms * (self._weight[asked] * known[leaders])[..., None]).transpose(0, 2, 1)
+        square = weighted @ terms + STIFF * np.diag([TINY, 1.0, 1.0])
+        right = weighted @ np.where(known[:, None], moved, 0.0)[leaders]
+        led: Float64 = np.linalg.solve(square, right)[:, 0]
+        return led
+
+    def _moved(self, partner: Index, points: Float64) -> tuple[Float64, Mask]:
+        """(n, 2) displacement, 0 without a partner, and (edges,) both ends have one."""
+        seen = partner >= 0
+        moved = np.where(seen[:, None], points[partner] - self._rest, 0.0) if len(points) else np.zeros_like(self._rest)
+        return moved, seen[self._first] & seen[self._second]
+
+    def _largest(self, partner: Index, points: Float64, stretch: float) -> Mask:
         """(n,) dots with a partner, in the largest part whose edges are not overstretched."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
         seen = partner >= 0
-        moved = np.where(seen[:, None], points[partner] - self._rest, 0.0) if len(points) else np.zeros_like(self._rest)
+        moved, both = self._moved(partner, points)
         change = moved[self._first] - moved[self._second]
-        both = seen[self._first] & seen[self._second]
-        sound = both & ((change**2).sum(axis=1) < (STRETCH * self._edge) ** 2)
+        sound = both & ((change**2).sum(axis=1) < (stretch * self._pitch) ** 2)
         if (sound == both).all():
             return seen
         first, second = self._first[sound], self._second[sound]

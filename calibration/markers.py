@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.dots import SMALLEST, DotFinder
-from calibration.lattice import NoLattice, find_lattice, spread, usual_pitch
+from calibration.lattice import Lattice, NoLattice, find_lattice, spread, usual_pitch
 from calibration.lens import Rectification
 from calibration.reference import UnusableReference
 from calibration.surface import seen_box
@@ -30,6 +30,8 @@ Image = NDArray[np.uint8]
 RADIUS = 2.5  # of a dot on the grid on which dots are sought [px]
 MOST_MISSING = 0.3  # share of the dots in view that a reference may lack
 MOST_STRAY = 0.1  # dots beyond the lattice's rows and columns, in shares of its own
+PINHOLE_STEPS = 4
+FULL = 0.75  # share of its dots that a lattice nobody asked for must show
 LEAST_KEPT = 0.25  # share of the dots that must be seen for a flow
 
 
@@ -168,11 +170,12 @@ class MarkerFlow:
         import cv2
 
         assert self._distance is not None
-        at = ((apparent - (grid.x0, grid.y0)) / grid.pitch).astype(np.float32)
-        nothing = np.empty(0, dtype=np.float32)
-        deep = cv2.remap(height, at, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        nearer: Float64 = 1.0 - np.asarray(deep, dtype=np.float64) / self._distance
-        return apparent * nearer[..., None]
+        nothing, at = np.empty(0, dtype=np.float32), apparent
+        for _ in range(PINHOLE_STEPS):  # height is known where the dot is, not where it appears
+            pixel = ((at - (grid.x0, grid.y0)) / grid.pitch).astype(np.float32)
+            deep = cv2.remap(height, pixel, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            at = apparent * (1.0 - np.asarray(deep, dtype=np.float64) / self._distance)[..., None]
+        return at
 
 
 def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
@@ -202,3 +205,39 @@ def _look_ups(
     middle = (parts[box[0], :, box[1]].mean(axis=(1, 3), dtype=np.float64) - (shrink - 1) / 2) / shrink
     whole, fraction = cv2.convertMaps(middle.astype(np.float32), np.empty(0, dtype=np.float32), cv2.CV_16SC2)
     return np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)
+
+
+def find_markers(image: Image) -> tuple[Lattice, float]:
+    """The lattice [px] in a picture (H, W, 3) without contact of which nothing is known, and the radius of its dots
+    [px]: that radius is sought with which most dots fall into rows and columns. Raises NoLattice."""
+    best: tuple[Lattice, float] | None = None
+    rows, columns, _ = image.shape
+    radius = SMALLEST
+    while radius < min(rows, columns) / 12:
+        dots = DotFinder(radius)(image)
+        try:
+            lattice = find_lattice(dots.centres - ((columns - 1) / 2, (rows - 1) / 2))
+        except NoLattice:
+            pass
+        else:
+            regular = lattice.present.mean() > FULL and min(lattice.present.shape) > 2
+            if regular and (best is None or lattice.present.sum() > best[0].present.sum()):
+                best = lattice, dots.radius
+        radius *= 1.3
+    if best is None:
+        raise NoLattice("the picture shows no lattice of dark dots, at least 3 x 3")
+    return best
+
+
+def require_no_markers(image: Image) -> None:
+    """Raises UnusableReference when a picture (H, W, 3) without contact shows a lattice of dots: to a sensor that knows
+    of none each would be a dent."""
+    try:
+        lattice, _ = find_markers(image)
+    except NoLattice:
+        return
+    rows, columns = lattice.present.shape
+    raise UnusableReference(
+        f"the reference shows a lattice of {rows} x {columns} dark dots, {lattice.pitch:.3g} px apart, but the sensor's "
+        "model or calibration has no markers: give it markers, or calibrate the sensor with --markers"
+    )

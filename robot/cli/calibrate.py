@@ -12,6 +12,7 @@ from robot.cli.output import Out, busy, make, new_directory, notes, quantity, sa
 if TYPE_CHECKING:
     from calibration.ballpress import Fit
     from calibration.bundle import Calibration
+    from tacsim.optics.geometry import Markers
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
 
@@ -64,8 +65,14 @@ def sensor(
             fit = calibrate_light(read.reference, read.presses, ball / pitch)
     except BadPresses as error:
         raise typer.BadParameter(str(error), param_hint="FRAMES") from None
+    found = _markers(fit, pitch) if markers else None
     _show(fit, pitch)
-    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], markers=markers)
+    if found is not None:
+        notes.print(
+            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
+            f"{found.radius * 1e3:.2g} mm"
+        )
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found)
     with writing(make(folder)):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
@@ -74,12 +81,28 @@ def sensor(
     say_files(*written)
 
 
-def _bundle(fit: Fit, serial: str, ball: float, pitch: float, names: list[str], *, markers: bool) -> Calibration:
+def _markers(fit: Fit, pitch: float) -> Markers:
+    """The lattice of dots in the picture without contact."""
+    from calibration.lattice import NoLattice
+    from calibration.markers import find_markers
+    from tacsim.optics.geometry import Markers
+
+    try:
+        lattice, radius = find_markers(fit.reference)
+    except NoLattice as nothing:
+        raise typer.BadParameter(f"{nothing}; leave --markers out if none are printed", param_hint="--markers") from None
+    rows, columns = lattice.present.shape
+    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
+def _bundle(
+    fit: Fit, serial: str, ball: float, pitch: float, names: list[str], markers: Markers | None
+) -> Calibration:
     from datetime import UTC, datetime
     from importlib import metadata
 
     from calibration.bundle import FORMAT, Calibration, Provenance, Residual
-    from tacsim.optics.geometry import Markers, SensorGeometry
+    from tacsim.optics.geometry import SensorGeometry
 
     rows, columns, _ = fit.reference.shape
     return Calibration(
@@ -91,7 +114,7 @@ def _bundle(fit: Fit, serial: str, ball: float, pitch: float, names: list[str], 
         inverse=fit.inverse,
         skirt_length=fit.skirt.length * pitch,
         skirt_fraction=fit.skirt.fraction,
-        markers=Markers() if markers else None,
+        markers=markers,
         residuals=tuple(
             Residual(
                 frame=score.name,

@@ -11,7 +11,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-LEVELS = (0.2, 0.35, 0.5)  # a dot takes at least such a share of the light round it; the higher ones part it from others
+LEVELS = (0.2, 0.35, 0.5)  # a dot takes at least such a share of the light round it; the higher part it from others
 LEAST_FILLED = 0.4  # share of its bounding box that a dot fills
 LARGEST = 2.5  # radius of the largest dot that is one, in radii of the usual one
 LEAST_AREA, LARGEST_AREA = 0.2, 7.0  # of one dot, in areas of the usual one: dots are painted over, and half hidden
@@ -67,7 +67,7 @@ class DotFinder:
         import cv2
 
         mask = (taken > level).astype(np.uint8)
-        kind = cv2.CV_16U if mask.size < 1 << 16 else cv2.CV_32S  # room for the label of every other pixel; 16 is faster
+        kind = cv2.CV_16U if mask.size < 1 << 16 else cv2.CV_32S  # room for as many labels as pixels; 16 is faster
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=kind)
         area = stats[:, cv2.CC_STAT_AREA]
         width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
@@ -96,5 +96,5 @@ def light_taken(image: Image, side: int, blur: float) -> Float32:
     calm = np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur), dtype=np.float32)
     levels = cv2.convertScaleAbs(calm)  # many times faster to close than float, and fine enough for what is smooth
     bright = cv2.morphologyEx(levels, cv2.MORPH_CLOSE, np.ones((side, side), dtype=np.uint8))
-    taken: Float32 = np.float32(1.0) - calm / np.maximum(bright, 1).astype(np.float32)
-    return taken
+    share = calm / np.maximum(bright, 1).astype(np.float32)
+    return np.asarray(np.float32(1.0) - share, dtype=np.float32)

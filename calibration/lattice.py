@@ -40,7 +40,8 @@ def usual_pitch(points: Float64) -> float:
     """Median distance to the nearest neighbour, of points (n >= 2, 2)."""
     from scipy.spatial import KDTree
 
-    return float(np.median(KDTree(points).query(points, k=2)[0][:, 1]))
+    away, _ = KDTree(points).query(points, k=2)
+    return float(np.median(np.asarray(away)[:, 1]))
 
 
 def find_lattice(points: Float64, shape: tuple[int, int] | None = None, pitch: float | None = None) -> Lattice:
@@ -76,7 +77,7 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
-    away, near = tree.query(points, k=min(5, len(points)))
+    away, near = (np.asarray(found) for found in tree.query(points, k=min(5, len(points))))
     steps = points[near[:, 1:]] - points[:, None, :]
     regular = np.abs(away[:, 1:] - pitch) < ODD * pitch
     if not regular.any():
@@ -84,7 +85,8 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
     angle = np.angle(np.exp(4j * np.arctan2(steps[regular][:, 1], steps[regular][:, 0])).mean()) / 4
     along = pitch * np.array([np.cos(angle), np.sin(angle)])  # one column further
     down = np.array([-along[1], along[0]])  # one row further
-    start = int(np.argmax(regular.sum(axis=1) - 1e-3 * np.linalg.norm(points - np.median(points, axis=0), axis=1) / pitch))
+    aside = np.linalg.norm(points - np.median(points, axis=0), axis=1) / pitch
+    start = int(np.argmax(regular.sum(axis=1) - 1e-3 * aside))
     labels = {start: (0, 0)}
     taken = {(0, 0)}
     queue: deque[tuple[int, Float64, Float64]] = deque([(start, along, down)])
@@ -104,7 +106,9 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
     return labels
 
 
-def _window(points: Float64, at: NDArray[np.intp], shape: tuple[int, int] | None) -> tuple[NDArray[np.intp], tuple[int, int]]:
+def _window(
+    points: Float64, at: NDArray[np.intp], shape: tuple[int, int] | None
+) -> tuple[NDArray[np.intp], tuple[int, int]]:
     """First row and column, and how many, of the lattice among points (n, 2) labelled `at` (n, 2)."""
     first = at.min(axis=0)
     filled = np.zeros(at.max(axis=0) - first + 1, dtype=np.intp)
@@ -128,8 +132,7 @@ def _window(points: Float64, at: NDArray[np.intp], shape: tuple[int, int] | None
 def _affine(points: Float64, at: NDArray[np.intp]) -> Float64:
     """(2, 3) from (1, row, column) to the place."""
     terms = np.column_stack([np.ones(len(at)), at])
-    fit: Float64 = np.linalg.lstsq(terms, points, rcond=None)[0].T
-    return fit
+    return np.asarray(np.linalg.lstsq(terms, points, rcond=None)[0].T, dtype=np.float64)
 
 
 def _completed(positions: Float64, present: Mask) -> Float64:
@@ -139,7 +142,8 @@ def _completed(positions: Float64, present: Mask) -> Float64:
     at = np.argwhere(np.ones_like(present))
     terms = np.column_stack([np.ones(len(at)), at])
     affine = (terms @ _affine(positions[present], np.argwhere(present)).T).reshape(positions.shape)
-    return affine + spread(np.where(present[..., None], positions - affine, 0.0), present)
+    bent = spread(np.where(present[..., None], positions - affine, 0.0), present)
+    return np.asarray(affine + bent, dtype=np.float64)
 
 
 def spread(values: Float64, known: Mask) -> Float64:

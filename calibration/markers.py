@@ -65,7 +65,7 @@ class MarkerFlow:
         self._markers, self._distance = markers, distance
         self._native = rectify.image_shape
         box = seen_box(rectify.valid)
-        self._valid = rectify.valid[box]
+        self._whole = _whole(rectify.valid[box], markers.radius / grid.pitch)
         self._shrink = max(1, math.floor(across * grid.pitch + 1e-6))
         self._map = _look_ups(rectify, self._shrink, box)
         self._pitch = grid.pitch
@@ -106,7 +106,7 @@ class MarkerFlow:
                 f"the reference shows {lattice.strays} dots more than {expected}: give the true rows and columns"
             )
         try:
-            tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch)
+            tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch, self._in_view)
         except ValueError as error:
             raise NoMarkers(f"the reference shows no {expected}: {error}") from error
         self._tracker, self._index = tracker, index
@@ -127,9 +127,10 @@ class MarkerFlow:
         seen[self._present] = tracked.seen
         self._seen = seen
         if tracked.kept < LEAST_KEPT:
+            self._tracker.reset()  # what so few say is no motion to go on from
             raise MarkersLost(
-                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {LEAST_KEPT:.0%} are needed for "
-                "a flow: is the light on, and the gel whole? If so, take a fresh reference"
+                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {LEAST_KEPT:.0%} are needed "
+                "for a flow: is the light on, and the gel whole? If so, take a fresh reference"
             )
         moved = np.zeros_like(self._rest)
         moved[self._present] = tracked.displacement
@@ -152,18 +153,15 @@ class MarkerFlow:
         seen = cv2.remap(grey, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         centres = self._find(np.asarray(seen, dtype=np.uint8)).centres
         column, row = np.rint(centres).astype(np.intp).T
-        found: Float64 = centres[self._valid[row, column]] * self._pitch + self._origin
+        found: Float64 = centres[self._whole[row, column]] * self._pitch + self._origin
         return found
 
     def _in_view(self, points: Float64) -> Mask:
         """(...,) whole dots at `points` (..., 2) [m] lie in the picture and on the gel."""
-        inside = np.ones(points.shape[:-1], dtype=np.bool_)
-        for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            at = (points + np.array(corner) * self._markers.radius - self._origin) / self._pitch
-            column, row = np.rint(np.moveaxis(at, -1, 0)).astype(np.intp)
-            there = (row >= 0) & (row < self._valid.shape[0]) & (column >= 0) & (column < self._valid.shape[1])
-            inside &= there & self._valid[row.clip(0, self._valid.shape[0] - 1), column.clip(0, self._valid.shape[1] - 1)]
-        return inside
+        column, row = np.rint(np.moveaxis((points - self._origin) / self._pitch, -1, 0)).astype(np.intp)
+        rows, columns = self._whole.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        return np.asarray(inside & self._whole[row.clip(0, rows - 1), column.clip(0, columns - 1)])
 
     def _onto_gel(self, apparent: Float64, height: Float32, grid: PixelGrid) -> Float64:
         """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
@@ -183,6 +181,16 @@ def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
     pitch = markers.radius / RADIUS
     columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)
     return PixelGrid(rows, columns, pitch, -(columns - 1) / 2 * pitch, -(rows - 1) / 2 * pitch)
+
+
+def _whole(valid: Mask, radius: float) -> Mask:
+    """Places in a mask about which a whole disc of `radius` [px] is valid; the centre of a cut one is not its own."""
+    import cv2
+
+    reach = math.floor(radius)
+    padded = np.pad(valid.astype(np.uint8), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray(cv2.erode(padded, disc)[1:-1, 1:-1], dtype=np.bool_)
 
 
 def _native_pixels(rectify: Rectification, grid: PixelGrid) -> float:
@@ -208,8 +216,8 @@ def _look_ups(
 
 
 def find_markers(image: Image) -> tuple[Lattice, float]:
-    """The lattice [px] in a picture (H, W, 3) without contact of which nothing is known, and the radius of its dots
-    [px]: that radius is sought with which most dots fall into rows and columns. Raises NoLattice."""
+    """The lattice [px from the middle] in a picture (H, W, 3) without contact of which nothing is known, and the radius
+    of its dots [px]: that radius is sought with which most dots fall into rows and columns. Raises NoLattice."""
     best: tuple[Lattice, float] | None = None
     rows, columns, _ = image.shape
     radius = SMALLEST
@@ -238,6 +246,6 @@ def require_no_markers(image: Image) -> None:
         return
     rows, columns = lattice.present.shape
     raise UnusableReference(
-        f"the reference shows a lattice of {rows} x {columns} dark dots, {lattice.pitch:.3g} px apart, but the sensor's "
-        "model or calibration has no markers: give it markers, or calibrate the sensor with --markers"
+        f"the reference shows a lattice of {rows} x {columns} dark dots, {lattice.pitch:.3g} px apart, but the "
+        "sensor's model or calibration has no markers: give it markers, or calibrate the sensor with --markers"
     )

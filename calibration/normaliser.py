@@ -209,9 +209,7 @@ def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: Ca
     return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid)
 
 
-def _marker_flow(
-    markers: Markers | None, geometry: SensorGeometry, gel_size: tuple[float, float]
-) -> MarkerFlow | None:
+def _marker_flow(markers: Markers | None, geometry: SensorGeometry, gel_size: tuple[float, float]) -> MarkerFlow | None:
     if markers is None:
         return None
     fine = marker_grid(markers, gel_size)
@@ -220,8 +218,10 @@ def _marker_flow(
 
 def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
     """(H, W, 3) clip(128 + 128 change), rounded; no change is exactly 128."""
-    image: NDArray[np.uint8] = np.rint(np.clip(128.0 + 128.0 * change, 0.0, 255.0)).astype(np.uint8)
-    return image
+    import cv2
+
+    # cv2 takes the absolute value before it saturates: what is below -1 would be folded up
+    return np.asarray(cv2.convertScaleAbs(np.maximum(change, np.float32(-1.0)), alpha=128.0, beta=128.0))
 
 
 def _cells(pixels: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:

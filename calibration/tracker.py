@@ -9,6 +9,7 @@ against rest, so errors don't add up.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ REACH = 1.0  # distance over which neighbours lead: the weight of those that far
 STIFF = 0.02  # of the affine map that they lead by: where few are known, it is their mean
 FAR_AHEAD = 3  # frames over which a velocity still says something
 JUMP = 2.6  # jumps of the whole lattice that are looked for [pitches]
+JUMPS = 4  # of these, how many are tried
 WITNESSES = 3  # dots whose surroundings propose such jumps
 MISSING = 0.04  # share of dots, and of points, without a partner from which on a jump is suspected
 SUPPORT = 2  # neighbours that must be known where a dot is looked for
@@ -52,15 +54,17 @@ class Tracked:
 class DotTracker:
     """Follows dots, in any unit of length."""
 
-    def __init__(self, rest: Float64, pitch: float) -> None:
-        """`rest`: (n, 2) where the dots are at rest; `pitch`: usual distance of neighbours. Raises ValueError for fewer
-        than 4 dots, or dots that are no neighbours of any other."""
+    def __init__(self, rest: Float64, pitch: float, in_view: Callable[[Float64], Mask] | None = None) -> None:
+        """`rest`: (n, 2) where the dots are at rest; `pitch`: usual distance of neighbours; `in_view`: at which places
+        (..., 2) a dot would be seen (None: everywhere). Raises ValueError for fewer than 4 dots, or dots that are no
+        neighbours of any other."""
         from scipy.spatial import KDTree
 
         if len(rest) < 4:
             raise ValueError(f"{len(rest)} dots are no lattice, at least 4 are needed")
         pairs = KDTree(rest).query_pairs(NEIGHBOUR * pitch, output_type="ndarray")
         self._rest, self._pitch = rest, pitch
+        self._in_view = in_view or (lambda places: np.ones(places.shape[:-1], dtype=np.bool_))
         self._first, self._second = pairs.T
         count = len(rest)
         self._linked = np.zeros((count, count))
@@ -69,8 +73,8 @@ class DotTracker:
             raise ValueError(f"some dots have no neighbour within {NEIGHBOUR:g} pitches of {pitch:.3g}: no lattice")
         near = min(LEADERS, count - 1)
         away, index = KDTree(rest).query(rest, k=near + 1)
-        self._leaders: Index = index[:, 1:]  # nobody leads itself
-        self._weight = np.exp(-((away[:, 1:] / (REACH * pitch)) ** 2))
+        self._leaders = np.asarray(index, dtype=np.intp)[:, 1:]  # nobody leads itself
+        self._weight = np.exp(-((np.asarray(away)[:, 1:] / (REACH * pitch)) ** 2))
         arm = (rest[self._leaders] - rest[:, None, :]) / pitch
         self._terms = np.concatenate([np.ones((count, near, 1)), arm], axis=2)
         self.reset()
@@ -120,7 +124,7 @@ class DotTracker:
         return partner
 
     def _best(self, expected: Float64, points: Float64, trusted: bool) -> Index:
-        """(n,) partners by the guess that finds most dots; of equal ones, by the smoothest."""
+        """(n,) partners by the guess that explains most dots; of equal ones, by the smoothest."""
         found = [self._grown(expected, points)]
         if trusted:
             matched = self._match(expected, points)
@@ -128,20 +132,25 @@ class DotTracker:
             best = max(found, key=lambda partner: self._score(partner, points))
             if not self._jumped(best, points):
                 return best
-        for guess in (self._rest + self._displacement, self._rest):
-            found.append(self._grown(guess, points))
+        last = self._rest + self._displacement
+        found += [self._grown(last, points), self._grown(self._rest, points)]
         best = max(found, key=lambda partner: self._score(partner, points))
-        if self._jumped(best, points):
-            for shift in self._jumps(points, self._rest + self._displacement):
-                found.append(self._grown(self._rest + self._displacement + shift, points))
+        if self._score(best, points)[0] < (1.0 - MISSING) * len(best):  # or is it all dirt and drop-outs?
+            found += [self._grown(last + shift, points) for shift in self._jumps(points, last)]
             best = max(found, key=lambda partner: self._score(partner, points))
         return best
 
     def _score(self, partner: Index, points: Float64) -> tuple[int, float]:
-        """How many dots have a partner, and how little displacement changes across edges."""
+        """How many dots have a partner, or would be out of view with the others' motion, less the points that nobody
+        claims; and how little displacement changes across edges."""
+        seen = partner >= 0
+        if not seen.any():
+            return -len(points), 0.0
         moved, both = self._moved(partner, points)
         change = ((moved[self._first] - moved[self._second]) ** 2).sum(axis=1)[both]
-        return int((partner >= 0).sum()), -float(change.mean()) if len(change) else 0.0
+        out = ~seen & ~self._in_view(self._rest + self._filled(moved, seen))
+        spare = len(points) - int(seen.sum())
+        return int((seen | out).sum()) - spare, -float(change.mean()) if len(change) else 0.0
 
     def _grown(self, guess: Float64, points: Float64) -> Index:
         """Partners of the largest coherent part of what is surely where it is guessed, and of all that those around
@@ -231,20 +240,23 @@ class DotTracker:
         lost, spare = int((partner < 0).sum()), len(points) - int((partner >= 0).sum())
         return min(lost, spare) > max(1.0, MISSING * len(partner))
 
-    def _jumps(self, points: Float64, start: Float64) -> Float64:
-        """(2, 2) shifts of the whole lattice that bring most dots near a point, the best first."""
+    def _jumps(self, points: Float64, start: Float64) -> list[Float64]:
+        """Shifts (2,) of the whole lattice that bring most dots near a point or out of view, the best first."""
         from scipy.spatial import KDTree
 
         middle = np.argsort(((self._rest - self._rest.mean(axis=0)) ** 2).sum(axis=1))[:WITNESSES]
         shifts = (points[None, :, :] - start[middle][:, None, :]).reshape(-1, 2)
         length = np.linalg.norm(shifts, axis=1)
-        near = np.argsort(length)[: int((length < JUMP * self._pitch).sum())]
-        shifts = shifts[near]
+        shifts = shifts[(length < JUMP * self._pitch) & (length > SURE * self._pitch)]
         if not len(shifts):
-            return np.zeros((0, 2))
-        away, _ = KDTree(points).query(
-            (start[None, :, :] + shifts[:, None, :]).reshape(-1, 2), distance_upper_bound=GATE / 2 * self._pitch
-        )
-        explained = np.isfinite(away).reshape(len(shifts), -1).sum(axis=1)
-        best: Float64 = shifts[np.argsort(-explained, kind="stable")[:2]]
-        return best
+            return []
+        there = start[None, :, :] + shifts[:, None, :]
+        away, _ = KDTree(points).query(there, distance_upper_bound=SURE * self._pitch)
+        explained = (np.isfinite(away) | ~self._in_view(there)).sum(axis=1)
+        chosen: list[Float64] = []
+        for shift in shifts[np.argsort(-explained, kind="stable")]:
+            if all(float(np.linalg.norm(shift - other)) > SURE * self._pitch for other in chosen):
+                chosen.append(shift)
+            if len(chosen) == JUMPS:
+                break
+        return chosen

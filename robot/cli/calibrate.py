@@ -90,14 +90,14 @@ def _markers(fit: Fit, pitch: float) -> Markers:
     try:
         lattice, radius = find_markers(fit.reference)
     except NoLattice as nothing:
-        raise typer.BadParameter(f"{nothing}; leave --markers out if none are printed", param_hint="--markers") from None
+        raise typer.BadParameter(
+            f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
+        ) from None
     rows, columns = lattice.present.shape
     return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
 
 
-def _bundle(
-    fit: Fit, serial: str, ball: float, pitch: float, names: list[str], markers: Markers | None
-) -> Calibration:
+def _bundle(fit: Fit, serial: str, ball: float, pitch: float, names: list[str], markers: Markers | None) -> Calibration:
     from datetime import UTC, datetime
     from importlib import metadata
 

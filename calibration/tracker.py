@@ -93,6 +93,8 @@ class DotTracker:
         coherent = self._largest(partner, points, STRETCH)
         if not trusted or self._jumped(partner, points) or (coherent != (partner >= 0)).any():
             partner = self._best(expected, points, trusted)
+        elif int((partner >= 0).sum()) < min(len(partner), len(points)):
+            partner = self._extended(partner, points)  # a dot that has turned round is where its neighbours lead
         seen = partner >= 0
         displacement = np.zeros_like(self._rest)
         displacement[seen] = points[partner[seen]] - self._rest[seen]

@@ -119,3 +119,12 @@ def test_too_few_or_scattered_dots_are_refused() -> None:
         DotTracker(REST[:3], PITCH)
     with pytest.raises(ValueError, match="no neighbour within"):
         DotTracker(REST * 3, PITCH)
+
+
+def test_a_drag_that_snaps_back_is_followed_by_what_the_neighbours_do() -> None:
+    """The fastest dot is then almost half a pitch from where its velocity would have it."""
+    tracker = DotTracker(REST, PITCH)
+    for far in (0.3, 0.6, 0.9, 0.5, 0.0):
+        found = tracker(REST + drag((far, 0.0), centre=(0.0, 0.0)))
+        assert found.kept == 1.0
+        np.testing.assert_allclose(found.displacement, drag((far, 0.0), centre=(0.0, 0.0)), atol=1e-9)

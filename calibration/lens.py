@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ class BadCorners(Unusable):
     """The four corners are no picture of a rectangle."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Rectification:
     """The map of one sensor. Make it by :func:`from_corners`, :func:`from_view` or :func:`from_geometry`."""
 
@@ -36,8 +37,6 @@ class Rectification:
     pixels: NDArray[np.float32]  # (factor * H, factor * W, 2) native u, v of each look-up [px]
     factor: int  # look-ups along each side of one canonical pixel
     valid: NDArray[np.bool_]  # (H, W) the canonical pixel lies on the gel and in the native image
-    # The same map in whole pixels and a table of 32 x 32 weights, as OpenCV uses it; no bit of the result differs.
-    fixed: tuple[NDArray[np.int16], NDArray[np.uint16]]
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(H, W, 3) rectified image, 0..255, of a native (rows, columns, 3) uint8 RGB image; 0 where not valid.
@@ -51,14 +50,36 @@ class Rectification:
                 f"image is {image.shape} {image.dtype}, this sensor delivers {(*self.image_shape, 3)} uint8; "
                 "is it another camera, or another setting of it?"
             )
-        # float before the mean, so that it is not rounded twice
-        fine = cv2.remap(image, *self.fixed, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        seen = np.asarray(fine, dtype=np.float32)
+        found = np.zeros((*self.valid.shape, 3), dtype=np.float32)
+        if not self.valid.any():
+            return found
+        box, look_ups, fraction, hidden = self._box
+        between = cv2.INTER_LINEAR if fraction.size else cv2.INTER_NEAREST
+        fine = cv2.remap(image, look_ups, fraction, between, borderMode=cv2.BORDER_REPLICATE)
+        seen = np.asarray(fine, dtype=np.float32)  # before the mean, so that it is not rounded twice
         if self.factor > 1:
-            height, width = self.valid.shape
-            seen = np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
-        seen[~self.valid] = 0.0
-        return seen
+            size = (seen.shape[1] // self.factor, seen.shape[0] // self.factor)
+            seen = np.asarray(cv2.resize(seen, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        if hidden is not None:
+            seen[hidden] = 0.0
+        found[box] = seen
+        return found
+
+    @cached_property
+    def _box(
+        self,
+    ) -> tuple[tuple[slice, slice], NDArray[np.int16], NDArray[np.uint16], NDArray[np.bool_] | None]:
+        """Rows and columns with valid pixels, their look-ups in OpenCV's fixed point (to 1/32 px, as it rounds them
+        anyway; an empty fraction where all are whole pixels), and which of them are not valid (None: all are)."""
+        import cv2
+
+        rows, columns = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
+        box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        finer = tuple(slice(side.start * self.factor, side.stop * self.factor) for side in box)
+        look_ups, fraction = cv2.convertMaps(self.pixels[finer], np.empty(0, dtype=np.float32), cv2.CV_16SC2)
+        hidden = ~self.valid[box]
+        parted = np.asarray(fraction if fraction.any() else fraction[:0], dtype=np.uint16)
+        return box, np.asarray(look_ups, dtype=np.int16), parted, hidden if hidden.any() else None
 
 
 def from_corners(
@@ -127,12 +148,7 @@ def _rectification(
     in_image = (u >= -margin) & (u <= columns - 1 + margin) & (v >= -margin) & (v <= rows - 1 + margin)
     height, width = on_gel.shape
     whole = in_image.reshape(height, factor, width, factor).all(axis=(1, 3))
-    import cv2
-
-    nearest = pixels.astype(np.float32)
-    coarse, table = cv2.convertMaps(nearest, np.empty(0, dtype=np.float32), cv2.CV_16SC2)
-    fixed = (np.asarray(coarse, dtype=np.int16), np.asarray(table, dtype=np.uint16))
-    return Rectification(image_shape, nearest, factor, whole & on_gel, fixed)
+    return Rectification(image_shape, pixels.astype(np.float32), factor, whole & on_gel)
 
 
 def _factor(pixels: NDArray[np.float64]) -> int:

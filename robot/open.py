@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from tacsim.rig import Rig
 from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts, RigFacts, SimArmFacts, SimSensorFacts
 
 if TYPE_CHECKING:
+    from calibration.normaliser import FrameNormaliser
     from tacsim.env import TacsimEnv
     from tacsim.guard import GelWatch
     from tacsim.optics.geometry import CanonicalGrid
@@ -252,10 +254,13 @@ def _open_replay(facts: RigFacts) -> Rig:
         sensors: dict[str, ReplaySensor] = {}
         normalisers: dict[str, Normaliser] = {}
         for name, sensor in recorded.items():
-            sensors[name] = ReplaySensor(sensor, name, clock)
-            stack.callback(sensors[name].close)
+            sensors[name] = source = ReplaySensor(sensor, name, clock)
+            stack.callback(source.close)
             with naming(f"sensors.{name}"):
-                normalisers[name] = _replay_normaliser(sensor, name, sensors[name].spec.image_shape, facts.canonical)
+                normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, facts.canonical)
+            if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
+                source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
+            normalisers[name] = normaliser
         arms: dict[str, Arm] = {}
         for name, arm in there.items():
             arms[name] = ReplayArm(arm, name, clock)
@@ -287,7 +292,7 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
 
 def _replay_normaliser(
     facts: ReplaySensorFacts, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
-) -> Normaliser:
+) -> FrameNormaliser:
     """By the corners of the rig file; without them by what an episode says of its own sensor."""
     from calibration.normaliser import for_recorded, for_simulated
 

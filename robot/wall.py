@@ -124,6 +124,9 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
             clock = WallClock(facts.period, bench.catch_up)
         else:
             clock = WallClock(facts.period)
+        for name, camera in cameras.items():  # what the normaliser finds in the picture is delivered too
+            found = normalisers[name]
+            camera.spec = replace(camera.spec, height=found.finds_height, flow=found.finds_flow)
         task = facts.task
         start = GuidedStart(
             arms={} if dry_run else arms,
@@ -162,10 +165,7 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
 
 def _sensor(name: str, facts: object, bench: MockBench) -> TactileSource:
     if isinstance(facts, CameraSensorFacts):
-        camera = Camera(facts, name)
-        # With a model of the light, the normaliser finds the surface in the picture.
-        camera.spec = replace(camera.spec, height=facts.model is not None or facts.calibration is not None)
-        return camera
+        return Camera(facts, name)
     assert isinstance(facts, SimSensorFacts)
     return TwinSensor(bench, name, facts)
 

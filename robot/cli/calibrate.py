@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from calibration.ballpress import Fit
     from calibration.bundle import Calibration
     from calibration.view import GelView
+    from tacsim.optics.geometry import Markers
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
 
@@ -77,8 +78,14 @@ def sensor(
             fit = calibrate_light(read.reference, read.presses, ball / pitch)
     except BadPresses as error:
         raise typer.BadParameter(str(error), param_hint="FRAMES") from None
+    found = _markers(fit, pitch) if markers else None
     _show(fit, pitch)
-    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], markers=markers, view=seen)
+    if found is not None:
+        notes.print(
+            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
+            f"{found.radius * 1e3:.2g} mm"
+        )
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, seen)
     with writing(make(folder)):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
@@ -94,14 +101,30 @@ def _load_view(path: Path) -> GelView:
     return load(GelView, path)
 
 
+def _markers(fit: Fit, pitch: float) -> Markers:
+    """The lattice of dots in the picture without contact."""
+    from calibration.lattice import NoLattice
+    from calibration.markers import find_markers
+    from tacsim.optics.geometry import Markers
+
+    try:
+        lattice, radius = find_markers(fit.reference)
+    except NoLattice as nothing:
+        raise typer.BadParameter(
+            f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
+        ) from None
+    rows, columns = lattice.present.shape
+    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
 def _bundle(
-    fit: Fit, serial: str, ball: float, pitch: float, names: list[str], *, markers: bool, view: GelView | None
+    fit: Fit, serial: str, ball: float, pitch: float, names: list[str], markers: Markers | None, view: GelView | None
 ) -> Calibration:
     from datetime import UTC, datetime
     from importlib import metadata
 
     from calibration.bundle import FORMAT, Calibration, Provenance, Residual
-    from tacsim.optics.geometry import Markers, SensorGeometry
+    from tacsim.optics.geometry import SensorGeometry
 
     rows, columns, _ = fit.reference.shape
     return Calibration(
@@ -114,7 +137,7 @@ def _bundle(
         skirt_length=fit.skirt.length * pitch,
         skirt_fraction=fit.skirt.fraction,
         view=view,
-        markers=Markers() if markers else None,
+        markers=markers,
         residuals=tuple(
             Residual(
                 frame=score.name,

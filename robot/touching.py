@@ -21,6 +21,7 @@ from calibration.adjustment import BadMeasurements
 from calibration.touch import Touch, touch_seen
 from robot.errors import DeviceError
 from robot.start import NoTouch
+from robot.wall import RigArm
 from tacsim import pose as se3
 from tacsim.hardware import CameraSensorFacts, UrArmFacts
 from tacsim.interface import ArmState, FloatArray, Pose, TactileObservation
@@ -159,6 +160,8 @@ class Mover(Protocol):
 def go(mover: Mover, name: str, target: Pose, timeout: float) -> None:
     """Drives an arm to a pose of its sensor and waits for rest. Raises Shortened, ActionError for what is out of reach,
     DeviceError after `timeout` [s] and for what stops an arm."""
+    if isinstance(mover, RigArm):
+        mover.unwatch()  # nothing is observed on the way
     deadline = time.monotonic() + timeout
     while True:
         sent = mover.command(target)

@@ -77,6 +77,10 @@ class RigArm:
         self._driven.target = sent
         return sent
 
+    def unwatch(self) -> None:
+        """For motions that are not decided by observations: they need not be fresh, until the next one is made."""
+        self._driven.arm.tell(None)
+
     def stop(self) -> None:
         self._driven.target = None
         self._driven.arm.stop()

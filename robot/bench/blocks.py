@@ -45,33 +45,44 @@ from tacsim.physics.plasticine import (
     node_sum,
     particles_to_grid,
 )
+from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.runtime import start, ti
 
+Steps = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 
 
 @ti.kernel
 def body_substeps(
+    team: ti.i32, steps: Steps,
     points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums,
-    facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32,
+    facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
 ):  # fmt: skip
-    """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it."""
-    ti.loop_config(serialize=True)
-    for _ in range(counts[0, STEPS]):
-        for part in range(PARTS):
-            clear_masses(0, part, masses, counts)
-            particles_to_grid(0, part, points, rates, strains, masses, facts, counts, partial)
-        plane = counts[0, GRID + 1] * counts[0, GRID + 2]
-        for i in range(counts[0, GRID]):
-            for node in range(i * plane, (i + 1) * plane):
-                q = node_sum(0, i, node, masses, counts)
-                velocity = vec4(0.0)
-                if q[3] > 0.0:
-                    velocity = vec4(keep_x * q[0] / q[3], keep_y * q[1] / q[3], keep_z * q[2] / q[3], 0.0)
-                velocities[node] = velocity
-        for part in range(PARTS):
-            grid_to_particles(0, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
+    """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
+    own substeps are (tacsim.physics.hybrid_kernels)."""
+    for task in range(team * CHUNK):
+        for _ in range(first_in_chunk(task)):
+            member = task // CHUNK
+            for it in range(steps.shape[1]):
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    clear_masses(0, part, masses, counts)
+                    particles_to_grid(0, part, points, rates, strains, masses, facts, counts, partial)
+                meet(sync, 0, team, 2 * it + 1)
+                plane, rows = counts[0, GRID + 1] * counts[0, GRID + 2], counts[0, GRID]
+                for share in range((rows - member + team - 1) // team):
+                    i = member + share * team
+                    for node in range(i * plane, (i + 1) * plane):
+                        q = node_sum(0, i, node, masses, counts)
+                        velocity = vec4(0.0)
+                        if q[3] > 0.0:
+                            velocity = vec4(keep_x * q[0] / q[3], keep_y * q[1] / q[3], keep_z * q[2] / q[3], 0.0)
+                        velocities[node] = velocity
+                meet(sync, 0, team, 2 * it + 2)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    grid_to_particles(0, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
 
 
 @ti.kernel
@@ -145,8 +156,9 @@ class BodyBlock(Block):
 
     def advance(self, substeps: int, keep: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
         """keep: 0 forbids motion along an axis, 1 allows it. Raises RuntimeError if a particle left the grid."""
-        self.counts[0, STEPS] = substeps
-        body_substeps(*self.state.arguments(), self.facts, self.counts, self.partial, *keep)
+        steps = np.zeros((1, substeps), np.int32)
+        arguments = self.state.arguments()
+        run_team(body_substeps, steps, arguments, self.facts, self.counts, self.partial, *keep)
         if self.partial[0, :, OFF_GRID].any():
             raise RuntimeError("particles left the grid of a body block: fit it anew, or with a wider margin")
 

@@ -73,6 +73,34 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
     ]  # fmt: skip
 
 
+def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measurement]:
+    """A free cube of clay whose ends are drawn apart at a rate at which all of it yields: what a substep of plasticine
+    costs by itself, without gels and contact. Error: how far the momentum has drifted."""
+    from robot.bench.blocks import BodyBlock
+    from tacsim.physics.plasticine import body_facts
+    from tacsim.shapes import particles
+
+    facts = body_facts(CLAY, spacing)
+    rest = particles(Box(size=(side, side, side)), spacing) * 1e3
+    rest -= rest.mean(axis=0)
+    dt, rate, substeps = COURANT * facts.cell, 2.0 * facts.limit / side * 1e-3, 60
+
+    def initial() -> BodyBlock:
+        body = BodyBlock(facts, rest, dt)
+        body.fit(4 * facts.cell)
+        body.state.v()[:, 2] = 0.01 + rate * rest[:, 2]
+        body.state.c()[:, 2, 2] = rate
+        return body
+
+    body = initial()
+    timing, _ = timed(lambda: body.advance(substeps), repeat)
+    momentum = body.state.v().mean(axis=0, dtype=np.float64)
+    drift = float(np.linalg.norm(momentum - [0.0, 0.0, 0.01])) / 0.01
+    yielded = float((body.state.flow() > 0.0).mean())
+    figures = {**step_cost(timing, substeps, len(rest), "particle"), "yielded": yielded}
+    return [Measurement(timing, drift, "-", "momentum is kept", "a cube drawn apart", substeps, figures)]
+
+
 def textbook_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
     """The same cube by textbook MLS-MPM: SVD, atomics, plates of grid nodes."""
     from robot.bench.textbook import yield_plateau as by_the_book  # compiles nothing before it is asked for
@@ -328,6 +356,13 @@ CASES = (
     *(
         Case("materials", name, "textbook", at, partial(textbook_plateau, side, fine), baseline=True)
         for name, at, side, fine in CUBES
+    ),
+    Case(
+        "materials",
+        "plasticine_alone",
+        "tacsim",
+        "dx 0.5 mm, 64000 particles",
+        partial(plasticine_alone, 10e-3, 0.25e-3),
     ),
     Case("materials", "gel_step", "tacsim", "h 0.5 mm", gel_step),
 )

@@ -55,7 +55,7 @@ def test_the_worst_row_counts() -> None:
 
 
 def test_figures_of_a_row_and_units() -> None:
-    step = row(case="plasticine_step", figures={"wall_per_particle_substep_ns": 76.0})
+    step = row(case="plasticine_alone", figures={"wall_per_particle_substep_ns": 76.0})
     assert target("plasticine step, 64,000 particles, wall").judge([step]) == (76.0, "missed")
     control = row(case="control_step", seconds=0.02)
     assert target("control step, draft, two images").judge([control]) == (pytest.approx(20.0), "met")

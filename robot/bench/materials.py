@@ -74,8 +74,7 @@ def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]
 
 
 def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measurement]:
-    """A free cube of clay whose ends are drawn apart at a rate at which all of it yields: what a substep of plasticine
-    costs by itself, without gels and contact. Error: how far the momentum has drifted."""
+    """A free cube of clay, drawn apart until it yields: the plasticine's own substep, without gels and contact."""
     from robot.bench.blocks import BodyBlock
     from tacsim.physics.plasticine import body_facts
     from tacsim.shapes import particles

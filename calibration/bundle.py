@@ -10,14 +10,16 @@ import hashlib
 import json
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from calibration.errors import Unusable
 from calibration.inverse import InverseModel
+from calibration.view import GelView
 from tacsim.config import ConfigError, load
 from tacsim.hardware import Placement
 from tacsim.optics.geometry import Lighting, Markers, SensorGeometry, SensorModel
@@ -26,7 +28,8 @@ from tacsim.quantity import Facts, Length, Time
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)  # 1: without view
 FILE, REFERENCE = "calibration.yaml", "reference.png"
 LARGEST_FILE = 1 << 20  # [bytes] of the YAML
 
@@ -34,7 +37,7 @@ Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class BadBundle(ValueError):
+class BadBundle(Unusable):
     """A calibration that cannot be used: which, why, and what to do."""
 
 
@@ -63,14 +66,15 @@ class Provenance(Facts):
 class Calibration(Facts):
     """Everything that is known of one sensor."""
 
-    format: Literal[1]
+    format: Literal[1, 2]
     serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-    geometry: SensorGeometry
+    geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
     forward: PhotometricModel  # slope -> colour
     inverse: InverseModel  # colour -> slope
     skirt_length: Positive  # of the dent that a ball presses [m]
     skirt_fraction: Annotated[float, Field(gt=0)]
+    view: GelView | None = None  # where the gel lies in the native picture; None: the native picture is metric
     markers: Markers | None = None  # None: no dots are printed on the gel
     tool_from_sensor: Placement | None = None  # None: not measured
     latency: Annotated[Time, Field(ge=0)] | None = None  # from exposure to arrival; None: not measured [s]
@@ -79,9 +83,24 @@ class Calibration(Facts):
     reference: Digest  # SHA-256 of the picture's bytes
     checksum: Digest = "0" * 64  # SHA-256 of all the rest
 
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows, columns of the pictures that the sensor's camera delivers."""
+        return (self.geometry.height, self.geometry.width) if self.view is None else self.view.image_shape
+
+    @model_validator(mode="after")
+    def _view_gives_the_geometry(self) -> Self:
+        if self.view is not None:
+            if self.format == 1:
+                raise ValueError("format 1 has no view")
+            if self.view.geometry != self.geometry:
+                raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
+        return self
+
     def digest(self) -> str:
         """What `checksum` must be."""
-        content = self.model_dump(mode="json", exclude={"checksum"})
+        later = {"view"} if self.format == 1 else set()  # what that format had not
+        content = self.model_dump(mode="json", exclude={"checksum"} | later)
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -117,8 +136,9 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
     version = re.search(r"^format:\s*(\S+)", text, re.MULTILINE)
     if version is None:
         raise BadBundle(f"{file} is no calibration: it names no format")
-    if version[1] != str(FORMAT):
-        raise BadBundle(f"{file} has format {version[1]}, this version of tacsim reads {FORMAT}; {again}")
+    if version[1] not in map(str, READABLE):
+        known = " and ".join(map(str, READABLE))
+        raise BadBundle(f"{file} has format {version[1]}, this version of tacsim reads {known}; {again}")
     try:
         calibration = load(Calibration, file)
     except ConfigError as error:
@@ -140,7 +160,10 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
 
 
 def sensor_model(path: Path) -> SensorModel:
-    """The simulated twin of a calibrated sensor: its geometry, its untouched picture, its light. Raises BadBundle."""
+    """The simulated twin of a calibrated sensor, as its rectified picture shows it: geometry, untouched picture, light.
+
+    Raises BadBundle.
+    """
     calibration, _ = read_bundle(path)
     folder = path if path.is_dir() else path.parent
     return SensorModel(

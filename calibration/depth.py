@@ -26,7 +26,7 @@ class Integrator:
         inverse = pitch / eigenvalue
         inverse[0, 0] = 0.0  # slopes know no constant
         self._inverse = inverse.astype(np.float32)
-        self._rim = _border(shape, max(1, round(RIM / pitch)))
+        self._rim = np.flatnonzero(_border(shape, max(1, round(RIM / pitch))))
 
     def __call__(self, gradient: Float32) -> Float32:
         """(rows, columns) height [m] of slopes (rows, columns, 2) along x, y [-].
@@ -36,7 +36,7 @@ class Integrator:
         """
         from scipy.fft import dctn, idctn
 
-        by_x, by_y = gradient[..., 0], gradient[..., 1]
+        by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
         across = 0.5 * (by_x[:, 1:] + by_x[:, :-1])  # slopes half-way between two pixels
         down = 0.5 * (by_y[1:] + by_y[:-1])
         divergence = np.zeros(self._inverse.shape, dtype=np.float32)
@@ -47,7 +47,7 @@ class Integrator:
         spectrum = dctn(divergence, norm="ortho", overwrite_x=True)
         spectrum *= self._inverse
         height: Float32 = idctn(spectrum, norm="ortho", overwrite_x=True)
-        height -= np.median(height[self._rim])
+        height -= np.median(height.ravel()[self._rim])
         return height
 
 

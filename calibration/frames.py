@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.ballpress import BadPresses
+from calibration.view import GelView
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image
 
@@ -35,6 +36,25 @@ class Frames:
     reference: Image  # (H, W, 3) RGB
     presses: tuple[tuple[str, Image], ...]  # names and pictures
     estimated: bool  # True: no frame without contact was given, the median of the presses stands for it
+
+
+def rectified(frames: Frames, view: GelView) -> Frames:
+    """The same frames as metric pictures of the gel. Raises BadPresses for pictures of another size than the view's."""
+    from calibration.lens import to_metric
+
+    sizes = {image.shape[:2] for image in (frames.reference, *(image for _, image in frames.presses))}
+    if sizes != {view.image_shape}:
+        odd = ", ".join(f"{columns} x {rows}" for rows, columns in sorted(sizes))
+        raise BadPresses(
+            f"the frames are {odd} px, the view was calibrated on {view.lens.width} x {view.lens.height} px; use one "
+            "setting of the camera"
+        )
+    rectify = to_metric(view)
+
+    def metric(image: Image) -> Image:
+        return np.rint(rectify(image)).astype(np.uint8)
+
+    return Frames(metric(frames.reference), tuple((n, metric(i)) for n, i in frames.presses), frames.estimated)
 
 
 def read_presses(folder: Path, reference: Path | None = None) -> Frames:

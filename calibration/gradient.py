@@ -51,22 +51,27 @@ class ColourTable:
     def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
         shape = change.shape[:2]
         colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
-        index = np.zeros(shape, dtype=np.int32)
+        index = np.zeros(shape, dtype=np.float32)  # whole numbers up to CELLS^3 are exact
         beyond = np.zeros(shape, dtype=np.bool_)
         for colour, low, scale in zip(colours, self.low, self.scale, strict=True):
             at = (colour - low) * scale
-            beyond |= (at < 0) | (at >= CELLS)
-            index = index * CELLS + np.clip(at, 0, CELLS - 1).astype(np.int32)
-        flat = index.ravel()
-        # plane by plane: NumPy is three times slower along rows of 8
+            beyond |= at < 0
+            beyond |= at >= CELLS
+            np.clip(at, 0, CELLS - 1, out=at)
+            index *= CELLS
+            index += np.floor(at, out=at)
+        flat = index.ravel().astype(np.intp)
         maps = np.ascontiguousarray(self.maps.take(flat, axis=0).T).reshape(8, *shape)
-        slope = np.empty((*shape, 2), dtype=np.float32)
-        for axis in range(2):
-            value = maps[axis] + maps[2 + axis] * colours[0] + maps[4 + axis] * colours[1] + maps[6 + axis] * colours[2]
-            beyond |= np.abs(value) > STEEPEST
-            np.clip(value, -STEEPEST, STEEPEST, out=slope[..., axis])
+        slope = maps[:2]
+        for channel, colour in enumerate(colours):
+            part = maps[2 + 2 * channel : 4 + 2 * channel]
+            part *= colour
+            slope += part
+        steep = np.abs(slope)
+        beyond |= np.maximum(steep[0], steep[1]) > STEEPEST
+        np.clip(slope, -STEEPEST, STEEPEST, out=slope)
         beyond |= self.foreign.take(flat).reshape(shape)
-        return slope, beyond
+        return np.moveaxis(slope, 0, -1), beyond
 
 
 def from_model(model: SensorModel) -> ColourTable:

@@ -66,7 +66,7 @@ class PolynomialSlopes:
             normal[:, beyond] *= largest / np.sqrt(square[beyond])
             square[beyond] = largest * largest
         slope = normal / np.sqrt(1.0 - square)
-        return np.ascontiguousarray(slope.transpose(1, 2, 0)), np.asarray(beyond)
+        return np.moveaxis(slope, 0, -1), np.asarray(beyond)
 
 
 def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:

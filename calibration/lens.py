@@ -1,33 +1,37 @@
 """Native image -> the canonical grid: one precomputed map from metric points on the gel to pixels of the camera.
 
-A map is made once for a sensor, from the four corners of the gel in a real image, or from the geometry of a
-simulated one; applying it is one look-up. Where the camera sees finer than the canonical grid, each canonical pixel is
-the mean over the area that it covers. Lens distortion is left out: four corners describe a flat gel and a pinhole.
+A map is made once for a sensor, from the four corners of the gel in a real image, from the view of a board that lay on
+it (distortion of the lens and perspective in one), or from the geometry of a simulated one; applying it is one look-up.
+Where the camera sees finer than the canonical grid, each canonical pixel is the mean over the area that it covers.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.errors import Unusable
+from calibration.view import GelView
 from tacsim.optics.geometry import SensorGeometry
-from tacsim.optics.grid import PixelGrid
+from tacsim.optics.grid import PixelGrid, image_grid
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
 LARGEST_FACTOR = 16  # look-ups along each side of one canonical pixel
 
 
-class BadCorners(ValueError):
+class BadCorners(Unusable):
     """The four corners are no picture of a rectangle."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Rectification:
-    """The map of one sensor. Make it by :func:`from_corners` or :func:`from_geometry`."""
+    """The map of one sensor. Make it by :func:`from_corners`, :func:`from_view` or :func:`from_geometry`."""
 
     image_shape: tuple[int, int]  # rows, columns of the native image
     pixels: NDArray[np.float32]  # (factor * H, factor * W, 2) native u, v of each look-up [px]
@@ -46,15 +50,36 @@ class Rectification:
                 f"image is {image.shape} {image.dtype}, this sensor delivers {(*self.image_shape, 3)} uint8; "
                 "is it another camera, or another setting of it?"
             )
-        # float before the mean, so that it is not rounded twice
-        nothing = np.empty(0, dtype=np.float32)
-        fine = cv2.remap(image, self.pixels, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        seen = np.asarray(fine, dtype=np.float32)
+        found = np.zeros((*self.valid.shape, 3), dtype=np.float32)
+        if not self.valid.any():
+            return found
+        box, look_ups, fraction, hidden = self._box
+        between = cv2.INTER_LINEAR if fraction.size else cv2.INTER_NEAREST
+        fine = cv2.remap(image, look_ups, fraction, between, borderMode=cv2.BORDER_REPLICATE)
+        seen = np.asarray(fine, dtype=np.float32)  # before the mean, so that it is not rounded twice
         if self.factor > 1:
-            height, width = self.valid.shape
-            seen = np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
-        seen[~self.valid] = 0.0
-        return seen
+            size = (seen.shape[1] // self.factor, seen.shape[0] // self.factor)
+            seen = np.asarray(cv2.resize(seen, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        if hidden is not None:
+            seen[hidden] = 0.0
+        found[box] = seen
+        return found
+
+    @cached_property
+    def _box(
+        self,
+    ) -> tuple[tuple[slice, slice], NDArray[np.int16], NDArray[np.uint16], NDArray[np.bool_] | None]:
+        """Rows and columns with valid pixels, their look-ups in OpenCV's fixed point (to 1/32 px, as it rounds them
+        anyway; an empty fraction where all are whole pixels), and which of them are not valid (None: all are)."""
+        import cv2
+
+        rows, columns = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
+        box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        finer = tuple(slice(side.start * self.factor, side.stop * self.factor) for side in box)
+        look_ups, fraction = cv2.convertMaps(self.pixels[finer], np.empty(0, dtype=np.float32), cv2.CV_16SC2)
+        hidden = ~self.valid[box]
+        parted = np.asarray(fraction if fraction.any() else fraction[:0], dtype=np.uint16)
+        return box, np.asarray(look_ups, dtype=np.int16), parted, hidden if hidden.any() else None
 
 
 def from_corners(
@@ -75,7 +100,7 @@ def from_corners(
     rows, columns = image_shape
     if corners is None:
         corners = ((-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5))
-    _check_corners(corners, image_shape)
+    check_corners(corners, image_shape)
     x, y = size[0] / 2, size[1] / 2
     on_gel = np.array([(-x, -y), (x, -y), (x, y), (-x, y)]) * 1e3  # [mm]: numbers near 1 keep the solver accurate
     image_from_gel = cv2.getPerspectiveTransform(on_gel.astype(np.float32), np.array(corners, dtype=np.float32))
@@ -85,8 +110,25 @@ def from_corners(
 
     factor = _factor(project(grid.points()))
     # The perspective of points far beyond the gel may pass through infinity: look there at the gel's rim instead.
-    points = np.clip(grid.refined(factor).points(), (-x, -y), (x, y))
+    points = _inside(grid.refined(factor).points(), size)
     return _rectification(project(points), factor, grid.within(size), image_shape)
+
+
+def from_view(view: GelView, grid: PixelGrid) -> Rectification:
+    """The map of a real camera whose view of the gel's plane was calibrated."""
+    factor = _factor(view.project(_inside(grid.points(), view.size)))
+    points = _inside(grid.refined(factor).points(), view.size)  # beyond the gel nothing is known of the lens
+    return _rectification(view.project(points), factor, grid.within(view.size), view.image_shape)
+
+
+def to_metric(view: GelView) -> Rectification:
+    """The map of a real camera to its metric picture (see `GelView.geometry`), for fits over all of the gel."""
+    return from_view(view, image_grid(view.geometry))
+
+
+def _inside(points: NDArray[np.float64], size: tuple[float, float]) -> NDArray[np.float64]:
+    x, y = size[0] / 2, size[1] / 2
+    return np.clip(points, (-x, -y), (x, y))
 
 
 def from_geometry(geometry: SensorGeometry, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
@@ -126,7 +168,8 @@ def _limited(factor: int) -> int:
     return max(factor, 1)
 
 
-def _check_corners(corners: Corners, image_shape: tuple[int, int]) -> None:
+def check_corners(corners: Sequence[tuple[float, float]], image_shape: tuple[int, int]) -> None:
+    """Raises BadCorners."""
     points = np.array(corners, dtype=np.float64)
     if points.shape != (4, 2) or not np.isfinite(points).all():
         raise BadCorners(f"corners must be 4 finite pixels (u, v), got {corners!r}")

@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import Calibration, read_bundle
+from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.gradient import from_model
 from calibration.inverse import PolynomialSlopes
-from calibration.lens import Rectification, from_corners, from_geometry
+from calibration.lens import Rectification, from_corners, from_geometry, from_view
+from calibration.markers import MarkerFlow, marker_grid, require_no_markers
 from calibration.reference import Reference, make_reference
 from calibration.surface import SurfaceFinder, seen_box, view, window
+from calibration.view import GelView
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
-from tacsim.optics.geometry import CanonicalGrid, SensorModel
-from tacsim.optics.grid import canonical_image
+from tacsim.optics.geometry import CanonicalGrid, Markers, SensorGeometry, SensorModel
+from tacsim.optics.grid import canonical_cells, canonical_image
 from tacsim.rigfile import ReplaySensorFacts
 from tacsim.touch import CONTACT_DIFFERENCE, CONTACT_HEIGHT
 
@@ -29,17 +31,23 @@ class NoReference(RuntimeError):
 class FrameNormaliser:
     """Rectifies a frame, compares it with the reference, and finds where there is contact.
 
-    Height, gradient and flow are those of the source where it knows them (simulation). Otherwise height and gradient
-    are found in the picture, if there is a `find` for that, and None if there is not; flow is None.
+    Height, gradient and flow are those of the source where it knows them (simulation). Otherwise they are found in the
+    picture: height and gradient if there is a `find` for that, flow if there are `markers`; what is not found is None.
     """
 
-    def __init__(self, rectify: Rectification, grid: CanonicalGrid, find: SurfaceFinder | None = None) -> None:
+    def __init__(
+        self,
+        rectify: Rectification,
+        grid: CanonicalGrid,
+        find: SurfaceFinder | None = None,
+        markers: MarkerFlow | None = None,
+    ) -> None:
         """`rectify` gives the canonical image, or for a `find` its wider view."""
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
         if min(spare) < 0 or any(extra % (2 * grid.image_scale) for extra in spare) or (find is None and any(spare)):
             raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
-        self._rectify, self._grid, self._find = rectify, grid, find
+        self._rectify, self._grid, self._find, self._markers = rectify, grid, find, markers
         self._on_image: NDArray[np.bool_] = window(rectify.valid, grid)
         self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
         self._valid.flags.writeable = False
@@ -62,18 +70,40 @@ class FrameNormaliser:
         gradient are only the nearest that the calibration knows. 0 where nothing had to be found."""
         return self._beyond
 
+    @property
+    def finds_flow(self) -> bool:
+        """True when flow is found in pictures of sources that don't know their surface."""
+        return self._markers is not None
+
+    @property
+    def markers_seen(self) -> NDArray[np.bool_] | None:
+        """(rows, columns) markers that were seen in the last picture in which flow was sought; that of the others is
+        the mean of their neighbours'. None for a sensor whose flow is not found in pictures."""
+        return None if self._markers is None else self._markers.seen
+
+    @property
+    def kept(self) -> float:
+        """Share of the reference's markers seen in that picture. 1 where nothing had to be found."""
+        return 1.0 if self._markers is None else self._markers.kept
+
     def take_reference(self, frame: TactileFrame) -> None:
-        """Makes `frame`, taken without contact, the reference I0. Raises UnusableReference (the old one then stays), or
-        ValueError for a frame of another shape."""
-        self._reference = make_reference(self._rectify(frame.image), self._rectify.valid, self._measured())
+        """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
+        UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
+        reference = make_reference(self._rectify(frame.image), self._rectify.valid, self._measured())
+        if self._markers is not None:
+            self._markers.take_reference(frame.image, frame.index)
+        elif self._find is not None:
+            require_no_markers(frame.image)
+        self._reference = reference
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
-        """The observation of `frame` at time `now` [s]. Raises NoReference; ValueError for a frame of another shape."""
+        """The observation of `frame` at time `now` [s]. Raises NoReference; MarkersLost when too few markers
+        are seen; ValueError for a frame of another shape."""
         if self._reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
         seen = self._reference.difference(self._rectify(frame.image))
         change: NDArray[np.float32] = window(seen, self._grid)
-        height, gradient, flow = self._surface(frame.surface, seen)
+        height, gradient, flow = self._surface(frame, seen)
         return TactileObservation(
             image=_byte_image(change),
             gradient=gradient,
@@ -93,19 +123,23 @@ class FrameNormaliser:
         return inside
 
     def _surface(
-        self, known: SurfaceMap | None, change: NDArray[np.float32]
+        self, frame: TactileFrame, change: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, NDArray[np.float32] | None]:
         """Height, gradient and flow, from the source or from the picture."""
         self._beyond = 0.0
-        if known is not None:
-            self._check(known)
-            return known.height, known.gradient, known.flow
-        if self._find is None:
-            return None, None, None
-        assert self._reference is not None
-        found = self._find(change, self._reference.relative)
-        self._beyond = found.beyond
-        return found.height, found.gradient, None
+        if frame.surface is not None:
+            self._check(frame.surface)
+            return frame.surface.height, frame.surface.gradient, frame.surface.flow
+        height = gradient = flow = None
+        if self._find is not None:
+            assert self._reference is not None
+            found = self._find(change, self._reference.relative)
+            self._beyond = found.beyond
+            height, gradient = found.height, found.gradient
+        if self._markers is not None:
+            deep = None if height is None else (height, canonical_cells(self._grid))
+            flow = self._markers(frame.image, frame.index, deep)
+        return height, gradient, flow
 
     def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference. It misses the
@@ -132,22 +166,28 @@ def for_simulated(model: SensorModel, gel_size: tuple[float, float], grid: Canon
 
 def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
-    gradient are found by the inverse of the model's own light. Raises ValueError for a light without inverse."""
+    gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
+    without inverse, or markers too small for the image."""
     rectify = from_geometry(model.geometry, gel_size, view(grid, gel_size))
     find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None)
-    return FrameNormaliser(rectify, grid, find)
+    return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size))
 
 
 def for_calibrated(calibration: Calibration, grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle."""
     geometry = calibration.geometry
     wide = view(grid, calibration.gel_size)
-    rectify = from_geometry(geometry, calibration.gel_size, wide)
+    # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
+    if calibration.view is None:
+        rectify = from_geometry(geometry, calibration.gel_size, wide)
+    else:
+        rectify = from_view(calibration.view, wide)
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
     x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
     slopes = PolynomialSlopes(calibration.inverse, x, y)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=calibration.markers is not None, drifts=True)
-    return FrameNormaliser(rectify, grid, find)
+    flow = _marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view)
+    return FrameNormaliser(rectify, grid, find, flow)
 
 
 def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
@@ -157,7 +197,7 @@ def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: C
     Raises calibration.lens.BadCorners, calibration.bundle.BadBundle.
     """
     if facts.calibration is not None:
-        return for_calibrated(read_bundle(Path(facts.calibration))[0], grid)
+        return for_calibrated(_bundle_for(facts.calibration, image_shape), grid)
     return FrameNormaliser(from_corners(facts.corners, facts.size, image_shape, canonical_image(grid)), grid)
 
 
@@ -168,17 +208,42 @@ def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: Ca
     Raises calibration.bundle.BadBundle, ValueError for a model without inverse, calibration.lens.BadCorners.
     """
     if facts.calibration is not None:
-        return for_calibrated(read_bundle(Path(facts.calibration))[0], grid)
+        return for_calibrated(_bundle_for(facts.calibration, (facts.height, facts.width)), grid)
     if facts.model is not None:
         return for_pictures(facts.model, gel_size, grid)
     shape = (facts.height, facts.width)
     return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid)
 
 
+def _bundle_for(path: str, image_shape: tuple[int, int]) -> Calibration:
+    """The calibration at `path`, for pictures of `image_shape` (rows, columns). Raises BadBundle."""
+    calibration, _ = read_bundle(Path(path))
+    if calibration.image_shape != image_shape:
+        (rows, columns), (high, wide) = image_shape, calibration.image_shape
+        raise BadBundle(
+            f"{path} was calibrated on pictures of {wide} x {high} px, this sensor delivers {columns} x {rows}: set "
+            "width and height of the sensor to those of the calibration, or calibrate again at this setting"
+        )
+    return calibration
+
+
+def _marker_flow(
+    markers: Markers | None, geometry: SensorGeometry, gel_size: tuple[float, float], seen: GelView | None = None
+) -> MarkerFlow | None:
+    """`seen`: the gel through lens and perspective; None: the picture is metric by itself."""
+    if markers is None:
+        return None
+    fine = marker_grid(markers, gel_size)
+    rectify = from_geometry(geometry, gel_size, fine) if seen is None else from_view(seen, fine)
+    return MarkerFlow(markers, rectify, fine, geometry.camera_distance)
+
+
 def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:
     """(H, W, 3) clip(128 + 128 change), rounded; no change is exactly 128."""
-    image: NDArray[np.uint8] = np.rint(np.clip(128.0 + 128.0 * change, 0.0, 255.0)).astype(np.uint8)
-    return image
+    import cv2
+
+    # cv2 takes the absolute value before it saturates: what is below -1 would be folded up
+    return np.asarray(cv2.convertScaleAbs(np.maximum(change, np.float32(-1.0)), alpha=128.0, beta=128.0))
 
 
 def _cells(pixels: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:

@@ -26,6 +26,7 @@ class Reference:
     mean: Float32  # (3,) over the gel
     relative: Float32  # (H, W, 3) I0 / mean(I0) [-]
     valid: NDArray[np.bool_]  # (H, W)
+    scale: Float32  # (H, W, 3) 1 / mean where valid, else 0: one product instead of a division and a mask
 
     def difference(self, image: Float32) -> Float32:
         """(H, W, 3) relative change (I - I0) / mean(I0) of a rectified image [-]; 0 where not valid.
@@ -34,8 +35,8 @@ class Reference:
         """
         if image.shape != self.image.shape:
             raise ValueError(f"image is {image.shape}, the reference {self.image.shape}; take a fresh reference")
-        change = (image - self.image) / self.mean
-        change[~self.valid] = 0.0
+        change = image - self.image
+        change *= self.scale
         return change
 
 
@@ -66,7 +67,8 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
             "or dim the lights"
         )
     mean = mean.astype(np.float32)
-    return Reference(image.astype(np.float32), mean, image / mean, valid)
+    scale = np.where(valid[..., None], 1.0 / mean, 0.0).astype(np.float32)
+    return Reference(image.astype(np.float32), mean, image / mean, valid, scale)
 
 
 def _levels(colour: Float32) -> str:

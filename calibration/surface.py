@@ -58,42 +58,60 @@ class SurfaceFinder:
         self._drift = _Drift(self._unseen.shape) if drifts else None
         self._integrate = Integrator(self._unseen.shape, pitch)
         self._shape = valid.shape
+        self._any_unseen = bool(self._unseen.any())
+        self._known: _Known | None = None
 
     def __call__(self, change: Float32, reference: Float32) -> FoundSurface:
-        """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3)."""
-        change, reference = change[self._box], reference[self._box]
-        hidden = self._unseen | _ink(reference) if self._dots else self._unseen
-        clear = reference[~hidden].mean(axis=0)  # the light that is known is that of all the gel, without its dots
-        change, reference = change / clear, reference / clear
+        """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3), known again by
+        its identity."""
+        if self._known is None or self._known.picture is not reference:
+            self._known = self._prepared(reference)
+        known, hidden = self._known, self._known.hidden
+        planes = np.empty((3, *self._unseen.shape), dtype=np.float32)  # work on planes is several times as fast
+        for channel in range(3):
+            np.multiply(change[(*self._box, channel)], known.gain[channel], out=planes[channel])
         if self._dots:
-            hidden = hidden | _ink(reference + change)
+            hidden = hidden | _ink(known.planes + planes)
         if self._drift is not None:
-            change -= self._drift(change, hidden)
-        gradient, beyond = self._slopes(change)
+            self._drift(planes, hidden)
+        gradient, beyond = self._slopes(np.moveaxis(planes, 0, -1))
+        by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
         if self._dots:
-            gradient = _bridged(gradient, hidden)
-        gradient[self._unseen] = 0.0  # what is not seen is taken as flat
-        beyond &= ~hidden
-        height = self._integrate(gradient)
+            _bridge((by_x, by_y), hidden)
+        if self._any_unseen:
+            by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
+        height = self._integrate(np.stack([by_x, by_y], axis=-1))
         return FoundSurface(
-            height=self._cells(height[..., None])[..., 0],
-            gradient=self._cells(gradient),
-            beyond=float(beyond.mean()),
+            height=self._cells(height),
+            gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
+            beyond=float(np.count_nonzero(beyond & ~hidden) / beyond.size),
         )
 
-    def _cells(self, pixels: Float32) -> Float32:
-        """(h, w, n) means over the cells of the canonical grid, of pixels (., ., n) of the seen box; 0 beyond it."""
-        view = np.zeros((*self._shape, pixels.shape[2]), dtype=np.float32)
-        view[self._box] = pixels
-        scale = self._grid.image_scale
-        cut = window(view, self._grid)
-        parts = cut.reshape(self._grid.rows, scale, self._grid.columns, scale, -1)
-        total = parts[:, 0, :, 0].copy()
-        for row in range(scale):
-            for column in range(1 if row == 0 else 0, scale):
-                total += parts[:, row, :, column]
-        total /= scale * scale
-        return total
+    def _prepared(self, picture: Float32) -> _Known:
+        reference = picture[self._box]
+        hidden = self._unseen | _ink(np.moveaxis(reference, -1, 0)) if self._dots else self._unseen
+        # the light that is known is that of all the gel, without its dots
+        gain = (1.0 / reference[~hidden].mean(axis=0)).astype(np.float32)
+        return _Known(picture, np.ascontiguousarray(np.moveaxis(reference * gain, -1, 0)), gain, hidden)
+
+    def _cells(self, plane: Float32) -> Float32:
+        """(h, w) means over the cells of the canonical grid, of a plane of the seen box; 0 beyond it."""
+        import cv2
+
+        view = np.zeros(self._shape, dtype=np.float32)
+        view[self._box] = plane
+        size = (self._grid.columns, self._grid.rows)
+        return np.asarray(cv2.resize(window(view, self._grid), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What follows from the reference alone."""
+
+    picture: Float32  # itself
+    planes: Float32  # (3, H, W) of the seen box, relative to the mean of the gel without its dots
+    gain: Float32  # (3,) from relative to the mean with dots, to that without
+    hidden: Mask  # (H, W) not seen, or under a dot at rest
 
 
 def view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
@@ -121,13 +139,12 @@ def window(view: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
 
 
 def _ink(relative: Float32) -> Mask:
-    """(H, W) where an image relative to the mean of the gel shows a printed dot."""
+    """(H, W) where an image (3, H, W) relative to the mean of the gel shows a printed dot."""
     import cv2
 
-    red, green, blue = relative[..., 0], relative[..., 1], relative[..., 2]
-    dark = (np.maximum(np.maximum(red, green), blue) < INK).astype(np.uint8)
+    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < INK).view(np.uint8)
     side = 2 * DOT_RIM + 1
-    return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8)), dtype=np.bool_)
+    return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
 
 
 class _Drift:
@@ -135,36 +152,37 @@ class _Drift:
     time through those near the first; their median where too few are calm to tell more."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        u, v = np.meshgrid(*(np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape)))
-        self._terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-        self._few = np.ascontiguousarray(self._terms[::DRIFT_THIN, ::DRIFT_THIN].reshape(-1, 6))
+        self._u, self._v = (np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape))
+        u, v = np.meshgrid(self._u[::DRIFT_THIN], self._v[::DRIFT_THIN])
+        self._few = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6)
 
-    def __call__(self, change: Float32, hidden: Mask) -> Float32:
-        """(H, W, 3) drift of relative changes (H, W, 3), of which those `hidden` (H, W) say nothing."""
-        seen = change[::DRIFT_THIN, ::DRIFT_THIN].reshape(-1, 3)
+    def __call__(self, planes: Float32, hidden: Mask) -> None:
+        """Takes the drift off relative changes (3, H, W), of which those `hidden` (H, W) say nothing."""
+        seen = planes[:, ::DRIFT_THIN, ::DRIFT_THIN].reshape(3, -1)
         told = ~hidden[::DRIFT_THIN, ::DRIFT_THIN].ravel()
         weights = np.zeros((6, 3), dtype=np.float32)
         if told.any():
-            weights[0] = np.median(seen[told], axis=0)
+            weights[0] = np.median(seen[:, told], axis=1)
         for _ in range(2):
-            calm = told & (np.abs(seen - self._few @ weights).max(axis=1) < CALM)
+            rest = np.abs(seen - np.einsum("ni,ic->cn", self._few, weights))
+            calm = told & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < CALM)
             if calm.mean() < LEAST_CALM:
                 break
             terms = self._few[calm].astype(np.float64)
-            square = terms.T @ terms + 1e-6 * len(terms) * np.eye(6)
-            weights = np.linalg.solve(square, terms.T @ seen[calm]).astype(np.float32)
-        drift: Float32 = self._terms @ weights
-        return drift
+            # einsum: products so small would wake the threads of BLAS, which cost more than they give
+            square = np.einsum("ni,nj->ij", terms, terms) + 1e-6 * len(terms) * np.eye(6)
+            weights = np.linalg.solve(square, np.einsum("ni,cn->ic", terms, seen[:, calm])).astype(np.float32)
+        for plane, (one, u, v, uu, uv, vv) in zip(planes, weights.T, strict=True):
+            plane -= (one + v * self._v + vv * self._v * self._v)[:, None] + (u * self._u + uu * self._u * self._u)
+            plane -= (uv * self._v)[:, None] * self._u
 
 
-def _bridged(gradient: Float32, hidden: Mask) -> Float32:
-    """`gradient` (H, W, 2), with a weighted mean of what surrounds them in the hidden pixels."""
+def _bridge(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
+    """Gives planes of slopes (H, W) in the hidden pixels a weighted mean of what surrounds these."""
     import cv2
 
-    weighted = np.empty((*hidden.shape, 3), dtype=np.float32)
-    weighted[..., 2] = ~hidden
-    np.multiply(gradient, weighted[..., 2:], out=weighted[..., :2])
-    around = np.asarray(cv2.GaussianBlur(weighted, (0, 0), BRIDGE), dtype=np.float32)[hidden]
-    bridged = gradient.copy()
-    bridged[hidden] = around[:, :2] / np.maximum(around[:, 2:], np.float32(1e-6))
-    return bridged
+    told = (~hidden).astype(np.float32)
+    total = np.maximum(cv2.GaussianBlur(told, (0, 0), BRIDGE), np.float32(1e-6))
+    for slope in slopes:
+        around = cv2.GaussianBlur(slope * told, (0, 0), BRIDGE)
+        np.copyto(slope, around / total, where=hidden)

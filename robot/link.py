@@ -150,6 +150,7 @@ class Orders:
     host: str
     model: str
     refused_serial: str | None  # of a controller that is a mock, while the arm is to be a real one
+    realtime: bool  # ask for real-time priority
     parent: int  # process number of the driver
     segment: str
     world_from_base: list[list[float]]

@@ -5,16 +5,20 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calibration.errors import naming
 from tacsim.config import LoadedRig, load_rig
+from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import Arm, Normaliser, SensorSpec, TactileFrame
 from tacsim.rig import Rig
 from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts, RigFacts, SimArmFacts, SimSensorFacts
 
 if TYPE_CHECKING:
+    from calibration.normaliser import FrameNormaliser
     from tacsim.env import TacsimEnv
     from tacsim.guard import GelWatch
     from tacsim.optics.geometry import CanonicalGrid
@@ -93,6 +97,17 @@ def make_env(
         raise
 
 
+def check_sensors(facts: RigFacts) -> None:
+    """Raises what opening the rig would raise over what its cameras show: CannotOpen, calibration.errors.Unusable."""
+    _check_parts(facts)
+    cameras = {name: each for name, each in facts.sensors.items() if isinstance(each, CameraSensorFacts)}
+    if cameras:
+        from robot.wall import camera_normaliser
+
+        for name, camera in cameras.items():
+            camera_normaliser(name, camera, facts)
+
+
 def _check_parts(facts: RigFacts) -> None:
     """All parts of a rig go by one clock, and every recorded sensor names its recording."""
     parts: dict[str, tuple[str, set[str]]] = {
@@ -106,6 +121,13 @@ def _check_parts(facts: RigFacts) -> None:
                 f"give it driver '{' or '.join(sorted(allowed))}', or change the clock"
             )
     for name, sensor in facts.sensors.items():
+        if isinstance(sensor, CameraSensorFacts) and sensor.model is not None:
+            shown = sensor.model.geometry
+            if (shown.width, shown.height) != (sensor.width, sensor.height):
+                raise CannotOpen(
+                    f"rig '{facts.name}': sensors.{name} delivers {sensor.width} x {sensor.height} px (width, height), "
+                    f"its model '{sensor.model.name}' shows {shown.width} x {shown.height}; make them alike"
+                )
         if isinstance(sensor, ReplaySensorFacts) and sensor.source is None:
             key = f"sensors.{name}.source"
             raise CannotOpen(f"rig '{facts.name}': {key}: no recording given; name one with --set {key}=PATH")
@@ -232,9 +254,13 @@ def _open_replay(facts: RigFacts) -> Rig:
         sensors: dict[str, ReplaySensor] = {}
         normalisers: dict[str, Normaliser] = {}
         for name, sensor in recorded.items():
-            sensors[name] = ReplaySensor(sensor, name, clock)
-            stack.callback(sensors[name].close)
-            normalisers[name] = _replay_normaliser(sensor, name, sensors[name].spec.image_shape, facts.canonical)
+            sensors[name] = source = ReplaySensor(sensor, name, clock)
+            stack.callback(source.close)
+            with naming(f"sensors.{name}"):
+                normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, facts.canonical)
+            if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
+                source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
+            normalisers[name] = normaliser
         arms: dict[str, Arm] = {}
         for name, arm in there.items():
             arms[name] = ReplayArm(arm, name, clock)
@@ -266,7 +292,7 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
 
 def _replay_normaliser(
     facts: ReplaySensorFacts, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
-) -> Normaliser:
+) -> FrameNormaliser:
     """By the corners of the rig file; without them by what an episode says of its own sensor."""
     from calibration.normaliser import for_recorded, for_simulated
 

@@ -1,4 +1,4 @@
-"""Time-critical processes ask the system to be run first."""
+"""Time-critical processes ask the system to be run first: workers of real arms, and mocks where timing is measured."""
 
 from __future__ import annotations
 

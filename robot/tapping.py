@@ -14,6 +14,7 @@ import numpy as np
 
 from calibration.latency import Latency
 from robot.camera import Camera, ClockSource
+from robot.wall import RigArm
 from tacsim import pose as se3
 from tacsim.hardware import CameraSensorFacts, UrArmFacts
 from tacsim.interface import Pose
@@ -100,6 +101,8 @@ def record_taps(
     assert isinstance(arm_facts, UrArmFacts)
     rig.reset()
     mover, eye = rig.arms[arm], rig.sensors[sensor]
+    assert isinstance(mover, RigArm)
+    mover.unwatch()  # pictures are looked at one by one here, not observed
     begun = mover.state().pose
     axis = se3.rotation(begun).apply([0.0, 0.0, 1.0])
     above = se3.compose(begun, Pose(np.array([0.0, 0.0, -plan.lift])))

@@ -440,6 +440,7 @@ def _orders(facts: UrArmFacts, name: str, segment: str, keep_out: Mapping[str, f
         host=facts.host,
         model=facts.model,
         refused_serial=MOCK_SERIAL if facts.mock is None else None,
+        realtime=facts.mock is None or facts.mock.realtime,
         parent=os.getpid(),
         segment=segment,
         world_from_base=se3.to_matrix(facts.world_from_base.pose).tolist(),

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from calibration.errors import naming
 from robot.align import ArmHistory
 from robot.camera import Camera
 from robot.clock import Driven, LockStep, WallClock
@@ -76,6 +77,10 @@ class RigArm:
         self._driven.target = sent
         return sent
 
+    def unwatch(self) -> None:
+        """For motions that are not decided by observations: they need not be fresh, until the next one is made."""
+        self._driven.arm.tell(None)
+
     def stop(self) -> None:
         self._driven.target = None
         self._driven.arm.stop()
@@ -94,9 +99,12 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
     confirm: asks a person a question before anything approaches the body; not needed where all arms are mocks.
     dry_run: connects, sees, feels, times and records, but no motion is sent, neither by reset nor by step.
 
-    Raises DeviceError for what cannot be opened, ValueError for a rig that makes no sense.
+    Raises DeviceError for what cannot be opened, calibration.errors.Unusable for a calibration, ValueError for a rig
+    that makes no sense.
     """
     real = [name for name, arm in facts.arms.items() if isinstance(arm, UrArmFacts) and arm.mock is None]
+    # first, because a wrong calibration is known before anything is connected
+    normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
     with ExitStack() as stack:
         bench = stack.enter_context(MockBench(facts))
         sensors: dict[str, TactileSource] = {}
@@ -120,7 +128,9 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
             clock = WallClock(facts.period, bench.catch_up)
         else:
             clock = WallClock(facts.period)
-        normalisers = {name: _normaliser(name, sensor, facts) for name, sensor in facts.sensors.items()}
+        for name, camera in cameras.items():  # what the normaliser finds in the picture is delivered too
+            found = normalisers[name]
+            camera.spec = replace(camera.spec, height=found.finds_height, flow=found.finds_flow)
         task = facts.task
         start = GuidedStart(
             arms={} if dry_run else arms,
@@ -159,10 +169,7 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
 
 def _sensor(name: str, facts: object, bench: MockBench) -> TactileSource:
     if isinstance(facts, CameraSensorFacts):
-        camera = Camera(facts, name)
-        # With a model of the light, the normaliser finds the surface in the picture.
-        camera.spec = replace(camera.spec, height=facts.model is not None or facts.calibration is not None)
-        return camera
+        return Camera(facts, name)
     assert isinstance(facts, SimSensorFacts)
     return TwinSensor(bench, name, facts)
 
@@ -226,10 +233,17 @@ def _confirmed(facts: RigFacts, bench: MockBench, confirm: Confirm | None, *, re
 
 
 def _normaliser(name: str, facts: object, rig: RigFacts) -> FrameNormaliser:
-    from calibration.normaliser import for_camera, for_simulated
+    from calibration.normaliser import for_simulated
 
-    assert isinstance(facts, CameraSensorFacts | SimSensorFacts)
     if isinstance(facts, CameraSensorFacts):
-        return for_camera(facts, facts.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical)
-    assert rig.scene is not None
+        return camera_normaliser(name, facts, rig)
+    assert isinstance(facts, SimSensorFacts) and rig.scene is not None
     return for_simulated(facts.model, rig.scene.gel.size[:2], rig.canonical)
+
+
+def camera_normaliser(name: str, facts: CameraSensorFacts, rig: RigFacts) -> FrameNormaliser:
+    """The normaliser of one camera of a rig. Raises calibration.errors.Unusable, naming the sensor; ValueError."""
+    from calibration.normaliser import for_camera
+
+    with naming(f"sensors.{name}"):
+        return for_camera(facts, facts.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical)

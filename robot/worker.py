@@ -2,7 +2,7 @@
 
 The only importer of ur_rtde, and for that reason a process of its own: the library may crash, hang, or hold the
 interpreter's lock while it waits for a silent controller. It is never asked to reconnect; a worker that lost its link
-ends, and another one is started. It asks for real-time priority and runs on without (robot.realtime).
+ends, and another one is started. For a real arm it asks for real-time priority, and runs on without.
 
 The loop, each 2 ms and in this order: read the newest package as one snapshot, publish it; is the driver alive; is the
 package fresh; safety bits, force, gels; a fault is published before anything that may wait; the newest command; limits,
@@ -104,7 +104,7 @@ class Worker:
             ) from failure
         try:
             self.receive: Any = rtde_receive.RTDEReceiveInterface(orders.host, 500.0, VARIABLES)
-            self.control: Any = rtde_control.RTDEControlInterface(orders.host, 125.0)
+            self.control: Any = rtde_control.RTDEControlInterface(orders.host, 500.0)
         except Exception as failure:  # the library raises RuntimeError for all that can happen
             if "in use" in str(failure).lower():
                 raise DeviceBusyError(
@@ -319,7 +319,8 @@ def main() -> NoReturn:
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which stops the arm gently
     orders = Orders.from_json(sys.stdin.read())
-    ask_for_realtime(WORKER)  # before the library starts its threads
+    if orders.realtime:
+        ask_for_realtime(WORKER)  # before the library starts its threads
     try:
         worker = Worker(orders)
         worker.connect()

@@ -90,6 +90,9 @@ class MockArmFacts(Facts):
     """A mock controller on loopback is started for this arm and stopped with the rig."""
 
     joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
+    # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
+    # they share a busy machine with whatever else the mock rig needs.
+    realtime: bool = False
 
 
 class UrArmFacts(Facts):

@@ -91,6 +91,11 @@ class Rig:
         return self._arms
 
     @property
+    def normalisers(self) -> Mapping[str, Normaliser]:
+        """By sensor; see `sensors`."""
+        return self._normalisers
+
+    @property
     def frames(self) -> Mapping[str, TactileFrame]:
         """Native frames of the last observation, by sensor; empty before the first."""
         return self._frames

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
-from robot.bench import deep, incline, materials, press, real, reliability, scenes, squeeze
+from robot.bench import deep, films, incline, labels, materials, press, real, reliability, scenes, squeeze
+from robot.bench.labels import BadData
 from robot.bench.runner import Case
 from robot.bench.schema import Group
 
@@ -20,6 +21,11 @@ CASES: tuple[Case, ...] = (
     *reliability.CASES,
 )
 
+BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
+    ("real", real.CASE): real.contact_radius,
+    ("real", films.CASE): films.marker_film,
+}
+
 
 def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None) -> list[Case]:
     """The cases of `groups` in their order; other methods only with `baselines`, long ones only with `long`.
@@ -28,16 +34,27 @@ def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data
     that cannot be used.
     """
     wanted = set(groups)
-    every = CASES if data is None or "real" not in wanted else (*CASES, *real.cases(data))
+    every = CASES if data is None or "real" not in wanted else (*CASES, *_real_cases(data))
     return [
         case for case in every if case.group in wanted and (baselines or not case.baseline) and (long or not case.long)
     ]
 
 
+def _real_cases(data: Path) -> tuple[Case, ...]:
+    """Those of the presses and of the films below `data`. Raises BadData where there is neither, ConfigError."""
+    found = films.cases(data) if data.is_dir() else ()
+    try:
+        return (*real.cases(data), *found)
+    except BadData:
+        if not found or (data / labels.OWN).is_file():
+            raise
+        return found
+
+
 def description(group: Group, name: str, method: str) -> str:
     """What a case does, from the first line of its docstring; empty for a case that is no more."""
-    if (group, name) == ("real", real.CASE):
-        return _first_line(real.contact_radius)
+    if (group, name) in BY_DATA:
+        return _first_line(BY_DATA[group, name])
     for case in CASES:
         if (case.group, case.name, case.method) == (group, name, method):
             return _first_line(case.measure.func if isinstance(case.measure, partial) else case.measure)

@@ -39,7 +39,10 @@ READING = (
     "`robot/bench/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
     "the circle in the real frame with that in our picture, found by the same fit; rows ending in `pressure` compare "
-    "our contact itself with the radius in the labels."
+    "our contact itself with the radius in the labels. Films of dotted gels under a press are found alike, by "
+    "`films.yaml`: the share of their dots that is followed to the end, how still the dots lie at rest, and "
+    "the time of "
+    "a frame."
 )
 
 

@@ -68,7 +68,7 @@ def facts(at: str, limits: Mapping[str, object] | None = None, **changes: object
         limits=ArmLimits.model_validate({"workspace": box, "speed": SPEED, **(limits or {})}),
         link_timeout=1.0,
         action_timeout=30.0,
-        mock=MockArmFacts(),
+        mock=MockArmFacts(realtime=True),
     )
     return made.model_copy(update={"watchdog": 1.0, **changes})
 
@@ -99,7 +99,7 @@ def mock_arm(number: int = 1) -> Iterator[MockUR]:
     """A mock controller. Raises MissingDriver where the driver could not talk to it anyway."""
     if find_spec("rtde_control") is None:
         raise MissingDriver("ur_rtde has no wheel for this Python and machine; use Python 3.11 or 3.12 on x86-64")
-    with MockUR(host(number)) as mock:
+    with MockUR(host(number), realtime=True) as mock:
         yield mock
 
 

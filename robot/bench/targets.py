@@ -151,6 +151,11 @@ TARGETS: tuple[Target, ...] = (
     Target("contact radius, our image against real ones", "px", 2, None, from_depth(0.5, "error", ": image")),
     Target("contact radius, our contact against labels", "px", 2, None, from_depth(0.5, "error", ": pressure"),
            remark="0.05 mm of depth, the uncertainty of the set, are 1 px"),
+    Target("markers kept through a real press", "%", 95, 99, pick("kept_percent", "marker_film"), True,
+           remark="dots that leave the picture are lost to it"),
+    Target("... of those that stay in the picture", "%", None, 99, pick("kept_in_picture_percent", "marker_film"),
+           True),
+    Target("... jitter at rest", "px", 0.09, 0.05, pick("jitter_px", "marker_film")),
     Target("hard cases that end their process", "", 0, 0, lambda rows: None,
            elsewhere="tests/stability: test_no_case_ended_the_process"),
 )  # fmt: skip

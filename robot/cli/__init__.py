@@ -11,7 +11,9 @@ from robot.cli.calibrate import calibrate
 from robot.cli.compare import compare
 from robot.cli.debug import debug
 from robot.cli.errors import Guarded
+from robot.cli.frames import hand_eye, touch
 from robot.cli.latency import latency
+from robot.cli.lens import lens
 from robot.cli.look import doctor, schema
 from robot.cli.mock import mock
 from robot.cli.run import replay, run
@@ -30,7 +32,7 @@ app = typer.Typer(
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {
     app: (run, press, reproduce, replay, mock, bench, compare, debug, schema, doctor),
-    calibrate: (latency,),
+    calibrate: (latency, lens, touch, hand_eye),
 }
 for group, commands in COMMANDS.items():
     for command in commands:

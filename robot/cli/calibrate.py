@@ -12,6 +12,8 @@ from robot.cli.output import Out, busy, make, new_directory, notes, quantity, sa
 if TYPE_CHECKING:
     from calibration.ballpress import Fit
     from calibration.bundle import Calibration
+    from calibration.view import GelView
+    from tacsim.optics.geometry import Markers
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
 
@@ -30,8 +32,15 @@ def sensor(
         Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help='Of the ball, for example "2.92 mm".')
     ],
     pixel_pitch: Annotated[
-        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Distance of two pixels on the gel.")
-    ],
+        Any,
+        typer.Option(
+            parser=quantity("length"), metavar="LENGTH", help="Distance of two pixels on the gel; or give --view."
+        ),
+    ] = None,
+    view: Annotated[
+        Path | None,
+        typer.Option(help="view.yaml of `tacsim calibrate lens`: frames are rectified by it.", show_default=False),
+    ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(help="The picture without contact.", show_default="background.png or the like in FRAMES"),
@@ -47,25 +56,36 @@ def sensor(
     Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, and prints how
     well each press is predicted by the others.
     """
-    ball, pitch = ball_radius, pixel_pitch
+    if (pixel_pitch is None) == (view is None):
+        raise typer.BadParameter("give either --pixel-pitch or --view")
+    seen = None if view is None else _load_view(view)
+    ball, pitch = ball_radius, pixel_pitch if seen is None else seen.pixel_pitch
     if not (ball > 0 and pitch > 0):
         raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
     folder = new_directory(out, "calibration")
     with busy("loading"):
         from calibration.ballpress import BadPresses, calibrate_light
         from calibration.bundle import write_bundle
-        from calibration.frames import read_presses
+        from calibration.frames import read_presses, rectified
         from calibration.residual_picture import draw
     try:
         read = read_presses(frames, reference)
+        if seen is not None:
+            read = rectified(read, seen)
         if read.estimated:
             notes.print("no picture without contact: the median of all presses stands for it")
         with busy(f"calibrating from {len(read.presses)} presses"):
             fit = calibrate_light(read.reference, read.presses, ball / pitch)
     except BadPresses as error:
         raise typer.BadParameter(str(error), param_hint="FRAMES") from None
+    found = _markers(fit, pitch) if markers else None
     _show(fit, pitch)
-    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], markers=markers)
+    if found is not None:
+        notes.print(
+            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
+            f"{found.radius * 1e3:.2g} mm"
+        )
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, seen)
     with writing(make(folder)):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
@@ -74,24 +94,50 @@ def sensor(
     say_files(*written)
 
 
-def _bundle(fit: Fit, serial: str, ball: float, pitch: float, names: list[str], *, markers: bool) -> Calibration:
+def _load_view(path: Path) -> GelView:
+    from calibration.view import GelView
+    from tacsim.config import load
+
+    return load(GelView, path)
+
+
+def _markers(fit: Fit, pitch: float) -> Markers:
+    """The lattice of dots in the picture without contact."""
+    from calibration.lattice import NoLattice
+    from calibration.markers import find_markers
+    from tacsim.optics.geometry import Markers
+
+    try:
+        lattice, radius = find_markers(fit.reference)
+    except NoLattice as nothing:
+        raise typer.BadParameter(
+            f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
+        ) from None
+    rows, columns = lattice.present.shape
+    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
+def _bundle(
+    fit: Fit, serial: str, ball: float, pitch: float, names: list[str], markers: Markers | None, view: GelView | None
+) -> Calibration:
     from datetime import UTC, datetime
     from importlib import metadata
 
     from calibration.bundle import FORMAT, Calibration, Provenance, Residual
-    from tacsim.optics.geometry import Markers, SensorGeometry
+    from tacsim.optics.geometry import SensorGeometry
 
     rows, columns, _ = fit.reference.shape
     return Calibration(
         format=FORMAT,
         serial=serial,
-        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch),
+        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch) if view is None else view.geometry,
         gel_size=(columns * pitch, rows * pitch),
         forward=fit.forward,
         inverse=fit.inverse,
         skirt_length=fit.skirt.length * pitch,
         skirt_fraction=fit.skirt.fraction,
-        markers=Markers() if markers else None,
+        view=view,
+        markers=markers,
         residuals=tuple(
             Residual(
                 frame=score.name,

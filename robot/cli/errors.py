@@ -39,12 +39,13 @@ class Guarded(TyperGroup):
 
 def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
+    from calibration.errors import Unusable
     from robot.open import CannotOpen
     from robot.policy import PolicyNotFound
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
 
-    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig)):
+    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, Unusable)):
         return str(error), UNUSABLE
     if isinstance(error, ExceptionGroup):
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]

@@ -59,10 +59,13 @@ def doctor(
         checks = machine.examine()
     else:
         from robot.inspect_rig import examine_rig
+        from robot.open import check_sensors
         from tacsim.config import load_rig
 
         with busy("looking at the rig"):
-            checks = examine_rig(load_rig(rig, overrides=set_ or []).facts)
+            facts = load_rig(rig, overrides=set_ or []).facts
+            check_sensors(facts)
+            checks = examine_rig(facts)
     report = machine.as_json(checks)
     if as_json:
         typer.echo(json.dumps(report, indent=2))

@@ -35,7 +35,6 @@ def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> N
     ended: list[str] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.append("signal"))
-    ask_for_realtime(CONTROLLER)
     with selectors.DefaultSelector() as selector:
         controllers: list[Controller] = []
         doors: list[FaultDoor] = []
@@ -118,7 +117,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--serial", default=SERIAL)
     parser.add_argument("--allow-network", action="store_true")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input ends")
+    parser.add_argument("--realtime", action="store_true", help="ask for real-time priority, to measure timing")
     given = parser.parse_args(arguments)
+    if given.realtime:
+        ask_for_realtime(CONTROLLER)
     try:
         check_hosts(given.hosts, given.allow_network)
         major, minor, bugfix, build = map(int, given.version.split("."))

@@ -75,6 +75,7 @@ class MockBench:
                     [arm.host for arm in self._mocked.values()],
                     model=[arm.model for arm in self._mocked.values()],
                     joints=[self._joints(name, arm) for name, arm in self._mocked.items()],
+                    realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._mocked.values()),
                 )
                 self.doors = dict(zip(self._mocked, self._controllers.doors, strict=True))
             stack.pop_all()

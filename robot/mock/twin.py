@@ -285,6 +285,8 @@ def _open(request: Mapping[str, Any]) -> tuple[Bench, list[str]]:
     scene = Scene.model_validate_json(json.dumps(request["scene"]))
     models = {name: SensorModel.model_validate_json(json.dumps(model)) for name, model in request["models"].items()}
     kind: Callable[..., Bench] = HertzBench if request["contact"] == "hertz" else WorldBench
+    if kind is WorldBench:
+        os.nice(NICENESS)
     return kind(scene, models, CanonicalGrid.model_validate(request["grid"])), list(models)
 
 
@@ -314,7 +316,6 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C means the parent, which ends this process in order
     answers = io.BufferedWriter(io.FileIO(os.dup(1), "wb"))
     os.dup2(2, 1)  # whoever prints shall not break a message
-    os.nice(NICENESS)
     requests = sys.stdin.buffer
     bench: Bench | None = None
     seen: list[str] = []

@@ -48,6 +48,7 @@ class MockArms:
         serial: str = SERIAL,
         ready_timeout: float = 10.0,
         allow_network: bool = False,
+        realtime: bool = False,
     ) -> None:
         self.hosts = tuple(hosts)
         arguments = [*self.hosts, "--door-port", str(door_port), "--serial", serial]
@@ -57,6 +58,8 @@ class MockArms:
             arguments.append("--joints=" + ",".join(repr(float(angle)) for angle in posture))
         if allow_network:
             arguments.append("--allow-network")
+        if realtime:
+            arguments.append("--realtime")
         check_hosts(self.hosts, allow_network)
         root = str(Path(__file__).resolve().parent.parent.parent)
         self._process = subprocess.Popen(
@@ -136,6 +139,7 @@ class MockUR(MockArms):
         serial: str = SERIAL,
         ready_timeout: float = 10.0,
         allow_network: bool = False,
+        realtime: bool = False,
     ) -> None:
         super().__init__(
             [host],
@@ -146,6 +150,7 @@ class MockUR(MockArms):
             serial=serial,
             ready_timeout=ready_timeout,
             allow_network=allow_network,
+            realtime=realtime,
         )
         self.host = host
         self.door = self.doors[0]

@@ -59,7 +59,7 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     root = _adopt_scene(root)
     for override in of_rest:
         root = apply(root, RigFacts, override, reading)
-    root = _settle_scene(root, own_scene, reading)
+    root = _anchored(_settle_scene(root, own_scene, reading))
     facts = _validate(RigFacts, root, reading)
     if overrides and any(isinstance(arm, UrArmFacts) and arm.mock is None for arm in facts.arms.values()):
         _require_limits(facts, load_rig(rig, task=task).facts)
@@ -85,6 +85,22 @@ def _require_limits(facts: RigFacts, file: RigFacts) -> None:
     if problems:
         words = "would loosen the limits of a real arm; write it into the rig file"
         raise ConfigError([Problem(Place("--set"), "", f"{what}: {words}") for what in problems])
+
+
+def _anchored(root: Node) -> Node:
+    """The paths of calibrations start from the folder of the file that they are written in (of an option: from the
+    current folder), as references do."""
+    sensors = root.items.get("sensors")
+    if sensors is None or not sensors.items:
+        return root
+    anchored = {}
+    for name, sensor in sensors.items.items():
+        path = sensor.items.get("calibration")
+        if path is not None and isinstance(path.value, str) and path.value:
+            there = replace(path, value=str((path.folder / path.value).resolve()))
+            sensor = replace(sensor, value={**sensor.items, "calibration": there})
+        anchored[name] = sensor
+    return replace(root, value={**root.items, "sensors": replace(sensors, value=anchored)})
 
 
 def _has(root: Node, key: str) -> bool:

@@ -26,12 +26,17 @@ class SensorGeometry(Facts):
     """Where the pixels of the (rectified) image lie on the gel: ``x = (u - u0) * pixel_pitch``, likewise y.
 
     Pixel centres are integers; (u0, v0) defaults to the image centre, so the sensor axis is in the middle.
+
+    A `camera_distance` H makes the camera a pinhole on the sensor axis, so far behind the untouched gel: a dot on a
+    surface pressed in by h appears at ``x H / (H - h)``. Without one it looks along parallel rays, x stays x. Only
+    dots are drawn so; the colour of the gel is always that of parallel rays.
     """
 
     width: Annotated[int, Field(ge=16, le=4096)] = 320
     height: Annotated[int, Field(ge=16, le=4096)] = 240
     pixel_pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.0625e-3  # [m]
     centre: tuple[float, float] | None = None  # (u0, v0) [px]
+    camera_distance: Annotated[Length, Field(ge=2e-3, le=10.0)] | None = None  # [m]; None: parallel rays
 
     @property
     def principal(self) -> tuple[float, float]:

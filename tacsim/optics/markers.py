@@ -32,29 +32,59 @@ def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
 
 def marker_flow(surface: GelSurface, markers: Markers) -> NDArray[np.float32]:
     """(rows, columns, 2) in-plane displacement of the dots, sensor x, y [m]."""
-    rest = rest_positions(markers)
-    displacement, _ = displacement_and_jacobian(surface, rest.reshape(-1, 2))
-    return displacement[:, :2].reshape(rest.shape).astype(np.float32)
+    return _displacement(surface, markers)[..., :2].astype(np.float32)
 
 
 def marker_positions(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> NDArray[np.float64]:
-    """(rows, columns, 2) column u, row v of the dots in the image [px]."""
-    return (rest_positions(markers) + marker_flow(surface, markers)) / geometry.pixel_pitch + geometry.principal
+    """(rows, columns, 2) column u, row v of the dots in the image [px]. Raises what :func:`marker_discs` raises."""
+    return marker_discs(surface, markers, geometry)[0]
 
 
-def marker_coverage(positions: NDArray[np.float64], radius: float, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """(rows, columns) share of each pixel that dots cover, for centres (..., 2) u, v and a radius [px].
+def marker_discs(
+    surface: GelSurface, markers: Markers, geometry: SensorGeometry
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(rows, columns, 2) column u, row v of the dots in the image, and (rows, columns) their radii [px].
+
+    Raises ValueError when the gel is pressed up to the camera.
+    """
+    displacement = _displacement(surface, markers)
+    nearer = np.ones(displacement.shape[:2])
+    if geometry.camera_distance is not None:
+        room = geometry.camera_distance + displacement[..., 2]
+        if not (room > 0).all():
+            raise ValueError(
+                f"the gel is pressed in {-displacement[..., 2].min() * 1e3:.2f} mm, up to the camera at "
+                f"camera_distance {geometry.camera_distance * 1e3:g} mm; press less"
+            )
+        nearer = geometry.camera_distance / room
+    scale = nearer / geometry.pixel_pitch
+    centres = (rest_positions(markers) + displacement[..., :2]) * scale[..., None] + geometry.principal
+    return centres, markers.radius * scale
+
+
+def _displacement(surface: GelSurface, markers: Markers) -> NDArray[np.float64]:
+    """(rows, columns, 3) of the dots, sensor axes [m]."""
+    rest = rest_positions(markers)
+    displacement, _ = displacement_and_jacobian(surface, rest.reshape(-1, 2))
+    return displacement.reshape(*rest.shape[:2], 3)
+
+
+def marker_coverage(
+    positions: NDArray[np.float64], radius: float | NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """(rows, columns) share of each pixel that dots cover, for centres (..., 2) u, v and radii (...) or one [px].
 
     Anti-aliased at sub-pixel accuracy: the edge is a ramp one pixel wide. Dots outside the image are left out.
     """
     rows, columns = shape
     centres = positions.reshape(-1, 2)
-    reach = int(np.ceil(radius + 1.0))
+    radii = np.broadcast_to(radius, positions.shape[:-1]).reshape(-1, 1, 1)
+    reach = int(np.ceil(radii.max(initial=0.0) + 1.0))
     offset = np.arange(-reach, reach + 1)
     u = np.rint(centres[:, 0]).astype(np.intp)[:, None, None] + offset[None, None, :]
     v = np.rint(centres[:, 1]).astype(np.intp)[:, None, None] + offset[None, :, None]
     distance = np.hypot(u - centres[:, 0, None, None], v - centres[:, 1, None, None])
-    covered = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+    covered = np.clip(radii + 0.5 - distance, 0.0, 1.0)
     u, v = np.broadcast_to(u, covered.shape), np.broadcast_to(v, covered.shape)
     inside = (covered > 0) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
     coverage = np.zeros(shape, dtype=np.float32)
@@ -64,6 +94,5 @@ def marker_coverage(positions: NDArray[np.float64], radius: float, shape: tuple[
 
 def marker_transmission(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> NDArray[np.float32]:
     """(H, W) share of its light that each pixel keeps under the dots of the deformed surface."""
-    positions = marker_positions(surface, markers, geometry)
-    coverage = marker_coverage(positions, markers.radius / geometry.pixel_pitch, (geometry.height, geometry.width))
+    coverage = marker_coverage(*marker_discs(surface, markers, geometry), (geometry.height, geometry.width))
     return np.float32(1.0) - np.float32(1.0 - INK) * coverage

@@ -62,8 +62,8 @@ class ReplaySensor:
     """Recorded frames as a TactileSource.
 
     The source is an episode (frames of the sensor of this name, or of its only one), a folder of pictures of one size,
-    or a video. Nothing is known of its physical calibration: `spec` promises height and flow only if the recorded
-    frames carry them.
+    or a video. `spec` promises height and flow if the recorded frames carry them; who finds them in the pictures says
+    so there.
 
     Raises EpisodeError when the source is missing, empty, unreadable, too large, or has no such sensor.
     """
@@ -83,19 +83,15 @@ class ReplaySensor:
             )
         surface = self._first.surface
         flow = surface is not None and surface.flow is not None
-        self._spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=facts.arm)
-
-    @property
-    def spec(self) -> SensorSpec:
-        return self._spec
+        self.spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=facts.arm)
 
     def read(self, timeout: float) -> TactileFrame:
         """The frame of this tick, at once. Raises EndOfEpisode after the last, EpisodeError for an unreadable one."""
         frame, age = self._frames.at(self._clock.index)
-        if frame.image.shape[:2] != self._spec.image_shape:
+        if frame.image.shape[:2] != self.spec.image_shape:
             raise EpisodeError(
                 f"{self._path}: frame {self._clock.index} has {frame.image.shape[:2]} rows and columns, "
-                f"the first has {self._spec.image_shape}"
+                f"the first has {self.spec.image_shape}"
             )
         return replace(frame, time=self._clock.now() - age)
 

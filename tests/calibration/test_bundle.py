@@ -1,7 +1,10 @@
+import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from calibration.bundle import (
     FILE,
@@ -14,7 +17,9 @@ from calibration.bundle import (
     write_bundle,
 )
 from calibration.inverse import TERMS, InverseModel
+from calibration.lens import to_metric
 from calibration.normaliser import for_calibrated, for_camera
+from calibration.view import GelView, pinhole, view_of_corners
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame
 from tacsim.optics.geometry import CanonicalGrid, SensorGeometry
@@ -29,7 +34,7 @@ PICTURE = RNG.integers(80, 120, (120, 160, 3), dtype=np.uint8)
 def calibration(serial: str = "gs-42") -> Calibration:
     weights = RNG.normal(0, 0.5, (3, 3))
     return Calibration(
-        format=1,
+        format=2,
         serial=serial,
         geometry=SensorGeometry(width=160, height=120, pixel_pitch=0.1e-3),
         gel_size=(16e-3, 12e-3),
@@ -42,6 +47,10 @@ def calibration(serial: str = "gs-42") -> Calibration:
         ),
         reference="0" * 64,
     )
+
+
+def camera(bundle: Path, width: int = 160, height: int = 120) -> CameraSensorFacts:
+    return CameraSensorFacts(driver="camera", source="x", calibration=str(bundle), width=width, height=height)
 
 
 @pytest.fixture
@@ -64,8 +73,10 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 1", "format: 0", "has format 0, this version of tacsim reads 1"),
-        ("format: 1", "form: 1", "names no format"),
+        ("format: 2", "format: 0", "has format 0, this version of tacsim reads 1 and 2"),
+        ("format: 2", "format: 3", "has format 3, this version of tacsim reads 1 and 2"),
+        ("format: 2", "format: 1", "was changed since it was written"),
+        ("format: 2", "form: 2", "names no format"),
         ("serial: gs-42", "serial: gs-43", "was changed since it was written"),
         ("degree: 1", "degree: 2", "is damaged"),
         ("skirt_fraction: 0.6", "skirt_fraction: six", "is damaged"),
@@ -111,9 +122,7 @@ def test_the_twin_shows_the_sensors_own_picture_and_changes_with_a_dent(bundle: 
 
 
 def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
-    normalise = for_camera(
-        CameraSensorFacts(driver="camera", source="x", calibration=str(bundle)), (1.0, 1.0), CanonicalGrid()
-    )
+    normalise = for_camera(camera(bundle), (1.0, 1.0), CanonicalGrid())
     assert normalise.finds_height
     frame = TactileFrame(image=PICTURE, time=0.0, index=0)
     normalise.take_reference(frame)
@@ -122,3 +131,63 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
     np.testing.assert_array_equal(seen.height, 0.0)
     assert seen.valid.sum() == 64 * 48
     assert for_calibrated(read_bundle(bundle)[0], CanonicalGrid()).finds_height
+
+
+# What format 1 wrote, before there was a view; its checksum is of that content.
+def _format_1(folder: Path) -> Path:
+    path = write_bundle(folder, calibration().model_copy(update={"format": 1}), PICTURE)
+    text = path.read_text(encoding="utf-8")
+    assert "view: null\n" in text
+    path.write_text(text.replace("view: null\n", ""), encoding="utf-8")
+    return path
+
+
+def test_a_bundle_of_format_1_still_loads(tmp_path: Path) -> None:
+    path = _format_1(tmp_path)
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    checksum = content.pop("checksum")
+    canonical = Calibration.model_validate(content).model_dump(mode="json", exclude={"checksum", "view"})
+    assert hashlib.sha256(json.dumps(canonical, sort_keys=True).encode()).hexdigest() == checksum
+    read, _ = read_bundle(path)
+    assert read.format == 1 and read.view is None and read.image_shape == (120, 160)
+    assert for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid()).finds_height
+
+
+def seen_askew() -> GelView:
+    """A gel of 16 x 12 mm as a camera of 320 x 240 px sees it; rectified to 160 x 120 px of 0.1 mm."""
+    corners = ((40.0, 30.0), (290.0, 20.0), (280.0, 215.0), (35.0, 222.0))
+    return view_of_corners(corners, (16e-3, 12e-3), (240, 320)).model_copy(update={"pixel_pitch": 0.1e-3})
+
+
+def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> None:
+    view = seen_askew()
+    write_bundle(tmp_path, calibration().model_copy(update={"view": view}), PICTURE)
+    read, _ = read_bundle(tmp_path)
+    assert read.view == view and read.image_shape == (240, 320)
+    with pytest.raises(BadBundle, match="calibrated on pictures of 320 x 240 px, this sensor delivers 160 x 120"):
+        for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid())
+    normalise = for_camera(camera(tmp_path, 320, 240), (1.0, 1.0), CanonicalGrid())
+    native = RNG.integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
+    normalise.take_reference(TactileFrame(image=native, time=0.0, index=0))
+    brighter = native.copy()
+    u, v = np.rint(view.project(np.array([[3e-3, -2e-3]]))[0]).astype(int)
+    brighter[v - 6 : v + 7, u - 6 : u + 7] += 30
+    seen = normalise(TactileFrame(image=brighter, time=0.0, index=1), now=0.0)
+    rows, columns = np.nonzero(np.abs(seen.image.astype(int) - 128).max(axis=2) > 5)
+    # canonical pixels of 0.125 mm, the sensor's axis between 63 and 64
+    assert columns.mean() == pytest.approx(63.5 + 24, abs=1.0) and rows.mean() == pytest.approx(63.5 - 16, abs=1.0)
+    # one look-up from native pixels shows the same as the metric picture does
+    metric = np.rint(to_metric(view)(brighter)).astype(np.uint8)
+    assert metric.shape == (120, 160, 3)
+    at_once = normalise._rectify(brighter)
+    plain = for_calibrated(calibration(), CanonicalGrid())._rectify(metric)
+    assert np.abs(at_once - plain).mean() < 1.5
+
+
+def test_geometry_and_view_must_agree(tmp_path: Path) -> None:
+    other = seen_askew().model_copy(update={"pixel_pitch": 0.2e-3})
+    with pytest.raises(ValueError, match="its view gives"):
+        Calibration.model_validate(calibration().model_dump() | {"view": other.model_dump()})
+    with pytest.raises(ValueError, match="format 1 has no view"):
+        Calibration.model_validate(calibration().model_dump() | {"view": seen_askew().model_dump(), "format": 1})
+    assert pinhole((240, 320)).centre == (159.5, 119.5)

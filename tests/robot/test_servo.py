@@ -29,6 +29,7 @@ def orders(**changes: object) -> Orders:
         "host": "127.0.0.2",
         "model": "ur5e",
         "refused_serial": None,
+        "realtime": False,
         "parent": 1,
         "segment": "none",
         "world_from_base": EYE,

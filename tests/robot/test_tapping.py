@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from calibration.latency import Latency
 from robot.cli import app
 from robot.mock import Door, MockCamera
-from robot.mock.fixtures import mock_host
+from robot.mock.fixtures import mock_host, rig_addresses
 from robot.tapping import AWAY, PAUSE, STAY, CannotTap, TapPlan, entries, schedule, untimed
 from tacsim.config import load_rig
 from tacsim.hardware import UrArmFacts
@@ -70,6 +70,7 @@ def test_both_times_shall_be_those_of_the_event(
 def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
     facts = load_rig("mock", overrides=["arms.upper.latency=10 ms", "sensors.upper.latency=50 ms"]).facts
     bare = untimed(facts, "upper", "upper")
+    assert bare.contact == "hertz"
     assert bare.arms["upper"].latency == bare.sensors["upper"].latency == 0.0  # type: ignore[union-attr]
     assert not bare.lock_step and bare.arms["lower"] == facts.arms["lower"]
 
@@ -155,3 +156,13 @@ def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
     assert abs(found - 1e3 * DELAY) < 1e3 * SLACK, done.output
     written = float(said[said.index("sensors.upper.latency:") + 1])
     assert written == pytest.approx(found + 100.0, abs=0.11)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
+def test_the_mock_rig_taps_a_ball_in_closed_form() -> None:
+    addresses = [word for override in rig_addresses() for word in ("--set", override)]
+    words = ["calibrate", "latency", "mock", "--arm", "upper", "--sensor", "upper", "--taps", "4", *addresses]
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    assert "sensors.upper is" in done.stdout

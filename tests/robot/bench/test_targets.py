@@ -108,9 +108,11 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
                 "80 % of its height", "stick limit", "lattice, 3 mm", "random, 3 mm",
                 "R 3 mm, 1 mm deep: image", "R 3 mm, 1 mm deep: pressure"]  # fmt: skip
     names = ["wall_per_particle_substep_ns", "cpu_per_element_substep_ns", "second_ms", "momentum", "angular_momentum"]
+    names += ["kept_percent", "kept_in_picture_percent", "jitter_px"]
     figures = {**dict.fromkeys(names, 1.0), "depth_mm": 1.0}
     keys = [(case.group, case.name, case.method, case.resolution) for case in CASES]
     keys.append(("real", "contact_radius", "tacsim", "ball R 3 mm"))
+    keys.append(("real", "marker_film", "tacsim", "the film's own pixels"))
     rows = [
         row(group=group, case=name, method=method, resolution=resolution, variant=variant, figures=figures)
         for group, name, method, resolution in keys

@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 
 from tacsim.optics.geometry import Markers, SensorGeometry, SensorModel
-from tacsim.optics.markers import check_fits, marker_coverage, marker_flow, marker_positions, rest_positions
+from tacsim.optics.markers import (
+    check_fits,
+    marker_coverage,
+    marker_discs,
+    marker_flow,
+    marker_positions,
+    rest_positions,
+)
 from tacsim.optics.render import Renderer
 from tests.tacsim.optics.surfaces import dent, flat, make_surface
 
@@ -60,3 +67,21 @@ def test_a_lattice_larger_than_the_gel_is_refused() -> None:
     check_fits(MARKERS, (11.1e-3, 6.6e-3))
     with pytest.raises(ValueError, match=r"5 x 8 dots at 1.5 mm need a gel of 11.00 x 6.50 mm, the gel is 10 x 10 mm"):
         Renderer(SensorModel(markers=MARKERS), (10e-3, 10e-3))
+
+
+def test_a_pinhole_shows_a_dot_that_is_pressed_towards_it_farther_out_and_larger() -> None:
+    """By similar triangles: at distance H - h instead of H everything is H / (H - h) times as large."""
+    near = GEOMETRY.model_copy(update={"camera_distance": 10e-3})
+    pressed = make_surface(lambda x, y: (x * 0, x * 0, x * 0 - 1e-3))
+    rest = marker_positions(flat(), MARKERS, near)
+    np.testing.assert_allclose(rest, marker_positions(flat(), MARKERS, GEOMETRY))  # untouched gel lies where it lay
+    centres, radii = marker_discs(pressed, MARKERS, near)
+    np.testing.assert_allclose(centres - near.principal, (rest - near.principal) * 10 / 9, rtol=1e-6)
+    np.testing.assert_allclose(radii, MARKERS.radius / near.pixel_pitch * 10 / 9, rtol=1e-6)
+    np.testing.assert_allclose(marker_positions(pressed, MARKERS, GEOMETRY), rest)  # parallel rays see none of it
+
+
+def test_a_gel_pressed_up_to_the_pinhole_is_refused() -> None:
+    near = GEOMETRY.model_copy(update={"camera_distance": 2e-3})
+    with pytest.raises(ValueError, match=r"pressed in 2\.50 mm, up to the camera at camera_distance 2 mm"):
+        marker_positions(make_surface(lambda x, y: (x * 0, x * 0, x * 0 - 2.5e-3)), MARKERS, near)

@@ -1,0 +1,142 @@
+"""Least squares for rigid transforms from measurements that should agree, and of which some do not.
+
+Parameters are poses and points. Each measurement gives a few residuals over their standard deviations. A fit that heeds
+strays little (Cauchy's loss) finds which measurements disagree; those are left out of the plain fit that follows, whose
+covariance is therefore that of the textbook.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from calibration.errors import Unusable
+from tacsim.interface import FloatArray
+
+STRAY = 5.0  # a measurement off by so many standard deviations, all its residuals together, is a stray
+MOST_STRAYS = 0.25  # of the measurements; with more, who is right?
+PROMISING = 4  # starts that are followed to their end
+ROUNDS = 4  # of leaving out and fitting again
+DISAGREE = 3.0  # scatter over what the noise allows: beyond it something other than noise is wrong
+
+Residuals = Callable[[FloatArray], FloatArray]
+
+
+class BadMeasurements(Unusable):
+    """Measurements that tell no transform: too few, too alike, or at odds with each other."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """A fit and how sure it is."""
+
+    parameters: FloatArray  # (p,) what is added to the start: for a pose, shift [m] and rotation vector [rad]
+    covariance: FloatArray  # (p, p) of it, for noise as it was stated, or as it is if that is larger
+    bound: FloatArray  # (p, p) least covariance that any unbiased estimate has at the stated noise (Cramer, Rao)
+    residuals: FloatArray  # (n, k) over their standard deviations, of all measurements
+    used: tuple[bool, ...]  # (n,) False: a stray, left out
+    scatter: float  # root mean square of the used residuals, by degrees of freedom: 1 if the stated noise is right
+
+
+def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adjusted:
+    """Fits parameters (p,) so that `residuals` (n, k), each over its standard deviation, become small.
+
+    starts: the best of the fits from each of them is taken. what: the measurements in a word, for messages.
+    Raises BadMeasurements.
+    """
+
+    def flat(parameters: FloatArray) -> FloatArray:
+        return residuals(parameters).ravel()
+
+    # Cauchy's loss hardly pulls from afar: sums of absolute values lead near, from the most promising starts.
+    promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:PROMISING]
+    rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3, max_nfev=30) for start in promising]
+    best = min(rough, key=lambda fit: float(fit.cost))
+    found = least_squares(flat, best.x, loss="cauchy", x_scale="jac", max_nfev=60).x
+    used = np.ones(len(residuals(found)), dtype=np.bool_)
+    for _ in range(ROUNDS):
+        apart = np.sqrt((residuals(found) ** 2).sum(axis=1))
+        # noise may be larger than stated: strays are told from the others, not only from the statement
+        usual = max(1.0, float(np.median(apart)) / np.sqrt(residuals(found).shape[1]))
+        keep = apart < STRAY * usual
+        if keep.sum() < max(1, (1 - MOST_STRAYS) * len(keep)):
+            raise BadMeasurements(
+                f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others; what is said to be fixed must "
+                "be so, the poses must be those of the pictures, and lengths in metres"
+            )
+        found, before = _plain(residuals, found, keep).x, used
+        used = keep
+        if (used == before).all():
+            break
+    everything = residuals(found)
+    jacobian = np.asarray(_plain(residuals, found, used).jac, dtype=np.float64)
+    information: FloatArray = jacobian.T @ jacobian
+    if np.linalg.matrix_rank(_scaled(information), tol=1e-10) < len(found):
+        raise BadMeasurements(f"{what} leave something free: vary places and tilts more")
+    bound: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    free = everything[used].size - len(found)
+    scatter = float(np.sqrt((everything[used] ** 2).sum() / free)) if free > 0 else 0.0
+    if scatter > DISAGREE:
+        raise BadMeasurements(
+            f"{what} disagree: they scatter {scatter:.1f} times as much as the stated noise allows ({DISAGREE:g} at "
+            "most); is something loose, a length or a frame wrong, or the noise larger than stated?"
+        )
+    return Adjusted(
+        parameters=found,
+        covariance=bound * max(1.0, scatter) ** 2,
+        bound=bound,
+        residuals=everything,
+        used=tuple(bool(each) for each in used),
+        scatter=scatter,
+    )
+
+
+def _plain(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> Any:
+    def flat(parameters: FloatArray) -> FloatArray:
+        return residuals(parameters)[keep].ravel()
+
+    return least_squares(flat, start, method="lm", x_scale="jac")
+
+
+def _scaled(information: FloatArray) -> FloatArray:
+    """The information matrix with ones on its diagonal: its rank then says nothing of units."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled: FloatArray = information / np.outer(scale, scale)
+    return scaled
+
+
+def swing(rotations: FloatArray) -> float:
+    """How much `rotations` (n, 3, 3) differ [rad]: the direction that they turn least still swings by so much, as a
+    root mean square; 0 if all turn about one axis.
+
+    With R the rotations and M their mean, it is the least singular value of the standard deviation of R over all
+    directions: the least eigenvalue of I - M^T M is its square.
+    """
+    mean = rotations.mean(axis=0)
+    least = float(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0])
+    return float(np.arcsin(np.sqrt(np.clip(least, 0.0, 1.0))))
+
+
+def moved(pose: FloatArray, change: FloatArray) -> FloatArray:
+    """`pose` (4, 4), shifted by change[:3] [m] and turned about its own origin by the rotation vector change[3:]; both
+    along the axes of the frame that the pose is given in."""
+    result = pose.copy()
+    result[:3, :3] = Rotation.from_rotvec(change[3:6]).as_matrix() @ pose[:3, :3]
+    result[:3, 3] += change[:3]
+    return result
+
+
+def invert(frames: FloatArray) -> FloatArray:
+    """Inverses of rigid transforms (..., 4, 4)."""
+    back = np.zeros_like(frames)
+    turn = np.swapaxes(frames[..., :3, :3], -1, -2)
+    back[..., :3, :3] = turn
+    back[..., :3, 3] = -np.einsum("...ij,...j->...i", turn, frames[..., :3, 3])
+    back[..., 3, 3] = 1.0
+    return back

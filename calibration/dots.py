@@ -1,0 +1,100 @@
+"""Dark dots in a picture: where their centres are, to a fraction of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LEVELS = (0.2, 0.35, 0.5)  # a dot takes at least such a share of the light round it; the higher part it from others
+LEAST_FILLED = 0.4  # share of its bounding box that a dot fills
+LARGEST = 2.5  # radius of the largest dot that is one, in radii of the usual one
+LEAST_AREA, LARGEST_AREA = 0.2, 7.0  # of one dot, in areas of the usual one: dots are painted over, and half hidden
+LONGEST = 2.0  # length of a dot in its breadth
+BLUR = 0.35  # of the picture before its dots are sought [radii]
+SMALLEST = 1.2  # radius of a dot that can be found [px]
+FIRST_KERNEL = 14  # the largest dot that is looked for where none is known: this part of the picture's shorter side
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dots:
+    """The dots of one picture."""
+
+    centres: Float64  # (n, 2) u, v [px]
+    areas: Float64  # (n,) [px^2]
+
+    @property
+    def radius(self) -> float:
+        """That of a disc with the median area [px]."""
+        return float(np.sqrt(np.median(self.areas) / np.pi)) if len(self.areas) else 0.0
+
+
+class DotFinder:
+    """Finds dots of about one radius [px].
+
+    The light that dots take is what a closing (the bright frame of each place) has beyond the picture itself, as a
+    share: unlike a difference of Gaussians it sees no dot in the shadow side of a step of brightness, as every rim of
+    a contact has one. A centre is the mean of the dot's pixels, each weighted with its share beyond DARK.
+    """
+
+    def __init__(self, radius: float) -> None:
+        """Raises ValueError for dots too small to be found."""
+        if not radius >= SMALLEST:
+            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {SMALLEST:g} px are needed")
+        self._area = np.pi * radius**2
+        self._blur = BLUR * radius
+        self._side = 2 * int(np.ceil(LARGEST * radius)) + 1
+
+    def __call__(self, image: Image) -> Dots:
+        """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
+        taken = light_taken(image, self._side, self._blur)
+        found = []
+        for level in LEVELS:
+            dots, rest = self._blobs(taken, level)
+            found.append(dots)
+            if rest is None:
+                break
+            taken = rest
+        return Dots(np.concatenate([d.centres for d in found]), np.concatenate([d.areas for d in found]))
+
+    def _blobs(self, taken: Float32, level: float) -> tuple[Dots, Float32 | None]:
+        """The dots among the blobs beyond `level`, and what is left in blobs too large or long to be one."""
+        import cv2
+
+        mask = (taken > level).astype(np.uint8)
+        kind = cv2.CV_16U if mask.size < 1 << 16 else cv2.CV_32S  # room for as many labels as pixels; 16 is faster
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=kind)
+        area = stats[:, cv2.CC_STAT_AREA]
+        width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
+        large = area > LEAST_AREA * self._area
+        compact = (area < LARGEST_AREA * self._area) & (np.maximum(width, height) < LONGEST * np.minimum(width, height))
+        compact &= area > LEAST_FILLED * width * height
+        large[0] = False  # what is no blob
+        good = large & compact
+        where = np.flatnonzero(mask)
+        label = labels.ravel()[where]
+        weight = taken.ravel()[where].astype(np.float64) - level
+        rows, columns = np.divmod(where, mask.shape[1])
+        total = np.maximum(np.bincount(label, weight, count), 1e-12)
+        centres = np.stack([np.bincount(label, weight * at, count) / total for at in (columns, rows)], axis=1)
+        dots = Dots(centres[good], area[good].astype(np.float64))
+        clumps = large & ~compact
+        return dots, np.where(clumps[labels], taken, np.float32(0.0)) if clumps.any() else None
+
+
+def light_taken(image: Image, side: int, blur: float) -> Float32:
+    """(H, W) share of the light that is missing against the frame of `side` x `side` px round each place."""
+    import cv2
+
+    if image.ndim == 3:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    calm = np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur), dtype=np.float32)
+    levels = cv2.convertScaleAbs(calm)  # many times faster to close than float, and fine enough for what is smooth
+    bright = cv2.morphologyEx(levels, cv2.MORPH_CLOSE, np.ones((side, side), dtype=np.uint8))
+    share = calm / np.maximum(bright, 1).astype(np.float32)
+    return np.asarray(np.float32(1.0) - share, dtype=np.float32)

@@ -1,0 +1,163 @@
+"""The lattice in scattered points: which row and column each belongs to, and where the missing ones would be."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STEP = 0.3  # a neighbour lies at most so far from one step along the lattice [pitches]
+FULL = 0.5  # a row or column belongs to the lattice if it has this share of the dots of the fullest one
+ODD = 0.25  # points at other distances than one pitch are strays [pitches]
+
+
+class NoLattice(ValueError):
+    """Points that are not the lattice asked for: what was found instead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lattice:
+    """Rows along y and columns along x, as nearly as the lattice lies along them."""
+
+    positions: Float64  # (rows, columns, 2); where no point is, the lattice's smooth continuation
+    present: Mask  # (rows, columns) a point is there
+    strays: int  # points that belong to the same lattice, but beyond its rows and columns
+
+    @property
+    def pitch(self) -> float:
+        """Usual distance of neighbours."""
+        along = np.linalg.norm(np.diff(self.positions, axis=1), axis=2).ravel()
+        down = np.linalg.norm(np.diff(self.positions, axis=0), axis=2).ravel()
+        return float(np.median(np.concatenate([along, down])))
+
+
+def usual_pitch(points: Float64) -> float:
+    """Median distance to the nearest neighbour, of points (n >= 2, 2)."""
+    from scipy.spatial import KDTree
+
+    away, _ = KDTree(points).query(points, k=2)
+    return float(np.median(np.asarray(away)[:, 1]))
+
+
+def find_lattice(points: Float64, shape: tuple[int, int] | None = None, pitch: float | None = None) -> Lattice:
+    """The square lattice in `points` (n, 2), turned by less than 45 degrees; strays and gaps may be among them.
+
+    Args:
+        points: x, y; the lattice asked for lies as near (0, 0) as its points allow.
+        shape: rows, columns; None: as many as there are.
+        pitch: distance of neighbours; None: the usual one of these points.
+
+    Raises NoLattice when fewer than 2 x 2 points make a lattice.
+    """
+    if len(points) < 4:
+        raise NoLattice(f"{len(points)} dots found, a lattice has at least 4")
+    found = usual_pitch(points) if pitch is None else pitch
+    labels = _labels(points, found)
+    if len(labels) < 4 or min(np.ptp(list(labels.values()), axis=0)) < 1:
+        raise NoLattice(f"{len(points)} dots found, but no rows and columns of them about {found:.3g} apart")
+    which, at = np.array(list(labels)), np.array(list(labels.values()))  # at: row, column
+    low, size = _window(points[which], at, shape)
+    inside = ((at >= low) & (at < low + size)).all(axis=1)
+    which, at = which[inside], at[inside] - low
+    present = np.zeros(size, dtype=np.bool_)
+    present[at[:, 0], at[:, 1]] = True
+    positions = np.zeros((*size, 2))
+    positions[at[:, 0], at[:, 1]] = points[which]
+    return Lattice(_completed(positions, present), present, len(labels) - len(which))
+
+
+def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
+    """Row and column (from anywhere) of all points that hang together, by the index of the point: grown from its most
+    regular place, each step from its neighbour's own."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    away, near = (np.asarray(found) for found in tree.query(points, k=min(5, len(points))))
+    steps = points[near[:, 1:]] - points[:, None, :]
+    regular = np.abs(away[:, 1:] - pitch) < ODD * pitch
+    if not regular.any():
+        return {}
+    angle = np.angle(np.exp(4j * np.arctan2(steps[regular][:, 1], steps[regular][:, 0])).mean()) / 4
+    along = pitch * np.array([np.cos(angle), np.sin(angle)])  # one column further
+    down = np.array([-along[1], along[0]])  # one row further
+    aside = np.linalg.norm(points - np.median(points, axis=0), axis=1) / pitch
+    start = int(np.argmax(regular.sum(axis=1) - 1e-3 * aside))
+    labels = {start: (0, 0)}
+    taken = {(0, 0)}
+    queue: deque[tuple[int, Float64, Float64]] = deque([(start, along, down)])
+    while queue:
+        one, along, down = queue.popleft()
+        row, column = labels[one]
+        for side, step in (((0, 1), along), ((0, -1), -along), ((1, 0), down), ((-1, 0), -down)):
+            there = (row + side[0], column + side[1])
+            distance, other = tree.query(points[one] + step)
+            if distance > STEP * pitch or other in labels or there in taken:
+                continue
+            labels[int(other)] = there
+            taken.add(there)
+            seen = (points[other] - points[one]) * (side[0] + side[1])
+            bent = (0.5 * (along + seen), down) if side[0] == 0 else (along, 0.5 * (down + seen))
+            queue.append((int(other), *bent))
+    return labels
+
+
+def _window(
+    points: Float64, at: NDArray[np.intp], shape: tuple[int, int] | None
+) -> tuple[NDArray[np.intp], tuple[int, int]]:
+    """First row and column, and how many, of the lattice among points (n, 2) labelled `at` (n, 2)."""
+    first = at.min(axis=0)
+    filled = np.zeros(at.max(axis=0) - first + 1, dtype=np.intp)
+    filled[tuple((at - first).T)] = 1
+    if shape is None:
+        rows, columns = (np.flatnonzero(n >= FULL * n.max()) for n in (filled.sum(axis=1), filled.sum(axis=0)))
+        low = np.array([rows[0], columns[0]])
+        return first + low, (int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1))
+    best, chosen = (-1, 0.0), first
+    for row in range(min(0, filled.shape[0] - shape[0]), max(0, filled.shape[0] - shape[0]) + 1):
+        for column in range(min(0, filled.shape[1] - shape[1]), max(0, filled.shape[1] - shape[1]) + 1):
+            part = filled[max(row, 0) : row + shape[0], max(column, 0) : column + shape[1]]
+            low = first + (row, column)
+            middle = _affine(points, at) @ np.array([1.0, *(low + (np.array(shape) - 1) / 2)])
+            score = (int(part.sum()), -float(np.hypot(*middle)))
+            if score > best or best[0] < 0:
+                best, chosen = score, low
+    return chosen, shape
+
+
+def _affine(points: Float64, at: NDArray[np.intp]) -> Float64:
+    """(2, 3) from (1, row, column) to the place."""
+    terms = np.column_stack([np.ones(len(at)), at])
+    return np.asarray(np.linalg.lstsq(terms, points, rcond=None)[0].T, dtype=np.float64)
+
+
+def _completed(positions: Float64, present: Mask) -> Float64:
+    """`positions` (rows, columns, 2) with what is missing: the affine lattice, bent as the neighbours are."""
+    if present.all():
+        return positions
+    at = np.argwhere(np.ones_like(present))
+    terms = np.column_stack([np.ones(len(at)), at])
+    affine = (terms @ _affine(positions[present], np.argwhere(present)).T).reshape(positions.shape)
+    bent = spread(np.where(present[..., None], positions - affine, 0.0), present)
+    return np.asarray(affine + bent, dtype=np.float64)
+
+
+def spread(values: Float64, known: Mask) -> Float64:
+    """`values` (rows, columns, n), where not `known` the mean of the nearest neighbours that are, ring by ring."""
+    if known.all() or not known.any():
+        return values
+    found, done = np.where(known[..., None], values, 0.0), known.copy()
+    rows, columns = known.shape
+    while not done.all():
+        padded = np.pad(np.where(done[..., None], found, 0.0), ((1, 1), (1, 1), (0, 0)))
+        weight = np.pad(done.astype(np.float64), 1)
+        shifts = [(slice(r, r + rows), slice(c, c + columns)) for r in range(3) for c in range(3)]
+        total, count = np.sum([padded[s] for s in shifts], axis=0), np.sum([weight[s] for s in shifts], axis=0)
+        new = ~done & (count > 0)
+        found[new] = total[new] / count[new][:, None]
+        done |= new
+    return found

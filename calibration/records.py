@@ -1,0 +1,103 @@
+"""Files of recorded poses, which the frames of a robot are calibrated from, and what is found, as JSON.
+
+YAML (or JSON, which is YAML): lengths and angles with units, or in m and rad. A pose is a position and a rotation
+vector, as UR writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field
+
+from calibration.handeye import Sight
+from calibration.touch import Touch
+from tacsim.config import load
+from tacsim.hardware import Placement
+from tacsim.interface import FloatArray, Pose
+from tacsim.pose import rotation
+from tacsim.quantity import Facts, Length
+
+MOST = 1000  # poses of a file
+
+
+class TouchEntry(Facts):
+    """One touch of the ball."""
+
+    tool: Placement  # world_from_tool
+    contact: tuple[Length, Length]  # its centre in the sensor's frame, x, y [m]
+    depth: Annotated[Length, Field(ge=0)]  # of the ball in the gel [m]
+
+
+class TouchFile(Facts):
+    """Touches of one fixed ball."""
+
+    ball_radius: Annotated[Length, Field(gt=0)]
+    touches: tuple[TouchEntry, ...] = Field(max_length=MOST)
+
+    def measurements(self) -> list[Touch]:
+        return [Touch(each.tool.pose, each.contact, each.depth) for each in self.touches]
+
+
+class SightEntry(Facts):
+    """One picture of the board."""
+
+    flange: Placement  # base_from_flange
+    board: Placement  # camera_from_board
+
+
+class SightFile(Facts):
+    """Poses of one board, seen by one camera."""
+
+    camera: Literal["flange", "fixed"] = "flange"  # rides on the flange before a fixed board, or the other way round
+    poses: tuple[SightEntry, ...] = Field(max_length=MOST)
+
+    def measurements(self) -> list[Sight]:
+        return [Sight(each.flange.pose, each.board.pose) for each in self.poses]
+
+
+def read_touches(path: Path) -> TouchFile:
+    """Raises tacsim.config.ConfigError."""
+    return load(TouchFile, path)
+
+
+def read_sights(path: Path) -> SightFile:
+    """Raises tacsim.config.ConfigError."""
+    return load(SightFile, path)
+
+
+def touch_file(touches: Sequence[Touch], ball_radius: float) -> TouchFile:
+    """What `write_record` shall write of touches."""
+    entries = tuple(TouchEntry(tool=placement(t.tool), contact=t.contact, depth=max(0.0, t.depth)) for t in touches)
+    return TouchFile(ball_radius=ball_radius, touches=entries)
+
+
+def sight_file(sights: Sequence[Sight], *, fixed: bool) -> SightFile:
+    """What `write_record` shall write of sights."""
+    entries = tuple(SightEntry(flange=placement(s.flange), board=placement(s.board)) for s in sights)
+    return SightFile(camera="fixed" if fixed else "flange", poses=entries)
+
+
+def write_record(path: Path, record: TouchFile | SightFile) -> Path:
+    """Writes a file that the functions above read. Raises OSError."""
+    text = yaml.safe_dump(record.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def placement(pose: Pose) -> Placement:
+    """A pose as files write it: position [m] and rotation vector [rad]."""
+    x, y, z = (float(value) for value in pose.position)
+    a, b, c = (float(value) for value in rotation(pose).as_rotvec())
+    return Placement(position=(x, y, z), rotation=(a, b, c))
+
+
+def plain(pose: Pose, covariance: FloatArray | None = None) -> dict[str, Any]:
+    """A pose for JSON [m, rad]; `covariance` (6, 6): of shift and rotation vector."""
+    found: dict[str, Any] = placement(pose).model_dump(mode="json")
+    if covariance is not None:
+        found["covariance"] = covariance.tolist()
+    return found

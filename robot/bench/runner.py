@@ -41,6 +41,7 @@ class Case:
     measure: Callable[[int], list[Measurement]]  # repetitions -> rows
     baseline: bool = False  # only with --baselines: a method that is not ours
     long: bool = False  # only with --long: ours, but more than some seconds
+    missing: str = ""  # why it cannot be measured here: what the user's folder lacks
 
 
 class Stopped(RuntimeError):

@@ -46,7 +46,6 @@ class BallSet(Facts):
     blue_first: bool = False  # of an archive: its colours stand as B, G, R
     ball_radius: Positive  # [m]
     pixel_pitch: Positive  # [m]
-    gel_thickness: Positive = 8e-3  # [m]
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -214,7 +213,9 @@ def _of_archive(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     except (OSError, ValueError, KeyError) as error:
         raise BadData(f"{path}: needs arrays `images` and `background` without pickles: {error}") from None
     if images.ndim != 4 or images.shape[1:] != reference.shape or reference.shape[-1] != 3:
-        raise BadData(f"{path}: `images` are {images.shape}, `background` {reference.shape}; (n, H, W, 3) and (H, W, 3)")
+        raise BadData(
+            f"{path}: `images` are {images.shape}, `background` {reference.shape}; (n, H, W, 3) and (H, W, 3)"
+        )
     if images.dtype != np.uint8 or reference.dtype != np.uint8:
         raise BadData(f"{path}: `images` and `background` must be uint8")
     step = -1 if of.blue_first else 1

@@ -86,9 +86,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
 class Camera:
     """The twin of a calibrated sensor: draws surfaces, and finds them in real frames."""
 
-    def __init__(
-        self, of: BallSet, fit: Fit, gel_size: tuple[float, float], reference: Image
-    ) -> None:
+    def __init__(self, of: BallSet, fit: Fit, gel_size: tuple[float, float], reference: Image) -> None:
         from calibration.bundle import sensor_model, write_bundle
         from calibration.normaliser import for_calibrated
         from tacsim.interface import TactileFrame
@@ -151,7 +149,9 @@ def _height(
     (u0, v0), pitch = camera.model.geometry.principal, camera.model.geometry.pixel_pitch
     scale = pitch / GRID.pitch
     x, y = (at[0] - u0) * scale + (GRID.columns - 1) / 2, (at[1] - v0) * scale + (GRID.rows - 1) / 2
-    near = circle_mask((GRID.rows, GRID.columns), x, y, HEIGHT_REACH * np.sqrt(press.ball_radius * press.depth) / GRID.pitch)
+    near = circle_mask(
+        (GRID.rows, GRID.columns), x, y, HEIGHT_REACH * np.sqrt(press.ball_radius * press.depth) / GRID.pitch
+    )
     ours = surface_map(surface, GRID, None).height.astype(np.float64)
     found = camera.height(real)
     off = (found - ours)[near]

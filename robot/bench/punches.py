@@ -134,7 +134,9 @@ def place(draw: Draw, face: Face, depths: Sequence[float], frames: Sequence[Imag
     """Fits scale and place to all frames of a punch. Raises BadData when no contact is seen."""
     from calibration import metrics
 
-    strongest = max((frame - draw.reference.astype(np.float32) for frame in frames), key=lambda c: float((c**2).mean()))
+    still = draw.reference.astype(np.float32)
+    changes = [frame.astype(np.float32) - still for frame in frames]
+    strongest = max(changes, key=lambda change: float((change**2).mean()))
     patch = metrics.patch_of(metrics.contact_region(strongest))
     if patch is None:
         raise BadData("no contact is seen in the frames of the punch")

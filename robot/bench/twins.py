@@ -31,27 +31,37 @@ ELEMENT = 0.5e-3  # [m]
 
 
 def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], repeat: int) -> list[Measurement]:
-    """Real presses beside the same by our gel, in five folds: distance over that of neighbouring presses, a classifier,
-    and the camera's gain. Seconds: to press and draw, a press."""
-    from calibration.invariance import pooled_invariance
+    """Real presses beside the same by our gel, in five folds: distances, a classifier, drift. Seconds: of a press.
 
+    *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: our simulation says it.
+    """
     reference, frames = balls.read_balls(folder, of)
     if len(frames) < LEAST_PRESSES:
         raise BadData(f"{of.name}: {len(frames)} presses; {LEAST_PRESSES} are the least that say something")
-    wall, cpu, pressed, notes, folds = 0.0, 0.0, 0, [], []
+    wall, cpu, pressed, notes = 0.0, 0.0, 0, []
+    ways: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
     for fold in range(FOLDS):
         train = tuple(frame for k, frame in enumerate(frames) if k % FOLDS != fold)
-        comparison, calibration, taken, said = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
-        wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(comparison.pairs)
+        both, calibration, taken, said = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
+        wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(both["pictures"].pairs)
         notes += said
-        folds.append((comparison, calibration))
+        for way, comparison in both.items():
+            ways[way].append((comparison, calibration))
+    timing, note = Timing((wall / pressed,), cpu / pressed), "; ".join(notes)
+    rows = []
+    for way, folds in ways.items():
+        rows += _rows(way, folds, timing, note)
+    return rows
+
+
+def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: Timing, note: str) -> list[Measurement]:
+    from calibration.invariance import pooled_invariance
+
     report = pooled_invariance(folds, GRID)
-    timing = Timing((wall / pressed,), cpu / pressed)
-    note = "; ".join(notes)
     rows = [
         Measurement(
             timing, view.rho, "x", "the distance of two real presses that are neighbours in size; 1 is as far",
-            f"rho, {view.view}", None,
+            f"{way}: rho, {view.view}", None,
             {
                 "rho_low": view.rho_low, "rho_high": view.rho_high, "auc": view.auc, "auc_low": view.auc_low,
                 "auc_high": view.auc_high, "distance": view.distance, "neighbour": view.neighbour,
@@ -60,29 +70,29 @@ def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], 
             note,
         )
         for view in report.views
+        if way == "pictures" or view.view in ("gradient", "height")
     ]  # fmt: skip
     rows += [
         Measurement(
             timing, max(0.0, drift.fresh), "deg more", "the same frames before the change, against our gel's gradient",
-            f"drift, {drift.change.name}", None,
+            f"{way}: drift, {drift.change.name}", None,
             {"extra_deg": drift.fresh, "stale_deg": drift.stale, "usual_deg": report.angle}, note,
         )
         for drift in report.drifts
     ]  # fmt: skip
     overall = [pair for comparison, _ in folds for pair in comparison.pairs]
-    for key, name, unit, scale in (
-        ("contact_mae", "picture of our gel", "grey", 1.0),
-        ("gradient_angle", "gradient", "deg", 1.0),
-        ("height_share", "height", "% of depth", 100.0),
-    ):
+    kinds = [("gradient_angle", "gradient", "deg", 1.0), ("height_share", "height", "% of depth", 100.0)]
+    if way == "pictures":
+        kinds.insert(0, ("contact_mae", "picture", "grey", 1.0))
+    for key, name, unit, scale in kinds:
         values, nulls = [pair.numbers[key] for pair in overall], [pair.null[key] for pair in overall]
         figures = {"null": float(np.nanmean(nulls)) * scale, "median": float(np.nanmedian(values)) * scale}
         if key == "contact_mae":
             figures["ncc"] = float(np.nanmean([pair.numbers["contact_ncc"] for pair in overall]))
         rows.append(
             Measurement(
-                timing, float(np.nanmean(values)) * scale, unit, "the real frame, by `tacsim compare`", name, None,
-                figures, note,
+                timing, float(np.nanmean(values)) * scale, unit, "the real frame, by `tacsim compare`",
+                f"{way}: {name}", None, figures, note,
             )
         )  # fmt: skip
     return rows
@@ -90,8 +100,8 @@ def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], 
 
 def _fold(
     of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
-) -> tuple[Comparison, Calibration, tuple[float, float], list[str]]:
-    """Left-out presses by our gel, compared with the real ones; wall and processor time of pressing; what to look
+) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
+    """Left-out presses by our gel, compared with the real ones in both ways; wall and processor time of pressing; what to look
     at."""
     from calibration.ballpress import BadPresses, calibrate_light
     from calibration.bundle import sensor_model, write_bundle
@@ -117,7 +127,11 @@ def _fold(
         write_bundle(Path(place), calibration, reference)
         ours, said = press_like(real, scene, sensor_model(Path(place)), GRID)
     taken = perf_counter() - wall, process_time() - cpu
-    return compare(ours, real, None, calibration), calibration, taken, said
+    both = {
+        "pictures": compare(ours, real, calibration, calibration),
+        "surfaces": compare(ours, real, None, calibration),
+    }
+    return both, calibration, taken, said
 
 
 def cases(folder: Path) -> tuple[Case, ...]:

@@ -42,7 +42,7 @@ READING = (
     "our contact itself with the radius in the labels. Films of dotted gels under a press are found alike, by "
     "`films.yaml`: the share of their dots that is followed to the end, how still the dots lie at rest, and the time "
     "of a frame. Presses of a ball are described by `balls.yaml`; `light` in `presses.yaml` names those by which the "
-    "sensor of the known depths is calibrated. *null* among the figures is what a picture without contact scores. What "
+    "sensor of the known depths is calibrated. *null* beside an error is what no contact at all would score. What "
     "the folder lacks stands under *Not measured*."
 )
 
@@ -53,6 +53,8 @@ def cells(row: Row) -> list[str]:
     spread = "" if row.spread is None else f" ± {row.spread:.2g}"
     substeps = "" if row.substeps is None else str(row.substeps)
     error = f"{row.error:.3g} {row.error_unit}"
+    null = next((value for name, value in row.figures.items() if name.startswith("null")), None)
+    error += "" if null is None else f" (null {null:.3g})"
     return [
         name, row.method, row.resolution, f"{row.seconds:.3g}{spread}", f"{row.cpu_seconds:.3g}", error,
         f"{row.peak_mb:.0f}", substeps,

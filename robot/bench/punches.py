@@ -32,7 +32,7 @@ Mask = NDArray[np.bool_]
 
 CASE = "punch"
 BOX = 512  # pixels of the periodic square that the layer is solved on
-FINER = 4  # the outline is drawn on so many times as many points
+FINER = 8  # the outline is drawn on so many times as many points
 RIM = 12  # the mask reaches so far beyond the outline [px]
 FIT_RIM = 20  # ... and that of the fit
 SCALES = (0.88, 0.92, 0.96, 1.0, 1.04)
@@ -55,8 +55,8 @@ class Face:
         drawn = np.zeros((shape[0] * FINER, shape[1] * FINER), dtype=np.uint8)
         at = (self.points * scale / pitch + [x, y] + 0.5) * FINER - 0.5
         for corners in at[self.triangles]:
-            cv2.fillConvexPoly(drawn, np.rint(corners * 16).astype(np.int32), 1, shift=4)
-        covered = cv2.resize(drawn.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+            cv2.fillConvexPoly(drawn, np.rint(corners * 16).astype(np.int32), 255, shift=4)
+        covered = cv2.resize(drawn, shape[::-1], interpolation=cv2.INTER_AREA) > 127
         if rim:
             covered = cv2.dilate(covered.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), dtype=np.uint8)) > 0
         return np.asarray(covered)

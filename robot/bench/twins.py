@@ -101,8 +101,8 @@ def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: 
 def _fold(
     of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
 ) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
-    """Left-out presses by our gel, compared with the real ones in both ways; wall and processor time of pressing; what to look
-    at."""
+    """Left-out presses by our gel, compared with the real ones in both ways; the calibration that has not seen them;
+    wall and processor time of pressing; what to look at."""
     from calibration.ballpress import BadPresses, calibrate_light
     from calibration.bundle import sensor_model, write_bundle
     from calibration.compare import compare

@@ -49,7 +49,12 @@ class Press:
     circle: ContactCircle
     change: Float64  # (H, W, 3) relative change of colour, drift removed
     drift: Float64  # (H, W, 3) what was removed
-    lit: NDArray[np.bool_]  # (H, W) not saturated
+    lit: NDArray[np.bool_]  # (H, W, 3) not saturated
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (self.lit.shape[0], self.lit.shape[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +121,7 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
     order = choose_order(forward_sets)
     steepest = max(rim_slope(press.circle, ball) for press in presses)
     scores = tuple(
-        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, base.mean.astype(np.float64))
+        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, base.mean.astype(np.float64), reference)
         for i in range(len(presses))
         if len(presses) > 1
     )
@@ -157,10 +162,10 @@ def _find(name: str, image: Image, reference: Image, mean: Float64, ball: float)
         raise BadPresses("the middle of the contact lies outside the picture")
     v, u = np.mgrid[:height, :width].astype(np.float64)
     away = np.hypot(u - start.x, v - start.y)
-    drift = _drift(raw, away > NEAR * start.radius)
-    lit = (image.max(axis=2) < SATURATED) & (reference.max(axis=2) < SATURATED)
+    lit = (image < SATURATED) & (reference < SATURATED)
+    drift = _drift(raw, (away > NEAR * start.radius) & lit.all(axis=2))
     contact = away < start.radius
-    dull = 1.0 - float(lit[contact].mean()) if contact.any() else 1.0
+    dull = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
     if dull > MOST_SATURATED:
         raise BadPresses(f"{dull:.0%} of the contact is saturated: shorten the exposure or press less")
     change = (raw - drift) / mean
@@ -222,34 +227,35 @@ def _window(press: Press) -> Window:
     v, u, _ = _near(press)
     thin = max(1, round(np.sqrt(len(u) / PIXELS)))
     keep = (u % thin == 0) & (v % thin == 0)
+    keep &= press.lit[v, u].all(axis=1)
     change = _smooth(press.change, BLUR)[v[keep], u[keep]]
     return Window(u[keep].astype(np.float64), v[keep].astype(np.float64), change)
 
 
 def _near(press: Press) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-    """Rows and columns of the usable pixels within NEAR contact radii, and their mask."""
-    height, width = press.lit.shape
+    """Rows and columns of the pixels within NEAR contact radii, and their mask."""
+    height, width = press.shape
     v, u = np.mgrid[:height, :width]
-    mask = (np.hypot(u - press.circle.x, v - press.circle.y) < NEAR * press.circle.radius + 5) & press.lit
+    mask = np.hypot(u - press.circle.x, v - press.circle.y) < NEAR * press.circle.radius + 5
     rows, columns = np.nonzero(mask)
     return rows, columns, mask
 
 
 def _gradient(press: Press, skirt: Skirt, ball: float) -> Float64:
     """(H, W, 2) the press's labels."""
-    v, u = np.mgrid[: press.lit.shape[0], : press.lit.shape[1]].astype(np.float64)
+    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
     return dent_gradient(u, v, press.circle, skirt, ball, RIM_BLUR)
 
 
 def _forward_equations(press: Press, gradient: Float64) -> Equations:
     v, u, mask = _near(press)
-    at_u, at_v = place_in_image(press.lit.shape[1], press.lit.shape[0])
-    return equations(gradient[mask], at_u[u], at_v[v], _smooth(press.change, BLUR)[mask])
+    at_u, at_v = place_in_image(press.shape[1], press.shape[0])
+    return equations(gradient[mask], at_u[u], at_v[v], _smooth(press.change, BLUR)[mask], press.lit[mask])
 
 
 def _inverse_equations(press: Press, gradient: Float64) -> tuple[Float64, Float64]:
     """Normal equations from contact and skirt, and from a tenth as many untouched pixels, whose slope is 0."""
-    height, width = press.lit.shape
+    height, width = press.shape
     v, u = np.mgrid[:height, :width]
     change = _smooth(press.change, INVERSE_BLUR)
     _, _, near = _near(press)
@@ -282,16 +288,19 @@ def _score(
     order: Order,
     steepest: float,
     mean: Float64,
+    reference: Image,
 ) -> Score:
     """Press i, by models of all the others."""
     press, gradient = presses[i], labels[i]
-    shape = press.lit.shape
+    shape = press.shape
     v, u = np.mgrid[: shape[0], : shape[1]]
     away = np.hypot(u - press.circle.x, v - press.circle.y) / press.circle.radius
     others = [*range(i), *range(i + 1, len(presses))]
     model = _forward_model([forward[k] for k in others], order, steepest)
     light, _ = PhotometricLight(model, shape).change(gradient.astype(np.float32), slice(0, shape[0]))
     predicted = _smooth(light.astype(np.float64), BLUR) * mean
+    still = np.float64(reference) + press.drift  # what this frame would show without contact
+    predicted = np.clip(still + predicted, 0.0, 255.0) - still
     real = press.change * mean
     contact = away < 1.5
     weights = fit_inverse([inverse[k] for k in others], place=len(others) > FEW)

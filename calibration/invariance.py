@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from calibration import metrics
 from calibration.bundle import Calibration
-from calibration.compare import DRAWS, GRID, Comparison, Pair
+from calibration.compare import DRAWS, GRID, Comparison
 from calibration.sides import BadSide, Image
-from calibration.touched import Touch, touches
+from calibration.touched import touches
 from tacsim.optics.geometry import CanonicalGrid
 from tacsim.touch import CONTACT_HEIGHT
 
@@ -109,33 +109,52 @@ def invariance(
 
     Raises BadSide for fewer than FEWEST presses with contact in B.
     """
-    touched = {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
-    if len(touched) < FEWEST:
-        raise BadSide(
-            f"{len(touched)} pairs show contact in B; {FEWEST} are needed to tell how far two presses are apart"
-        )
-    pairs = [comparison.pairs[k] for k in touched]
-    patches, words = _patches(comparison, touched, calibration_b, grid)
-    order = np.argsort([patch.radius for patch in touched.values()])
-    steps = len(patches) + len(CHANGES)
+    folds = [(comparison, calibration_b)]
+    return pooled_invariance(folds, grid, on_step)
+
+
+def pooled_invariance(
+    folds: Sequence[tuple[Comparison, Calibration | None]],
+    grid: CanonicalGrid = GRID,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """The same of several comparisons, each with B's calibration: parts of one set of presses, of which each was left
+    out of the calibration that it is seen through. Raises BadSide for fewer than FEWEST presses with contact in B."""
+    touched = [
+        {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
+        for comparison, _ in folds
+    ]
+    count = sum(map(len, touched))
+    if count < FEWEST:
+        raise BadSide(f"{count} pairs show contact in B; {FEWEST} are needed to tell how far two presses are apart")
+    radii = [patch.radius for one in touched for patch in one.values()]
+    half, words = _size(folds[0][1], radii)
+    parts = [
+        _patches(comparison, one, calibration, grid, half)
+        for (comparison, calibration), one in zip(folds, touched, strict=True)
+        if one
+    ]
+    common = [name for name in VIEWS if all(name in part for part in parts)]
+    steps = len(common) + len(CHANGES)
     views: list[Invariance] = []
-    for name, (of_a, of_b, signal) in patches.items():
+    for name in common:
         on_step(len(views), steps)
-        views.append(_view(name, of_a, of_b, signal, order))
-    notes = [] if "height" in patches else ["gradient and height are left out: no surfaces on both sides"]
+        of_a, of_b = (np.concatenate([part[name][side] for part in parts]) for side in (0, 1))
+        signal = float(np.mean(np.concatenate([part[name][2] for part in parts])))
+        views.append(_view(name, of_a, of_b, signal, np.argsort(radii)))
+    notes = [] if "height" in common else ["gradient and height are left out: no surfaces on both sides"]
     angle = math.nan
     drifts: list[Drift] = []
-    if comparison.touched_a is None or calibration_b is None:
+    if any(comparison.touched_a is None or calibration is None for comparison, calibration in folds):
         notes.append("no drift table: it needs surfaces of A and the calibration of B")
     else:
-        truth = [comparison.touched_a[k] for k in touched]
-        angle = _angle(comparison, pairs, truth, calibration_b, grid, None, None)
+        angle = _angle(folds, touched, grid, None, None)
         for k, change in enumerate(CHANGES):
             on_step(len(views) + k, steps)
-            fresh = _angle(comparison, pairs, truth, calibration_b, grid, change, change)
-            stale = _angle(comparison, pairs, truth, calibration_b, grid, change, None)
+            fresh = _angle(folds, touched, grid, change, change)
+            stale = _angle(folds, touched, grid, change, None)
             drifts.append(Drift(change, fresh - angle, stale - angle))
-    return Report(len(touched), tuple(views), words, angle, tuple(drifts), tuple(notes))
+    return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
 
 def ratio(of_a: Float64, of_b: Float64, order: NDArray[np.intp]) -> tuple[float, float]:
@@ -201,16 +220,22 @@ def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray
     )
 
 
-def _patches(
-    comparison: Comparison, touched: dict[int, metrics.Patch], calibration: Calibration | None, grid: CanonicalGrid
-) -> tuple[dict[str, tuple[Float64, Float64, float]], str]:
-    """Of each view the patches (n, d) of A and of B and B's signal; and how large they are."""
+def _size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
+    """Half the side of the patch [px], and how large that is in words."""
     if calibration is not None:
-        half = PATCH / 2 / calibration.geometry.pixel_pitch
-        words = f"{PATCH * 1e3:g} mm"
-    else:
-        half = OF_RADIUS / 2 * float(np.median([patch.radius for patch in touched.values()]))
-        words = f"{2 * half:.0f} px: {OF_RADIUS:g} radii of the usual contact region"
+        return PATCH / 2 / calibration.geometry.pixel_pitch, f"{PATCH * 1e3:g} mm"
+    half = OF_RADIUS / 2 * float(np.median(radii))
+    return half, f"{2 * half:.0f} px: {OF_RADIUS:g} radii of the usual contact region"
+
+
+def _patches(
+    comparison: Comparison,
+    touched: dict[int, metrics.Patch],
+    calibration: Calibration | None,
+    grid: CanonicalGrid,
+    half: float,
+) -> dict[str, tuple[Float64, Float64, Float64]]:
+    """Of each view the patches (n, d) of A and of B, and the norms (n,) of B's change."""
     found: dict[str, tuple[list[Float64], list[Float64], list[float]]] = {view: ([], [], []) for view in VIEWS}
     a0, b0 = comparison.alignment(comparison.a.reference), comparison.b.reference.astype(np.float32)
     for k, patch in touched.items():
@@ -232,10 +257,10 @@ def _patches(
             cut = _cut(other, at_x, at_y, reach)
             _add(found[view], _cut(one, at_x, at_y, reach), cut, cut)
     return {
-        view: (np.array(of_a), np.array(of_b), float(np.mean(signals)))
+        view: (np.array(of_a), np.array(of_b), np.array(signals))
         for view, (of_a, of_b, signals) in found.items()
         if of_a
-    }, words
+    }
 
 
 def _add(to: tuple[list[Float64], list[Float64], list[float]], a: Float64, b: Float64, change: Float64) -> None:
@@ -273,23 +298,26 @@ def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> Float64
 
 
 def _angle(
-    comparison: Comparison,
-    pairs: Sequence[Pair],
-    truth: Sequence[Touch],
-    calibration: Calibration,
+    folds: Sequence[tuple[Comparison, Calibration | None]],
+    touched: Sequence[dict[int, metrics.Patch]],
     grid: CanonicalGrid,
     change: Change | None,
     of_reference: Change | None,
 ) -> float:
     """Mean gradient angle error of B's changed frames against A's surfaces, where those are pressed [degrees]."""
-    reference = comparison.b.reference if of_reference is None else of_reference(comparison.b.reference)
-    shots = [replace(pair.b, image=pair.b.image if change is None else change(pair.b.image)) for pair in pairs]
-    found, _ = touches(replace(comparison.b, reference=reference), shots, calibration, grid)
-    assert found is not None  # there is a calibration
-    angles = [
-        metrics.gradient_angle(
-            one.gradient, other.gradient, metrics.pressed_region(one.height, CONTACT_HEIGHT) & other.valid
-        )
-        for one, other in zip(truth, found, strict=True)
-    ]
+    angles: list[float] = []
+    for (comparison, calibration), one in zip(folds, touched, strict=True):
+        assert comparison.touched_a is not None
+        truth = [comparison.touched_a[k] for k in one]
+        reference = comparison.b.reference if of_reference is None else of_reference(comparison.b.reference)
+        real = [comparison.pairs[k].b for k in one]
+        shots = [replace(shot, image=shot.image if change is None else change(shot.image)) for shot in real]
+        found, _ = touches(replace(comparison.b, reference=reference), shots, calibration, grid)
+        assert found is not None  # there is a calibration
+        angles += [
+            metrics.gradient_angle(
+                seen.gradient, other.gradient, metrics.pressed_region(seen.height, CONTACT_HEIGHT) & other.valid
+            )
+            for seen, other in zip(truth, found, strict=True)
+        ]
     return float(np.nanmean(angles))

@@ -39,9 +39,10 @@ class Order:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equations:
-    """Normal equations of one press for the terms of LARGEST."""
+    """Normal equations of one press for the terms of LARGEST. Each channel has its own where pixels are saturated in
+    one and not in another."""
 
-    square: Float64  # (terms, terms)
+    square: Float64  # (1, terms, terms) of all channels, or (3, terms, terms)
     right: Float64  # (terms, 3)
     power: float  # sum of the squares of the changes of colour
     count: int  # numbers summed
@@ -54,37 +55,52 @@ def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: i
     return (place[:, :, None] * normal[:, None, :]).reshape(len(gradient), -1)
 
 
-def equations(gradient: Float64, u: Float64, v: Float64, change: Float64) -> Equations:
-    """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3)."""
+def equations(
+    gradient: Float64, u: Float64, v: Float64, change: Float64, lit: NDArray[np.bool_] | None = None
+) -> Equations:
+    """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
+    and counts; None: all."""
     terms = features(gradient, u, v, *LARGEST)
-    return Equations(terms.T @ terms, terms.T @ change, float((change**2).sum()), change.size)
+    square = terms.T @ terms
+    if lit is None or lit.all():
+        return Equations(square[None], terms.T @ change, float((change**2).sum()), change.size)
+    burnt = [terms[~lit[:, channel]] for channel in range(3)]
+    counted = change * lit
+    squares = np.stack([square - lost.T @ lost for lost in burnt])
+    return Equations(squares, terms.T @ counted, float((counted**2).sum()), int(lit.sum()))
 
 
 def solve(presses: Sequence[Equations], order: Order) -> Float64:
     """(terms, 3) ridge weights."""
     use = _terms_of(order)
-    square = sum((p.square[np.ix_(use, use)] for p in presses), np.zeros((len(use), len(use))))
+    square = sum((_part(p, use) for p in presses), np.zeros((1, len(use), len(use))))
     right = sum((p.right[use] for p in presses), np.zeros((len(use), 3)))
     return ridge_solution(square, right, order.ridge)
 
 
 def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
-    """Solution of the normal equations with `ridge` times the mean diagonal added to the diagonal."""
-    shift = ridge * float(np.trace(square)) / len(square)
-    return np.asarray(np.linalg.solve(square + max(shift, 1e-300) * np.eye(len(square)), right), dtype=np.float64)
+    """(terms, 3) solution of the normal equations (1 or 3, terms, terms), (terms, 3) with `ridge` times the mean
+    diagonal added to the diagonal."""
+    size = square.shape[-1]
+    shift = np.maximum(ridge * np.trace(square, axis1=1, axis2=2) / size, 1e-300)
+    regular = square + shift[:, None, None] * np.eye(size)
+    if len(square) == 1:
+        return np.asarray(np.linalg.solve(regular[0], right), dtype=np.float64)
+    return np.asarray(np.linalg.solve(regular, right.T[..., None])[..., 0].T, dtype=np.float64)
 
 
 def left_out_error(presses: Sequence[Equations], order: Order) -> float:
     """Root mean square error of each press predicted from all others [relative change of colour]."""
     use = _terms_of(order)
-    grid = np.ix_(use, use)
-    square = sum((p.square[grid] for p in presses), np.zeros((len(use), len(use))))
+    square = sum((_part(p, use) for p in presses), np.zeros((1, len(use), len(use))))
     right = sum((p.right[use] for p in presses), np.zeros((len(use), 3)))
     error, count = 0.0, 0
     for press in presses:
-        own, wanted = press.square[grid], press.right[use]
+        own, wanted = _part(press, use), press.right[use]
         weights = ridge_solution(square - own, right - wanted, order.ridge)
-        error += press.power - 2 * float((weights * wanted).sum()) + float((weights * (own @ weights)).sum())
+        seen = own @ weights if len(own) == 1 else own @ weights.T[..., None]  # (1, terms, 3) or (3, terms, 1)
+        seen = seen[0] if len(own) == 1 else seen[..., 0].T
+        error += press.power - 2 * float((weights * wanted).sum()) + float((weights * seen).sum())
         count += press.count
     return float(np.sqrt(max(error, 0.0) / count))
 
@@ -105,6 +121,10 @@ def choose_order(presses: Sequence[Equations]) -> Order:
             best = (error, order)
     assert best is not None
     return best[1]
+
+
+def _part(press: Equations, use: list[int]) -> Float64:
+    return press.square[:, use][:, :, use]
 
 
 def _terms_of(order: Order) -> list[int]:

@@ -6,9 +6,25 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
-from robot.bench import deep, films, incline, labels, materials, press, real, reliability, scenes, squeeze
+from robot.bench import (
+    balls,
+    deep,
+    depths,
+    films,
+    incline,
+    labels,
+    materials,
+    observe,
+    press,
+    punches,
+    real,
+    reliability,
+    scenes,
+    squeeze,
+    twins,
+)
 from robot.bench.labels import BadData
-from robot.bench.runner import Case
+from robot.bench.runner import Case, lacking
 from robot.bench.schema import Group
 
 CASES: tuple[Case, ...] = (
@@ -24,6 +40,12 @@ CASES: tuple[Case, ...] = (
 BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
     ("real", real.CASE): real.contact_radius,
     ("real", films.CASE): films.marker_film,
+    ("real", balls.CASE): balls.ball_presses,
+    ("real", depths.CASE): depths.known_depth,
+    ("real", punches.CASE): punches.punch,
+    ("real", twins.CASE): twins.invariance,
+    ("real", observe.RENDER): observe.calibrated_render,
+    ("real", observe.NORMALISE): observe.normaliser,
 }
 
 
@@ -41,14 +63,19 @@ def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data
 
 
 def _real_cases(data: Path) -> tuple[Case, ...]:
-    """Those of the presses and of the films below `data`. Raises BadData where there is neither, ConfigError."""
-    found = films.cases(data) if data.is_dir() else ()
+    """Those of the frames below `data`, and those that need none; what is not there says so. Raises BadData where there
+    is nothing at all, or where labels of the folder's own name what is not there; ConfigError."""
+    found = (*films.cases(data), *balls.cases(data)) if data.is_dir() else ()
     try:
-        return (*real.cases(data), *found)
-    except BadData:
-        if not found or (data / labels.OWN).is_file():
+        presses = real.cases(data)
+    except BadData as error:
+        if all(case.missing for case in found) or (data / labels.OWN).is_file():
             raise
-        return found
+        presses = (lacking("real", real.CASE, str(error)),)
+    if not any(case.name == films.CASE for case in found):
+        found = (*found, lacking("real", films.CASE, f"no film of a dotted gel below {data}"))
+    of_light = (*depths.cases(data), *punches.cases(data), *twins.cases(data))
+    return (*presses, *found, *of_light, *observe.CASES)
 
 
 def description(group: Group, name: str, method: str) -> str:

@@ -42,6 +42,15 @@ class Press(Facts):
         return f"R {self.ball_radius * 1e3:g} mm, {self.depth * 1e3:g} mm deep"
 
 
+class Punch(Facts):
+    """One press of a flat punch straight into the gel."""
+
+    frames: Annotated[tuple[str, ...], Field(min_length=1)]  # names of its frame, the first that exists counts
+    mesh: Annotated[tuple[str, ...], Field(min_length=1)]  # names of an STL in mm whose highest face touches the gel; x
+    # points right in the image and y up
+    depth: Positive  # commanded [m]
+
+
 class Presses(Facts):
     """Presses on one sensor."""
 
@@ -53,7 +62,9 @@ class Presses(Facts):
     depth_uncertainty: Annotated[Length, Field(ge=0)] = 0.0  # [m]
     backgrounds: Annotated[tuple[str, ...], Field(min_length=1)]  # names of the frame without contact, seen from the
     # folder of the presses' frames; the first that exists counts
+    light: str = ""  # name of the ball presses (balls.yaml) on the same sensor that its light is calibrated by
     presses: Annotated[tuple[Press, ...], Field(min_length=1)]
+    punches: tuple[Punch, ...] = ()
 
     @property
     def balls(self) -> list[float]:
@@ -76,7 +87,7 @@ def find_frames(folder: Path, labels: Presses) -> dict[Press, Path]:
 
     Raises BadData when there is none at all, when a name is there twice, or for a press with neither frame nor radius.
     """
-    found = {press: path for press in labels.presses if (path := _find(folder, press.frames)) is not None}
+    found = {press: path for press in labels.presses if (path := find(folder, press.frames)) is not None}
     if not found:
         wanted = ", ".join(press.frames[0] for press in labels.presses if press.frames) or "(the labels name no frame)"
         raise BadData(
@@ -95,16 +106,30 @@ def find_frames(folder: Path, labels: Presses) -> dict[Press, Path]:
 def read_frames(folder: Path, labels: Presses) -> tuple[Image, dict[Press, Image]]:
     """The frame without contact, and those of the presses, (H, W, 3) RGB. Raises BadData that names the file."""
     paths = find_frames(folder, labels)
-    home = next(iter(paths.values())).parent
-    background = next((path for name in labels.backgrounds if (path := home / name).is_file()), None)
-    if background is None:
-        raise BadData(f"{home} has no frame without contact; looked for {', '.join(labels.backgrounds)}")
-    reference = _read(background)
+    background, reference = read_background(next(iter(paths.values())).parent, labels)
     frames = {press: _read(path) for press, path in paths.items()}
     for press, frame in frames.items():
         if frame.shape != reference.shape:
             raise BadData(f"{paths[press]} and {background} differ in size; they must be of one camera")
     return reference, frames
+
+
+def read_punches(folder: Path, labels: Presses) -> dict[Punch, tuple[Path, Image]]:
+    """Mesh and frame of each punch that has both below `folder`. Raises BadData that names the file."""
+    found = {}
+    for punch in labels.punches:
+        mesh, frame = find(folder, punch.mesh), find(folder, punch.frames)
+        if mesh is not None and frame is not None:
+            found[punch] = mesh, _read(frame)
+    return found
+
+
+def read_background(home: Path, labels: Presses) -> tuple[Path, Image]:
+    """The picture without contact of frames in `home`, and its path. Raises BadData."""
+    background = next((path for name in labels.backgrounds if (path := home / name).is_file()), None)
+    if background is None:
+        raise BadData(f"{home} has no frame without contact; looked for {', '.join(labels.backgrounds)}")
+    return background, _read(background)
 
 
 def _read(path: Path) -> Image:
@@ -114,7 +139,8 @@ def _read(path: Path) -> Image:
         raise BadData(str(error)) from None
 
 
-def _find(folder: Path, names: Iterable[str]) -> Path | None:
+def find(folder: Path, names: Iterable[str]) -> Path | None:
+    """The first of these names that is below `folder`; None without. Raises BadData for one that is there twice."""
     for name in names:
         found = sorted(folder.rglob(name))
         if len(found) > 1:

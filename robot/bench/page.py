@@ -15,7 +15,7 @@ GROUP_WORDS = {
     "squeeze": "Squeeze: plasticine between two gels",
     "materials": "Materials: laws, elements, transfers, and what a substep costs",
     "scenes": "Scenes: cost by what is in them",
-    "real": "Real: contact radius of balls on a real sensor",
+    "real": "Real: frames of real sensors, and what they cost",
 }
 COLUMNS = ("case", "method", "resolution", "seconds", "CPU s", "error", "MB", "substeps")
 
@@ -40,9 +40,10 @@ READING = (
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
     "the circle in the real frame with that in our picture, found by the same fit; rows ending in `pressure` compare "
     "our contact itself with the radius in the labels. Films of dotted gels under a press are found alike, by "
-    "`films.yaml`: the share of their dots that is followed to the end, how still the dots lie at rest, and "
-    "the time of "
-    "a frame."
+    "`films.yaml`: the share of their dots that is followed to the end, how still the dots lie at rest, and the time "
+    "of a frame. Presses of a ball are described by `balls.yaml`; `light` in `presses.yaml` names those by which the "
+    "sensor of the known depths is calibrated. *null* beside an error is what no contact at all would score. What "
+    "the folder lacks stands under *Not measured*."
 )
 
 
@@ -52,6 +53,8 @@ def cells(row: Row) -> list[str]:
     spread = "" if row.spread is None else f" ± {row.spread:.2g}"
     substeps = "" if row.substeps is None else str(row.substeps)
     error = f"{row.error:.3g} {row.error_unit}"
+    null = next((value for name, value in row.figures.items() if name.startswith("null")), None)
+    error += "" if null is None else f" (null {null:.3g})"
     return [
         name, row.method, row.resolution, f"{row.seconds:.3g}{spread}", f"{row.cpu_seconds:.3g}", error,
         f"{row.peak_mb:.0f}", substeps,
@@ -107,6 +110,7 @@ def markdown(report: Report) -> str:
         parts += ["## Failed", *(f"- {f.case}, {f.method}, {f.resolution}: {f.cause}" for f in report.failures)]
     parts += [
         "## Not measured",
+        *(["\n".join(f"- {m.case}: {m.cause}" for m in report.missing)] if report.missing else []),
         "Whether hard cases end their process is counted by a test, `test_no_case_ended_the_process` in "
         "`tests/stability`.",
     ]

@@ -76,7 +76,7 @@ def draw_radii(rows: Sequence[Row], path: Path) -> bool:
     """
     from tacsim.figure import canvas, plain, save
 
-    found = [row for row in rows if row.group == "real" and "depth_mm" in row.figures]
+    found = [row for row in rows if row.group == "real" and "thickness_mm" in row.figures]
     if not found:
         return False
     thickness = found[0].figures["thickness_mm"]

@@ -20,10 +20,11 @@ from datetime import UTC, datetime
 from importlib import metadata
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from robot.bench.cache import fingerprint
 from robot.bench.measure import Measurement, forget_peak_memory, peak_memory
-from robot.bench.schema import Failure, Group, Machine, Metadata, Report, Row
+from robot.bench.schema import Failure, Group, Machine, Metadata, Missing, Report, Row
 from robot.realtime import allowed
 
 EXIT = 10.0  # [s] a process may take to end after its last word
@@ -41,6 +42,16 @@ class Case:
     measure: Callable[[int], list[Measurement]]  # repetitions -> rows
     baseline: bool = False  # only with --baselines: a method that is not ours
     long: bool = False  # only with --long: ours, but more than some seconds
+    missing: str = ""  # why it cannot be measured here: what the user's folder lacks
+
+
+def lacking(group: Group, name: str, why: str, resolution: str = "") -> Case:
+    """A case of ours that cannot be measured here, and why."""
+    return Case(group, name, "tacsim", resolution, _never, missing=why)
+
+
+def _never(repeat: int) -> list[Measurement]:
+    raise AssertionError("a case that lacks its frames was measured")
 
 
 class Stopped(RuntimeError):
@@ -56,11 +67,11 @@ def run_cases(
     (commit, modified), code = _commit(), fingerprint("tacsim", "robot", "calibration")
     rows: list[Row] = []
     failures: list[Failure] = []
-    for together in _apart(cases):
+    missing = [Missing(**_names(case), cause=case.missing) for case in cases if case.missing]
+    for together in _apart([case for case in cases if not case.missing]):
         for case, found in _run(together, repeat, on_start, stop):
             if isinstance(found, str):
-                names = {"group": case.group, "case": case.name, "method": case.method, "resolution": case.resolution}
-                failures.append(Failure(**names, cause=found))
+                failures.append(Failure(**_names(case), cause=found))
             else:
                 rows += found
     groups = list(dict.fromkeys(case.group for case in cases))
@@ -80,7 +91,12 @@ def run_cases(
         ),
         results=rows,
         failures=failures,
+        missing=missing,
     )
+
+
+def _names(case: Case) -> dict[str, Any]:
+    return {"group": case.group, "case": case.name, "method": case.method, "resolution": case.resolution}
 
 
 def _apart(cases: Sequence[Case]) -> list[list[Case]]:

@@ -48,6 +48,16 @@ class Failure(_Frozen):
     cause: str
 
 
+class Missing(_Frozen):
+    """A case that could not be measured with what there was; not a failure."""
+
+    group: Group
+    case: str
+    method: str
+    resolution: str
+    cause: str  # what is missing, and where it was looked for
+
+
 class Machine(_Frozen):
     """Where it was measured. The load averages tell how much else went on."""
 
@@ -81,6 +91,7 @@ class Report(_Frozen):
     metadata: Metadata
     results: list[Row]
     failures: list[Failure] = []
+    missing: list[Missing] = []
 
 
 def json_schema() -> dict[str, Any]:

@@ -76,6 +76,23 @@ def ratio(above: Find, below: Find) -> Find:
     return find
 
 
+def mean(what: str, case: str, variant: str = "", ending: str = "", *, method: str = "tacsim") -> Find:
+    """The mean of `what` over the rows of a case whose variant begins and ends so."""
+
+    def find(rows: Sequence[Row]) -> float | None:
+        found = [
+            value
+            for row in rows
+            if (row.case, row.method) == (case, method)
+            and row.variant.startswith(variant)
+            and row.variant.endswith(ending)
+            and (value := _number(row, what)) is not None
+        ]
+        return sum(found) / len(found) if found else None
+
+    return find
+
+
 def from_depth(least: float, what: str, ending: str) -> Find:
     """The worst contact radius of the real group, presses of at least `least` [mm], by the end of the variant."""
 
@@ -108,6 +125,22 @@ def _peer(what: str) -> Find:
 
 def _squeeze(what: str, variant: str, preset: str = "", scale: float = 1.0) -> Find:
     return pick(what, "squeeze", variant, resolution=preset, scale=scale)
+
+
+def _ball(what: str, name: str) -> Find:
+    return mean(what, "ball_presses", name, ": picture")
+
+
+def _from_depth(what: str) -> Find:
+    return mean(what, "known_depth", ending=": picture")
+
+
+def _punch(what: str) -> Find:
+    return mean(what, "punch", method="layer")
+
+
+def _twins(what: str, variant: str) -> Find:
+    return pick(what, "invariance", variant)
 
 
 TARGETS: tuple[Target, ...] = (
@@ -151,6 +184,40 @@ TARGETS: tuple[Target, ...] = (
     Target("contact radius, our image against real ones", "px", 2, None, from_depth(0.5, "error", ": image")),
     Target("contact radius, our contact against labels", "px", 2, None, from_depth(0.5, "error", ": pressure"),
            remark="0.05 mm of depth, the uncertainty of the set, are 1 px"),
+    Target("ball presses left out, THUsight: contact error", "grey", 7.2, 6, _ball("error", "THUsight")),
+    Target("... correlation of its change of colour", "", 0.98, 0.99, _ball("ncc", "THUsight"), True),
+    Target("ball presses left out, Taxim GelSight: contact error", "grey", 6.1, 5, _ball("error", "Taxim")),
+    Target("ball presses left out, FOTS GelSight: contact error", "grey", 4.0, 3.2, _ball("error", "FOTS")),
+    Target("balls simulated from depth alone: contact error", "grey", 7, 5, _from_depth("error")),
+    Target("... SSIM there", "", 0.88, 0.92, _from_depth("ssim"), True),
+    Target("... correlation there", "", 0.98, 0.99, _from_depth("ncc"), True),
+    Target("flat punches, outline scaled once: contact error", "grey", 11, 9, _punch("error")),
+    Target("... correlation within that outline", "", 0.90, 0.95, _punch("ncc"), True),
+    Target("normals in contact of left-out presses, THUsight", "deg", 3.5, 3, pick("error", "ball_presses",
+           "THUsight: normals")),
+    Target("height error of the indentation, shape", "%", 5, 3, mean("error", "known_depth", ending=": height")),
+    Target("... with its zero and the commanded depth", "%", 5, 3, mean("whole_percent", "known_depth",
+           ending=": height"), remark="the depths of the set are known to 0.05 mm: 5 to 20 % of them"),
+    Target("our gel beside the real one, found in pictures: rho of gradients", "x", 1, 0.7,
+           _twins("error", "pictures: rho, gradient")),
+    Target("... rho of heights", "x", 1, 0.6, _twins("error", "pictures: rho, height")),
+    Target("... lower end of the AUC's 95 % interval, gradients", "", 0.55, 0.5,
+           _twins("auc_low", "pictures: rho, gradient")),
+    Target("... lower end of the AUC's 95 % interval, heights", "", 0.55, 0.5,
+           _twins("auc_low", "pictures: rho, height")),
+    Target("the same by the surface that the simulator knows: rho of gradients", "x", 1, 0.7,
+           _twins("error", "surfaces: rho, gradient")),
+    Target("... rho of heights, by that surface", "x", 1, 0.6, _twins("error", "surfaces: rho, height")),
+    Target("... lower end of the AUC's 95 % interval, gradients, by that surface", "", 0.55, 0.5,
+           _twins("auc_low", "surfaces: rho, gradient")),
+    Target("... lower end of the AUC's 95 % interval, heights, by that surface", "", 0.55, 0.5,
+           _twins("auc_low", "surfaces: rho, height"),
+           remark="a slow sink of the whole gel round a press looks like drift of the light, and is removed with it"),
+    Target("gain -30 %: extra gradient error", "deg", 0.5, 0.2, _twins("extra_deg", "surfaces: drift, gain −30 %")),
+    Target("a ball touched 24 times, against the Cramér-Rao bound", "x", 1.3, 1.1, pick("bound_ratio", "touch_ball")),
+    Target("calibrated picture, 640 x 480", "ms", 10, 5, pick("seconds", "calibrated_render", "640", scale=1e3)),
+    Target("calibrated picture, 320 x 240", "ms", 3, 1.5, pick("seconds", "calibrated_render", "320", scale=1e3)),
+    Target("observation with height from a picture, 320 x 240", "ms", 5, 2, pick("seconds", "normaliser", scale=1e3)),
     Target("markers kept through a real press", "%", 95, 99, pick("kept_percent", "marker_film"), True,
            remark="dots that leave the picture are lost to it"),
     Target("... of those that stay in the picture", "%", None, 99, pick("kept_in_picture_percent", "marker_film"),

@@ -162,5 +162,7 @@ def _show(report: Report) -> None:
         table.add_row(*cells(row))
     # a file or a pipe has no width; a table folded to 80 columns cannot be read there
     Console(width=None if results.is_terminal else 160, highlight=False).print(table)
+    for lack in report.missing:
+        notes.print(f"not measured: {lack.case}: {lack.cause}", markup=False)
     for failure in report.failures:
         complain(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")

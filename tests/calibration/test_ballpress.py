@@ -111,6 +111,23 @@ def test_left_out_scores_are_those_of_presses_nobody_has_seen(calibrated: tuple[
     assert np.median([score.angle for score in calibrated[0].scores]) < 2.0
 
 
+def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None:
+    """The bright side of every press is white in one channel. The other two still show the slope there, and what the
+    camera cut off is not asked of the model."""
+    lit, burnt = HiddenSensor(3), HiddenSensor(3)
+    colour = int(np.argmax(lit.empty().mean(axis=(0, 1))))
+    burnt._base = burnt._base + 110.0 * np.eye(3)[colour]
+    fits = []
+    for sensor in (lit, burnt):
+        fits.append(calibrate_light(sensor.empty(), named(sensor.presses(6)), BALL_PX))
+    shares = [1.0 - press.lit.mean() for press in fits[1].presses]
+    assert min(shares) > 0.001 and len(fits[1].scores) == 6
+    wanted = np.mean([score.error for score in fits[0].scores])
+    assert np.mean([score.error for score in fits[1].scores]) < 1.05 * wanted
+    unseen = burnt.press(0.5e-3, 150, 90)
+    assert angle_in_contact(fits[1], unseen) < 1.2
+
+
 def test_one_press_gives_a_plain_model_and_a_warning(sensor: HiddenSensor) -> None:
     fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, 130, 100)]), BALL_PX)
     assert (fit.order.degree, fit.order.position) == (3, 0)

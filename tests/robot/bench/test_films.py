@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from robot.bench.cases import chosen, description
-from robot.bench.films import OWN, SHIPPED, Films, marker_film, read_films
+from robot.bench.films import CASE, OWN, SHIPPED, Films, marker_film, read_films
 from robot.bench.labels import BadData
 from tacsim.config import load
 from tests.calibration.dotted import draw, lattice_points
@@ -36,7 +36,7 @@ def film(tmp_path: Path) -> Path:
 
 
 def test_dots_are_followed_and_those_that_leave_are_told(film: Path) -> None:
-    (case,) = chosen(["real"], baselines=False, data=film)
+    (case,) = (case for case in chosen(["real"], baselines=False, data=film) if case.name == CASE)
     assert description("real", case.name, "tacsim").startswith("Dots followed")
     (row,) = case.measure(1)
     assert row.figures["dots"] == 48

@@ -54,6 +54,8 @@ def test_a_row_is_shown_with_time_error_and_memory(report: Report) -> None:
     shown = cells(row)
     assert shown[0] == f"{row.case}: v"
     assert "0.123 ± 0.02" in shown and "3.46 %" in shown and "171" in shown
+    beside = row.model_copy(update={"error": 3.4567, "error_unit": "grey", "figures": {"null_grey": 42.17}})
+    assert "3.46 grey (null 42.2)" in cells(beside)
     bare = row.model_copy(update={"figures": {"wall_per_particle_substep_ns": 75.4, "force_n": 1.0}})
     assert costs(bare) == ["75 ns wall a substep and particle"]
 

@@ -21,6 +21,7 @@ from robot.bench import (
     reliability,
     scenes,
     squeeze,
+    touching,
     twins,
 )
 from robot.bench.labels import BadData
@@ -46,6 +47,7 @@ BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend o
     ("real", twins.CASE): twins.invariance,
     ("real", observe.RENDER): observe.calibrated_render,
     ("real", observe.NORMALISE): observe.normaliser,
+    ("real", touching.CASE): touching.touch_ball,
 }
 
 
@@ -75,7 +77,7 @@ def _real_cases(data: Path) -> tuple[Case, ...]:
     if not any(case.name == films.CASE for case in found):
         found = (*found, lacking("real", films.CASE, f"no film of a dotted gel below {data}"))
     of_light = (*depths.cases(data), *punches.cases(data), *twins.cases(data))
-    return (*presses, *found, *of_light, *observe.CASES)
+    return (*presses, *found, *of_light, *observe.CASES, *touching.CASES)
 
 
 def description(group: Group, name: str, method: str) -> str:

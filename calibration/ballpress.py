@@ -97,15 +97,12 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
     Raises BadPresses, with what is wrong in every frame, when no press can be used.
     """
     _check_frames(reference, frames)
-    try:
-        base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
-    except UnusableReference as error:
-        raise BadPresses(str(error)) from None
+    mean = untouched_mean(reference)
     found: list[Press] = []
     refused: list[tuple[str, str]] = []
     for name, image in frames:
         try:
-            found.append(_find(name, image, reference, base.mean.astype(np.float64), ball))
+            found.append(find_press(name, image, reference, mean, ball))
         except (NoCircle, BadPresses) as error:
             refused.append((name, str(error)))
     presses, refined = _refined(found, refused, ball)
@@ -116,7 +113,7 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
     order = choose_order(forward_sets)
     steepest = max(rim_slope(press.circle, ball) for press in presses)
     scores = tuple(
-        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, base.mean.astype(np.float64))
+        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, mean)
         for i in range(len(presses))
         if len(presses) > 1
     )
@@ -146,8 +143,24 @@ def _check_frames(reference: Image, frames: Sequence[tuple[str, Image]]) -> None
         raise BadPresses("no frame of a press; give at least one, better 5 to 8, beside the one without contact")
 
 
-def _find(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> Press:
-    """Contact circle of one frame, about, and its change of colour without drift. Raises NoCircle, BadPresses."""
+def untouched_mean(reference: Image) -> Float64:
+    """(3,) mean colour of a picture without contact. Raises BadPresses for one that is dark or saturated."""
+    try:
+        base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
+    except UnusableReference as error:
+        raise BadPresses(str(error)) from None
+    return base.mean.astype(np.float64)
+
+
+def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> Press:
+    """Contact circle of one frame, about, and its change of colour without drift.
+
+    Args:
+        image, reference: (H, W, 3) uint8 RGB with and without contact; `mean` (3,) of the reference.
+        ball: radius of the ball [px].
+
+    Raises NoCircle, BadPresses.
+    """
     raw = image.astype(np.float64) - reference
     coarse = [_halved(picture) for picture in (image, reference)]
     circle = contact_circle(coarse[0], coarse[1], ball / 2)

@@ -23,6 +23,11 @@ class Drift:
     told: bool  # enough of the gel was calm; otherwise it is but the median of all
 
 
+def size_of(change: Float32) -> float:
+    """Mean over the gel of changes of colour (n, 3), in the channel that changed most [-]."""
+    return float(np.abs(change).mean(axis=0).max())
+
+
 class DriftFinder:
     """Finds the drift in a view of `shape` (H, W): a quadratic in the place through the calm pixels, twice, the second
     time through those near the first; their median where too few are calm to tell more."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
-from calibration.drift import DriftFinder
+from calibration.drift import DriftFinder, size_of
 from calibration.gradient import from_model
 from calibration.inverse import PolynomialSlopes
 from calibration.lens import Rectification, from_corners, from_geometry, from_view
@@ -97,11 +97,15 @@ class FrameNormaliser:
         return self._background
 
     @property
+    def drift(self) -> float | None:
+        """By how much the untouched gel's colour has changed since the reference [-], by the same picture; known
+        without slopes, too."""
+        return self._drift
+
+    @property
     def stale(self) -> bool:
         """True when the reference does not fit any more: take a fresh one as soon as nothing touches."""
-        if self._drift is not None and self._drift > STALE_COLOUR:
-            return True
-        return self._background is not None and self._background > STALE
+        return (self._drift or 0.0) > STALE_COLOUR or (self._background or 0.0) > STALE
 
     @property
     def finds_flow(self) -> bool:
@@ -134,13 +138,15 @@ class FrameNormaliser:
         self._background = self._drift = None
 
     def diagnostics(self) -> dict[str, float]:
-        """How far the last observation is to be trusted, where it was found in a picture: `beyond`, `background` and
-        `kept` as the properties say, and `stale` (0 or 1)."""
+        """How far the last observation is to be trusted, where it was found in a picture: `beyond`, `drift`,
+        `background` and `kept` as the properties say, and `stale` (0 or 1)."""
         if not self._sought:
             return {}
         found = {"stale": float(self.stale)}
         if self._find is not None:
             found["beyond"] = self._beyond
+        if self._drift is not None:
+            found["drift"] = self._drift
         if self._background is not None:
             found["background"] = self._background
         if self._markers is not None:
@@ -184,27 +190,32 @@ class FrameNormaliser:
         height = gradient = flow = None
         self._sought = any(part is not None for part in (self._find, self._markers, self._watched))
         if self._watched is not None:
-            self._watch(change)
+            drift = self._watched(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
+            self._drift = size_of(self._watched.at(drift)) if drift.told else self._drift
         if self._find is not None:
             assert self._reference is not None
             found = self._find(change, self._reference.relative)
             self._beyond = found.beyond
-            if found.background is not None:
-                self._background = found.background
-                _require_light(found.background, LOST, f"{found.background:.0f} degrees of slope")
+            if found.drift is not None:
+                self._drift, self._background = found.drift, found.background
             height, gradient = found.height, found.gradient
+        self._require_light()
         if self._markers is not None:
             deep = None if height is None else (height, canonical_cells(self._grid))
             flow = self._markers(frame.image, frame.index, deep)
         return height, gradient, flow
 
-    def _watch(self, change: NDArray[np.float32]) -> None:
-        """How far the light has drifted, of a sensor whose slopes are not known."""
-        assert self._watched is not None
-        drift = self._watched(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
-        if drift.told:
-            self._drift = float(np.abs(self._watched.at(drift)).mean(axis=0).max())
-            _require_light(self._drift, LOST_COLOUR, f"{self._drift:.0%} of its brightness")
+    def _require_light(self) -> None:
+        """Raises StaleReference."""
+        for told, limit, words in (
+            (self._background, LOST, "slopes of {:.0f} degrees"),
+            (self._drift, LOST_COLOUR, "{:.0%} of its colour"),
+        ):
+            if told is not None and told > limit:
+                raise StaleReference(
+                    f"the untouched gel differs from its reference by {words.format(told)}: nothing can be told by it. "
+                    "Is a lamp out, or the exposure another? If not, take a fresh reference (Rig.reset does)"
+                )
 
     def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference. It misses the
@@ -222,14 +233,6 @@ class FrameNormaliser:
                 f"frame.surface has height {surface.height.shape} and gradient {surface.gradient.shape}, the canonical "
                 f"grid is {shape}; sample it on the grid of the rig"
             )
-
-
-def _require_light(drift: float, limit: float, told: str) -> None:
-    if drift > limit:
-        raise StaleReference(
-            f"the untouched gel differs from its reference by {told}: nothing can be told by it. Is a lamp out, or the "
-            "exposure another? If not, take a fresh reference (Rig.reset does)"
-        )
 
 
 def for_simulated(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:

@@ -21,9 +21,9 @@ DARKEST = 8.0  # mean grey level of each channel over the gel; below, noise and 
 
 
 STALE = 2.0  # background slopes that a reference which still fits never shows; real sensors: 0.3 to 0.7 [degrees]
-STALE_COLOUR = 0.05  # the same where no slopes are known: relative change of the untouched gel's colour [-]
+STALE_COLOUR = 0.05  # the same of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
 LOST = 20.0  # background slopes that no drift of a working light makes [degrees]
-LOST_COLOUR = 0.5  # the same where no slopes are known [-]
+LOST_COLOUR = 0.5  # the same of the colour [-]
 EXCHANGED = 0.5  # red and blue are exchanged if the picture is then so much nearer to the one it should be like
 ANOTHER = 0.02  # pictures that differ by less, each colour relative to its mean, are alike as they are [-]
 COARSE = 8  # pixels, each way, over which that is averaged

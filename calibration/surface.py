@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.depth import Integrator
-from calibration.drift import THIN, DriftFinder
+from calibration.drift import THIN, DriftFinder, size_of
 from calibration.gradient import GradientModel
 from tacsim.optics.geometry import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
@@ -35,10 +35,8 @@ class FoundSurface:
     height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
     gradient: Float32  # (h, w, 2) [-]
     beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
-    background: (
-        float | None
-    )  # mean angle of the slopes that the drift of the light would be [degrees]; None: too little
-    # of the gel is untouched to tell
+    drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it to tell
+    background: float | None  # mean angle of the slopes that this change would be taken for [degrees]
 
 
 class SurfaceFinder:
@@ -78,7 +76,7 @@ class SurfaceFinder:
         if self._dots:
             hidden = hidden | _ink(known.planes + planes)
         drift = self._drift(planes, hidden)
-        background = self._angle(self._drift.at(drift)) if drift.told else None
+        changed = self._drift.at(drift) if drift.told else None
         if self._drifts:
             self._drift.remove(planes, drift)
         gradient, beyond = self._slopes(np.moveaxis(planes, 0, -1))
@@ -92,7 +90,8 @@ class SurfaceFinder:
             height=self._cells(height),
             gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
             beyond=float(np.count_nonzero(beyond & ~hidden) / beyond.size),
-            background=background,
+            drift=None if changed is None else size_of(changed),
+            background=None if changed is None else self._angle(changed),
         )
 
     def _angle(self, change: Float32) -> float:

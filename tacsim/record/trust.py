@@ -7,6 +7,7 @@ from typing import Any
 from tacsim.record.episode import Episode
 
 STALE = "stale_"  # 1: the reference does not fit any more; beginnings of names in Step.info, before a sensor's name
+DRIFT = "drift_"  # change of the untouched gel's colour since the reference [-]
 BACKGROUND = "background_"  # mean slope that the drift of the light would be taken for [degrees]
 BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrated slopes
 KEPT = "kept_"  # share of the markers that were seen
@@ -32,6 +33,7 @@ def trust(episode: Episode) -> dict[str, dict[str, Any]] | None:
         name: {
             "stale": sum(bool(value) for value in all_of(STALE + name)),
             "steps": len(all_of(STALE + name)),
+            "drift": max(all_of(DRIFT + name), default=None),
             "background": max(all_of(BACKGROUND + name), default=None),
             "beyond": max(all_of(BEYOND + name), default=None),
             "kept": min(all_of(KEPT + name), default=None),
@@ -45,7 +47,7 @@ def trust_rows(facts: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
     rows = []
     for name, told in facts.items():
         if told["stale"]:
-            most = "" if told["background"] is None else f", background {told['background']:.1f}° at most"
+            most = "" if told["drift"] is None else f", colour of the untouched gel off by up to {told['drift']:.0%}"
             rows.append(
                 (
                     "look at this",

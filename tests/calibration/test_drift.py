@@ -11,7 +11,7 @@ from calibration.ballpress import normal_angle
 from calibration.drift import DriftFinder
 from calibration.inverse import to_normal
 from calibration.normaliser import FrameNormaliser, for_calibrated, for_camera, for_pictures, for_simulated
-from calibration.reference import LOST, STALE, StaleReference, UnusableReference, require_order
+from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, require_order
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.optics.geometry import CanonicalGrid, SensorModel
@@ -91,14 +91,13 @@ def test_with_the_drift_removed_a_stale_reference_costs_little(
 def test_a_reference_becomes_stale_by_and_by(normalise: FrameNormaliser, sensor: HiddenSensor, bundle) -> None:
     press = sensor.press(0.5e-3, 130, 100)
     normalise.take_reference(frame(bundle[1]))
-    told = []
+    told: list[tuple[float, float, bool]] = []
     for gain in (1.0, 0.98, 0.95, 0.9, 0.8, 0.7):
         normalise(frame(gain * press.image.astype(float)), 0.0)
-        told.append((normalise.background, normalise.stale))
-    angles = [background for background, _ in told]
-    assert np.all(np.diff(angles) > 0)
-    assert [stale for _, stale in told] == [background > STALE for background in angles]
-    assert not told[2][1] and told[4][1]  # before it costs a degree, and after
+        told.append((normalise.background, normalise.drift, normalise.stale))
+    assert np.all(np.diff([background for background, _, _ in told]) > 0)
+    assert [drift for _, drift, _ in told] == pytest.approx([0.0, 0.02, 0.05, 0.1, 0.2, 0.3], abs=0.01)
+    assert not told[1][2] and told[3][2]  # before it costs a degree, and after
 
 
 @pytest.mark.parametrize(
@@ -108,7 +107,18 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
     normalise.take_reference(frame(bundle[1]))
     with pytest.raises(StaleReference, match=r"Is a lamp out.*take a fresh reference"):
         normalise(frame(change(sensor.press(0.5e-3, 130, 100).image.astype(float))), 0.0)
-    assert normalise.background > LOST
+    assert normalise.background > LOST or normalise.drift > LOST_COLOUR
+
+
+def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
+    """Three lights alike: dimmed together they leave the background flat, and heights too low."""
+    model = SensorModel()
+    normalise = for_pictures(model, (20e-3, 20e-3), GRID, drifts=True)
+    render = Renderer(model, (20e-3, 20e-3))
+    normalise.take_reference(frame(render(flat())))
+    deep = normalise(frame(render(dent())), 0.0).height.max()
+    assert normalise(frame(0.8 * render(dent()).astype(float)), 0.0).height.max() < 0.9 * deep
+    assert normalise.background < STALE and normalise.stale
 
 
 def test_where_too_little_is_untouched_the_last_word_stays(
@@ -143,10 +153,10 @@ def test_a_sensor_without_slopes_is_watched_by_its_colour() -> None:
     image = Renderer(SensorModel(), (20e-3, 20e-3))(dent()).astype(float)
     normalise.take_reference(frame(Renderer(SensorModel(), (20e-3, 20e-3))(flat())))
     normalise(frame(image), 0.0)
-    assert normalise.diagnostics() == {"stale": 0.0}
+    assert normalise.diagnostics() == {"stale": 0.0, "drift": pytest.approx(0.0, abs=0.02)}
     normalise(frame(0.9 * image), 0.0)
-    assert normalise.diagnostics() == {"stale": 1.0}
-    with pytest.raises(StaleReference, match="of its brightness"):
+    assert normalise.diagnostics() == {"stale": 1.0, "drift": pytest.approx(0.1, abs=0.02)}
+    with pytest.raises(StaleReference, match="of its colour"):
         normalise(frame(0.3 * image), 0.0)
 
 

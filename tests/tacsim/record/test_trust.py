@@ -33,16 +33,16 @@ def episode(*infos: dict[str, float]) -> Episode:
     return Episode(EpisodeMeta("bench", None, "none", 0, spec, {}), steps)
 
 
-FINE = {"stale_left_2": 0.0, "background_left_2": 0.4, "beyond_left_2": 0.0, "kept_left_2": 1.0}
-BAD = {"stale_left_2": 1.0, "background_left_2": 4.25, "beyond_left_2": 0.06, "kept_left_2": 0.5}
+FINE = {"stale_left_2": 0.0, "drift_left_2": 0.01, "background_left_2": 0.4, "beyond_left_2": 0.0, "kept_left_2": 1.0}
+BAD = {"stale_left_2": 1.0, "drift_left_2": 0.12, "background_left_2": 4.25, "beyond_left_2": 0.06, "kept_left_2": 0.5}
 
 
 def test_the_worst_of_an_episode_is_said() -> None:
     facts = trust(episode(FINE, BAD, FINE))
-    assert facts == {"left_2": {"stale": 1, "steps": 3, "background": 4.25, "beyond": 0.06, "kept": 0.5}}
+    assert facts == {"left_2": {"stale": 1, "steps": 3, "drift": 0.12, "background": 4.25, "beyond": 0.06, "kept": 0.5}}
     words = [value for _, value in trust_rows(facts)]
     assert len(words) == 3 and all(each.startswith("left_2: ") for each in words)
-    assert "stale reference in 1 of 3 observations, background 4.2° at most" in words[0]
+    assert "stale reference in 1 of 3 observations, colour of the untouched gel off by up to 12%" in words[0]
     assert "6% of the picture beyond the calibrated slopes" in words[1]
     assert "only 50% of the markers" in words[2]
 

@@ -12,7 +12,7 @@ Mask = NDArray[np.bool_]
 
 CALM = 0.08  # a pixel that changes less than this, drift apart, is not touched [-]
 LEAST_CALM = 0.15  # share of the view that must be calm for a drift to be told
-THIN = 3  # every so many pixels say enough of it
+THIN = 5  # every so many pixels say enough of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.ballpress import normal_angle
-from calibration.drift import DriftFinder
+from calibration.drift import THIN, DriftFinder
 from calibration.inverse import to_normal
 from calibration.normaliser import FrameNormaliser, for_calibrated, for_camera, for_pictures, for_simulated
 from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, require_order
@@ -182,7 +182,7 @@ def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
     finder = DriftFinder((120, 160))
     drift = finder(planes, hidden)
     assert drift.told
-    np.testing.assert_allclose(finder.at(drift), true[:, ::3, ::3].reshape(3, -1).T, atol=2e-4)
+    np.testing.assert_allclose(finder.at(drift), true[:, ::THIN, ::THIN].reshape(3, -1).T, atol=2e-4)
     finder.remove(planes, drift)
     assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
     assert not finder(planes, np.ones_like(hidden)).told

@@ -47,6 +47,9 @@ class PressCollection:
             circle = find_press("press", self._rectify(image), self._reference, self._mean, self._ball).circle
         except NoCircle as none:
             raise BadPresses(str(none)) from none
+        height, width = self._reference.shape[:2]
+        if min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) < circle.radius:
+            raise BadPresses("the contact is cut off by the border of the picture; press nearer to the middle")
         for number, other in enumerate(self._circles, start=1):
             if math.hypot(circle.x - other.x, circle.y - other.y) < APART * max(circle.radius, other.radius):
                 raise BadPresses(f"it is in the same place as press {number}; press elsewhere")

@@ -21,8 +21,9 @@ from calibration.reference import (
     STALE_COLOUR,
     Reference,
     StaleReference,
+    UnusableReference,
+    exchanged,
     make_reference,
-    require_order,
 )
 from calibration.surface import SurfaceFinder, seen_box, view, window
 from calibration.view import GelView
@@ -128,8 +129,11 @@ class FrameNormaliser:
         UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
         rectified = self._rectify(frame.image)
         reference = make_reference(rectified, self._rectify.valid, self._measured())
-        if self._untouched is not None:
-            require_order(rectified, self._untouched, self._rectify.valid)
+        if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
+            raise UnusableReference(
+                "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
+                "order; give pictures in the order in which they were calibrated (this program's is RGB)"
+            )
         if self._markers is not None:
             self._markers.take_reference(frame.image, frame.index)
         elif self._find is not None:

@@ -90,18 +90,16 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
     return Reference(image.astype(np.float32), mean, image / mean, valid, scale)
 
 
-def require_order(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> None:
-    """Raises UnusableReference when a contact-free image (H, W, 3) is like the `known` one of the same gel only with
-    red and blue exchanged. What counts is where on the gel each colour is bright: a dimmer lamp or another white
-    balance changes nothing. Where all colours are equally even, nothing is told."""
+def exchanged(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
+    """True when an image (H, W, 3) is like the `known` one of the same gel only with red and blue exchanged.
+
+    What counts is where on the gel each colour is bright: a dimmer lamp or another white balance changes nothing. Where
+    all colours are equally even, nothing is told, and the answer is no.
+    """
     one, other = (_pattern(picture, valid) for picture in (image, known))
     apart = float(np.sqrt(((one - other) ** 2).mean()))
-    exchanged = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
-    if apart > ANOTHER and exchanged < EXCHANGED * apart:
-        raise UnusableReference(
-            "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
-            "order; give pictures in the order in which they were calibrated (this program's is RGB)"
-        )
+    turned = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
+    return apart > ANOTHER and turned < EXCHANGED * apart
 
 
 def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:

@@ -110,6 +110,8 @@ def _write(
 
     found = _markers(fit, pitch) if markers else None
     _show(fit, pitch)
+    if found is None:
+        _look_for_dots(fit)
     if found is not None:
         notes.print(
             f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
@@ -145,6 +147,17 @@ def _markers(fit: Fit, pitch: float) -> Markers:
         ) from None
     rows, columns = lattice.present.shape
     return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
+def _look_for_dots(fit: Fit) -> None:
+    """A word on dots that nobody told of."""
+    from calibration.markers import require_no_markers
+    from calibration.reference import UnusableReference
+
+    try:
+        require_no_markers(fit.reference)
+    except UnusableReference:
+        notes.print("look at this: dots seem to be printed on the gel; give --markers, or each will pass for a dent")
 
 
 def _bundle(

@@ -111,9 +111,10 @@ def glaring() -> np.ndarray:
         (finger(), "no ball's contact is seen"),
         (PRESSES[0], "it is in the same place as press 1; press elsewhere"),
         (glaring(), r"saturated: shorten the exposure|no ball's contact"),
+        (SENSOR.press(0.5e-3, 8, 100).image, "the contact is cut off by the border of the picture"),
         (np.maximum(PRESSES[1], PRESSES[3]), "there is a second contact in the picture; press one ball at a time"),
     ],
-    ids=["no ball", "same place", "saturated", "two balls"],
+    ids=["no ball", "same place", "saturated", "cut off", "two balls"],
 )
 def test_a_press_that_tells_nothing_is_refused_and_asked_for_again(move: np.ndarray, why: str) -> None:
     person = Person([PRESSES[0], move, PRESSES[1]])

@@ -244,14 +244,12 @@ def for_simulated(model: SensorModel, gel_size: tuple[float, float], grid: Canon
     return FrameNormaliser(from_geometry(model.geometry, gel_size, canonical_image(grid)), grid)
 
 
-def for_pictures(
-    model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid, *, drifts: bool = False
-) -> FrameNormaliser:
-    """The normaliser of a sensor with the light of a model, of which only pictures are at hand: a camera's, or recorded
-    ones. Height and gradient are found by the inverse of that light, flow by its markers. drifts: the pictures are
-    real, and their light drifts. Raises ValueError for a light without inverse, or markers too small for the image."""
+def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+    """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
+    gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
+    without inverse, or markers too small for the image."""
     rectify = from_geometry(model.geometry, gel_size, view(grid, gel_size))
-    find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None, drifts=drifts)
+    find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None)
     return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size))
 
 
@@ -299,7 +297,7 @@ def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: Ca
     if facts.calibration is not None:
         return _of_bundle(facts.calibration, (facts.height, facts.width), grid)
     if facts.model is not None:
-        return for_pictures(facts.model, gel_size, grid, drifts=facts.mock is None)
+        return for_pictures(facts.model, gel_size, grid)
     shape = (facts.height, facts.width)
     return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid, drifts=True)
 

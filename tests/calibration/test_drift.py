@@ -113,7 +113,7 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
 def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
     """Three lights alike: dimmed together they leave the background flat, and heights too low."""
     model = SensorModel()
-    normalise = for_pictures(model, (20e-3, 20e-3), GRID, drifts=True)
+    normalise = for_pictures(model, (20e-3, 20e-3), GRID)
     render = Renderer(model, (20e-3, 20e-3))
     normalise.take_reference(frame(render(flat())))
     deep = normalise(frame(render(dent())), 0.0).height.max()

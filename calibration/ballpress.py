@@ -16,7 +16,7 @@ from calibration.circle import NoCircle, contact_circle
 from calibration.dent import STEEPEST_RIM, ContactCircle, Skirt, dent_gradient, rim_slope
 from calibration.inverse import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.photometry import FEW, Equations, Order, choose_order, equations, solve
-from calibration.reference import SATURATED, UnusableReference, make_reference
+from calibration.reference import SATURATED, STALE_COLOUR, UnusableReference, exchanged, make_reference
 from calibration.refine import BLUR as RIM_BLUR
 from calibration.refine import Refined, Window, refine
 from tacsim.optics.photometric import PhotometricLight, PhotometricModel, place_in_image
@@ -34,6 +34,10 @@ TOO_LITTLE = 0.5  # share of its change of colour that a dent may leave unexplai
 SURELY = 0.05  # a press that leaves no more than this share unexplained is no outlier
 OUTLIER = 5.0  # a press whose unexplained share is so many times the median's is left out
 MOST_SATURATED = 0.4  # of the contact
+MEDIAN_OF = 9  # frames, at most, whose median tells the order of colours
+ONE_PLACE = 0.2  # presses that spread over less than this share of the picture say nothing of the rest
+ODD = 3.0  # a press whose normals are so many times as wrong as usual, and by ODD_ANGLE, is worth a look
+ODD_ANGLE = 8.0  # [degrees]
 SECOND = 0.7  # a second patch as strong as this share of the first is a second contact
 
 
@@ -102,29 +106,27 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
     Raises BadPresses, with what is wrong in every frame, when no press can be used.
     """
     _check_frames(reference, frames)
-    try:
-        base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
-    except UnusableReference as error:
-        raise BadPresses(str(error)) from None
+    _check_order(reference, frames)
+    mean = untouched_mean(reference)
     found: list[Press] = []
     refused: list[tuple[str, str]] = []
     for name, image in frames:
         try:
-            found.append(_find(name, image, reference, base.mean.astype(np.float64), ball))
+            found.append(find_press(name, image, reference, mean, ball))
         except (NoCircle, BadPresses) as error:
             refused.append((name, str(error)))
     presses, refined = _refined(found, refused, ball)
-    warnings = [*_doubts(presses, ball), *(["only one press: it says little"] if len(presses) == 1 else [])]
     labels = [_gradient(press, refined.skirt, ball) for press in presses]
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     order = choose_order(forward_sets)
     steepest = max(rim_slope(press.circle, ball) for press in presses)
     scores = tuple(
-        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, base.mean.astype(np.float64), reference)
+        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, mean, reference)
         for i in range(len(presses))
         if len(presses) > 1
     )
+    warnings = [*_doubts(presses, ball, mean, len(refused)), *_doubts_of(scores)]
     return Fit(
         forward=_forward_model(forward_sets, order, steepest),
         inverse=_inverse_model(inverse_sets, steepest),
@@ -151,8 +153,33 @@ def _check_frames(reference: Image, frames: Sequence[tuple[str, Image]]) -> None
         raise BadPresses("no frame of a press; give at least one, better 5 to 8, beside the one without contact")
 
 
-def _find(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> Press:
-    """Contact circle of one frame, about, and its change of colour without drift. Raises NoCircle, BadPresses."""
+def _check_order(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
+    """The median of the frames shows the gel nearly without contact."""
+    few = np.median(np.stack([image for _, image in frames[:MEDIAN_OF]]), axis=0)
+    if exchanged(few.astype(np.float32), reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_)):
+        raise BadPresses(
+            "the frames are like the picture without contact only with red and blue exchanged: give all in one order"
+        )
+
+
+def untouched_mean(reference: Image) -> Float64:
+    """(3,) mean colour of a picture without contact. Raises BadPresses for one that is dark or saturated."""
+    try:
+        base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
+    except UnusableReference as error:
+        raise BadPresses(str(error)) from None
+    return base.mean.astype(np.float64)
+
+
+def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> Press:
+    """Contact circle of one frame, about, and its change of colour without drift.
+
+    Args:
+        image, reference: (H, W, 3) uint8 RGB with and without contact; `mean` (3,) of the reference.
+        ball: radius of the ball [px].
+
+    Raises NoCircle, BadPresses.
+    """
     raw = image.astype(np.float64) - reference
     coarse = [_halved(picture) for picture in (image, reference)]
     circle = contact_circle(coarse[0], coarse[1], ball / 2)
@@ -210,7 +237,7 @@ def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) ->
     raise BadPresses(f"no frame can be used. {why}")
 
 
-def _doubts(presses: Sequence[Press], ball: float) -> list[str]:
+def _doubts(presses: Sequence[Press], ball: float, mean: Float64, refused: int) -> list[str]:
     """What a person should look at. A wrong radius of the ball scales every slope, which another light explains just as
     well; only a contact as wide as the ball gives it away."""
     doubts = []
@@ -219,7 +246,30 @@ def _doubts(presses: Sequence[Press], ball: float) -> list[str]:
         doubts.append(
             f"contact as wide as the ball in {', '.join(steep)}: is the ball's radius (or the pixel pitch) right?"
         )
+    drift = float(np.abs(np.median([(p.drift / mean).mean(axis=(0, 1)) for p in presses], axis=0)).max())
+    if drift > STALE_COLOUR:
+        doubts.append(
+            f"where nothing touches, the presses differ from the picture without contact by {drift:.0%}: was it taken "
+            "with the same light, just before?"
+        )
+    if refused > len(presses):
+        doubts.append("most frames were left out: does the picture without contact really show none?")
+    if len(presses) == 1:
+        return [*doubts, "only one press: it says little"]
+    height, width = presses[0].lit.shape
+    if max(np.ptp([p.circle.x for p in presses]) / width, np.ptp([p.circle.y for p in presses]) / height) < ONE_PLACE:
+        doubts.append("all presses are in one place: nothing is known of light elsewhere on the gel; spread them")
     return doubts
+
+
+def _doubts_of(scores: Sequence[Score]) -> list[str]:
+    """Presses that the others do not predict."""
+    angles = [score.angle for score in scores]
+    odd = [s for s in scores if s.angle > max(ODD_ANGLE, ODD * float(np.median(angles)))] if len(scores) > 2 else []
+    return [
+        f"{s.name} is predicted badly by the others, normals off by {s.angle:.0f} degrees: another ball, a bad frame?"
+        for s in odd
+    ]
 
 
 def _window(press: Press) -> Window:

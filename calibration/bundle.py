@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import stat
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -31,7 +32,7 @@ from tacsim.record.images import decode_image, encode_png
 FORMAT = 2
 READABLE = (1, 2)  # 1: without view
 FILE, REFERENCE = "calibration.yaml", "reference.png"
-LARGEST_FILE = 1 << 20  # [bytes] of the YAML
+LARGEST_FILE, LARGEST_PICTURE = 1 << 20, 1 << 26  # [bytes] of the YAML, and of the picture
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -89,6 +90,14 @@ class Calibration(Facts):
         return (self.geometry.height, self.geometry.width) if self.view is None else self.view.image_shape
 
     @model_validator(mode="after")
+    def _picture_shows_the_gel(self) -> Self:
+        pitch = self.geometry.pixel_pitch
+        shown = (self.geometry.width * pitch, self.geometry.height * pitch)
+        if any(abs(one - other) > pitch for one, other in zip(shown, self.gel_size, strict=True)):
+            raise ValueError(f"gel_size is {self.gel_size} m, the picture of its geometry shows {shown} m")
+        return self
+
+    @model_validator(mode="after")
     def _view_gives_the_geometry(self) -> Self:
         if self.view is not None:
             if self.format == 1:
@@ -120,11 +129,16 @@ def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.u
 def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDArray[np.uint8]]:
     """The calibration at `path` (its folder or YAML file) and its picture without contact; `serial` is the sensor that
     it must belong to. Raises BadBundle."""
-    file = path / FILE if path.is_dir() else path
     again = "make it again with `tacsim calibrate sensor`"
+    file = path
     try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise BadBundle(f"{file}: {file.stat().st_size} bytes is too much for a calibration; {again}")
+        file = path / FILE if path.is_dir() else path
+        for part, most in ((file, LARGEST_FILE), (file.with_name(REFERENCE), LARGEST_PICTURE)):
+            about = part.stat()
+            if not stat.S_ISREG(about.st_mode):  # a pipe would be waited for
+                raise BadBundle(f"{part} is no file: a calibration is a folder with {FILE} and {REFERENCE}")
+            if about.st_size > most:
+                raise BadBundle(f"{part}: {about.st_size} bytes is too much for a calibration; {again}")
         text = file.read_text(encoding="utf-8")
         png = file.with_name(REFERENCE).read_bytes()
     except FileNotFoundError as missing:

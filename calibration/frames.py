@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,21 +41,32 @@ class Frames:
 
 def rectified(frames: Frames, view: GelView) -> Frames:
     """The same frames as metric pictures of the gel. Raises BadPresses for pictures of another size than the view's."""
-    from calibration.lens import to_metric
-
     sizes = {image.shape[:2] for image in (frames.reference, *(image for _, image in frames.presses))}
-    if sizes != {view.image_shape}:
+    check_size(sizes, view)
+    metric = metric_picture(view)
+    return Frames(metric(frames.reference), tuple((n, metric(i)) for n, i in frames.presses), frames.estimated)
+
+
+def check_size(sizes: Collection[tuple[int, ...]], view: GelView) -> None:
+    """Raises BadPresses unless pictures of `sizes` (rows, columns) are those of the view."""
+    if set(sizes) != {view.image_shape}:
         odd = ", ".join(f"{columns} x {rows}" for rows, columns in sorted(sizes))
         raise BadPresses(
             f"the frames are {odd} px, the view was calibrated on {view.lens.width} x {view.lens.height} px; use one "
             "setting of the camera"
         )
+
+
+def metric_picture(view: GelView) -> Callable[[Image], Image]:
+    """Native picture (H, W, 3) -> metric picture of the gel, both uint8."""
+    from calibration.lens import to_metric
+
     rectify = to_metric(view)
 
     def metric(image: Image) -> Image:
         return np.rint(rectify(image)).astype(np.uint8)
 
-    return Frames(metric(frames.reference), tuple((n, metric(i)) for n, i in frames.presses), frames.estimated)
+    return metric
 
 
 def read_presses(folder: Path, reference: Path | None = None) -> Frames:

@@ -9,11 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
+from calibration.drift import DriftFinder, size_of
 from calibration.gradient import from_model
 from calibration.inverse import PolynomialSlopes
 from calibration.lens import Rectification, from_corners, from_geometry, from_view
 from calibration.markers import MarkerFlow, marker_grid, require_no_markers
-from calibration.reference import Reference, make_reference
+from calibration.reference import (
+    LOST,
+    LOST_COLOUR,
+    STALE,
+    STALE_COLOUR,
+    Reference,
+    StaleReference,
+    UnusableReference,
+    exchanged,
+    make_reference,
+)
 from calibration.surface import SurfaceFinder, seen_box, view, window
 from calibration.view import GelView
 from tacsim.hardware import CameraSensorFacts
@@ -41,8 +52,13 @@ class FrameNormaliser:
         grid: CanonicalGrid,
         find: SurfaceFinder | None = None,
         markers: MarkerFlow | None = None,
+        *,
+        drifts: bool = False,
+        untouched: NDArray[np.float32] | None = None,
     ) -> None:
-        """`rectify` gives the canonical image, or for a `find` its wider view."""
+        """`rectify` gives the canonical image, or for a `find` its wider view. drifts: a real light is behind the
+        pictures, which may drift from its reference; where there is a `find`, that watches over it. untouched:
+        what `rectify` gives of the picture without contact that the sensor was calibrated with."""
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
         if min(spare) < 0 or any(extra % (2 * grid.image_scale) for extra in spare) or (find is None and any(spare)):
@@ -53,6 +69,11 @@ class FrameNormaliser:
         self._valid.flags.writeable = False
         self._reference: Reference | None = None
         self._beyond = 0.0
+        self._watched = DriftFinder(shape) if drifts and find is None else None
+        self._background: float | None = None
+        self._drift: float | None = None
+        self._untouched = untouched
+        self._sought = False  # something was sought in the last picture
 
     @property
     def reference(self) -> Reference | None:
@@ -69,6 +90,23 @@ class FrameNormaliser:
         """Share of the pixels of the last picture whose colour lies beyond the calibrated slopes; their height and
         gradient are only the nearest that the calibration knows. 0 where nothing had to be found."""
         return self._beyond
+
+    @property
+    def background(self) -> float | None:
+        """Mean slope [degrees] that the drift of the light since the reference would be taken for, by the last picture
+        in which enough of the gel was untouched to tell; None where no height is found, or nothing told it yet."""
+        return self._background
+
+    @property
+    def drift(self) -> float | None:
+        """By how much the untouched gel's colour has changed since the reference [-], by the same picture; known
+        without slopes, too."""
+        return self._drift
+
+    @property
+    def stale(self) -> bool:
+        """True when the reference does not fit any more: take a fresh one as soon as nothing touches."""
+        return (self._drift or 0.0) > STALE_COLOUR or (self._background or 0.0) > STALE
 
     @property
     def finds_flow(self) -> bool:
@@ -89,16 +127,39 @@ class FrameNormaliser:
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
         UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
-        reference = make_reference(self._rectify(frame.image), self._rectify.valid, self._measured())
+        rectified = self._rectify(frame.image)
+        reference = make_reference(rectified, self._rectify.valid, self._measured())
+        if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
+            raise UnusableReference(
+                "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
+                "order; give pictures in the order in which they were calibrated (this program's is RGB)"
+            )
         if self._markers is not None:
             self._markers.take_reference(frame.image, frame.index)
         elif self._find is not None:
             require_no_markers(frame.image)
         self._reference = reference
+        self._background = self._drift = None
+
+    def diagnostics(self) -> dict[str, float]:
+        """How far the last observation is to be trusted, where it was found in a picture: `beyond`, `drift`,
+        `background` and `kept` as the properties say, and `stale` (0 or 1)."""
+        if not self._sought:
+            return {}
+        found = {"stale": float(self.stale)}
+        if self._find is not None:
+            found["beyond"] = self._beyond
+        if self._drift is not None:
+            found["drift"] = self._drift
+        if self._background is not None:
+            found["background"] = self._background
+        if self._markers is not None:
+            found["kept"] = self.kept
+        return found
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
-        """The observation of `frame` at time `now` [s]. Raises NoReference; MarkersLost when too few markers
-        are seen; ValueError for a frame of another shape."""
+        """The observation of `frame` at time `now` [s]. Raises NoReference; StaleReference when the light is another;
+        MarkersLost when too few markers are seen; ValueError for a frame of another shape."""
         if self._reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
         seen = self._reference.difference(self._rectify(frame.image))
@@ -126,20 +187,39 @@ class FrameNormaliser:
         self, frame: TactileFrame, change: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, NDArray[np.float32] | None]:
         """Height, gradient and flow, from the source or from the picture."""
-        self._beyond = 0.0
+        self._beyond, self._sought = 0.0, False
         if frame.surface is not None:
             self._check(frame.surface)
             return frame.surface.height, frame.surface.gradient, frame.surface.flow
         height = gradient = flow = None
+        self._sought = any(part is not None for part in (self._find, self._markers, self._watched))
+        if self._watched is not None:
+            drift = self._watched(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
+            self._drift = size_of(self._watched.at(drift)) if drift.told else self._drift
         if self._find is not None:
             assert self._reference is not None
             found = self._find(change, self._reference.relative)
             self._beyond = found.beyond
+            if found.drift is not None:
+                self._drift, self._background = found.drift, found.background
             height, gradient = found.height, found.gradient
+        self._require_light()
         if self._markers is not None:
             deep = None if height is None else (height, canonical_cells(self._grid))
             flow = self._markers(frame.image, frame.index, deep)
         return height, gradient, flow
+
+    def _require_light(self) -> None:
+        """Raises StaleReference."""
+        for told, limit, words in (
+            (self._background, LOST, "slopes of {:.0f} degrees"),
+            (self._drift, LOST_COLOUR, "{:.0%} of its colour"),
+        ):
+            if told is not None and told > limit:
+                raise StaleReference(
+                    f"the untouched gel differs from its reference by {words.format(told)}: nothing can be told by it. "
+                    "Is a lamp out, or the exposure another? If not, take a fresh reference (Rig.reset does)"
+                )
 
     def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference. It misses the
@@ -173,8 +253,11 @@ def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: Canoni
     return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size))
 
 
-def for_calibrated(calibration: Calibration, grid: CanonicalGrid) -> FrameNormaliser:
-    """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle."""
+def for_calibrated(
+    calibration: Calibration, grid: CanonicalGrid, untouched: NDArray[np.uint8] | None = None
+) -> FrameNormaliser:
+    """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle.
+    untouched: the bundle's (metric) picture, against which the order of colours of each reference is checked."""
     geometry = calibration.geometry
     wide = view(grid, calibration.gel_size)
     # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
@@ -187,7 +270,10 @@ def for_calibrated(calibration: Calibration, grid: CanonicalGrid) -> FrameNormal
     slopes = PolynomialSlopes(calibration.inverse, x, y)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=calibration.markers is not None, drifts=True)
     flow = _marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view)
-    return FrameNormaliser(rectify, grid, find, flow)
+    known = None
+    if untouched is not None:  # it is metric by itself, whatever the camera's picture is
+        known = from_geometry(geometry, calibration.gel_size, wide)(untouched)
+    return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 
 
 def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
@@ -197,8 +283,9 @@ def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: C
     Raises calibration.lens.BadCorners, calibration.bundle.BadBundle.
     """
     if facts.calibration is not None:
-        return for_calibrated(_bundle_for(facts.calibration, image_shape), grid)
-    return FrameNormaliser(from_corners(facts.corners, facts.size, image_shape, canonical_image(grid)), grid)
+        return _of_bundle(facts.calibration, image_shape, grid)
+    seen = from_corners(facts.corners, facts.size, image_shape, canonical_image(grid))
+    return FrameNormaliser(seen, grid, drifts=True)
 
 
 def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
@@ -208,23 +295,23 @@ def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: Ca
     Raises calibration.bundle.BadBundle, ValueError for a model without inverse, calibration.lens.BadCorners.
     """
     if facts.calibration is not None:
-        return for_calibrated(_bundle_for(facts.calibration, (facts.height, facts.width)), grid)
+        return _of_bundle(facts.calibration, (facts.height, facts.width), grid)
     if facts.model is not None:
         return for_pictures(facts.model, gel_size, grid)
     shape = (facts.height, facts.width)
-    return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid)
+    return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid, drifts=True)
 
 
-def _bundle_for(path: str, image_shape: tuple[int, int]) -> Calibration:
-    """The calibration at `path`, for pictures of `image_shape` (rows, columns). Raises BadBundle."""
-    calibration, _ = read_bundle(Path(path))
+def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
+    """By the calibration at `path`, for pictures of `image_shape` (rows, columns). Raises BadBundle."""
+    calibration, untouched = read_bundle(Path(path))
     if calibration.image_shape != image_shape:
         (rows, columns), (high, wide) = image_shape, calibration.image_shape
         raise BadBundle(
             f"{path} was calibrated on pictures of {wide} x {high} px, this sensor delivers {columns} x {rows}: set "
             "width and height of the sensor to those of the calibration, or calibrate again at this setting"
         )
-    return calibration
+    return for_calibrated(calibration, grid, untouched)
 
 
 def _marker_flow(

@@ -1,4 +1,10 @@
-"""The reference image I0: what a sensor shows without contact. A fresh one matters more than any formula."""
+"""The reference image I0: what a sensor shows without contact. A fresh one matters more than any formula.
+
+A picture cannot say that nothing touches: a wide flat contact looks like none, and a change of light like a contact.
+So a new reference is taken only where the arms' motion makes it certain: clear of everything at the start of an episode
+(`Rig.reset`), lifted off before each touch of a fixed ball (`tacsim calibrate touch`), or when a person says so.
+Between these moments the background of each picture tells how far the light has drifted (:mod:`calibration.drift`).
+"""
 
 from __future__ import annotations
 
@@ -14,8 +20,21 @@ MOST_SATURATED = 0.05  # share of the gel that may be saturated; ten real sensor
 DARKEST = 8.0  # mean grey level of each channel over the gel; below, noise and rounding are all there is
 
 
+STALE = 2.0  # background slopes that a reference which still fits never shows; real sensors: 0.3 to 0.7 [degrees]
+STALE_COLOUR = 0.05  # the same of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
+LOST = 20.0  # background slopes that no drift of a working light makes [degrees]
+LOST_COLOUR = 0.5  # the same of the colour [-]
+EXCHANGED = 0.5  # red and blue are exchanged if the picture is then so much nearer to the one it should be like
+ANOTHER = 0.02  # pictures that differ by less, each colour relative to its mean, are alike as they are [-]
+COARSE = 8  # pixels, each way, over which that is averaged
+
+
 class UnusableReference(ValueError):
     """A reference image that nothing can be measured against."""
+
+
+class StaleReference(RuntimeError):
+    """The light is so far from what it was at the reference that nothing can be told any more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +88,28 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
     mean = mean.astype(np.float32)
     scale = np.where(valid[..., None], 1.0 / mean, 0.0).astype(np.float32)
     return Reference(image.astype(np.float32), mean, image / mean, valid, scale)
+
+
+def exchanged(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
+    """True when an image (H, W, 3) is like the `known` one of the same gel only with red and blue exchanged.
+
+    What counts is where on the gel each colour is bright: a dimmer lamp or another white balance changes nothing. Where
+    all colours are equally even, nothing is told, and the answer is no.
+    """
+    one, other = (_pattern(picture, valid) for picture in (image, known))
+    apart = float(np.sqrt(((one - other) ** 2).mean()))
+    turned = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
+    return apart > ANOTHER and turned < EXCHANGED * apart
+
+
+def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+    """(n, 3) how bright each part of the gel is in each colour, relative to all of it."""
+    import cv2
+
+    size = (valid.shape[1] // COARSE, valid.shape[0] // COARSE)
+    whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    parts = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))[whole]
+    return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)
 
 
 def _levels(colour: Float32) -> str:

@@ -5,16 +5,17 @@ A side is a folder of pictures, a video, or one sensor of an episode. Simulated 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.frames import MEDIAN_OF, UNTOUCHED
+from calibration.frames import MEDIAN_OF, UNTOUCHED, metric_picture
 from calibration.lens import BadCorners, Corners
 from calibration.reference import SATURATED
+from calibration.view import GelView
 from tacsim.interface import SurfaceMap
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
@@ -116,13 +117,26 @@ def through_corners(side: Side, corners: Corners, shape: tuple[int, int]) -> Sid
     if not rectify.valid.all():
         raise BadCorners(f"corners {corners!r} reach beyond the picture; all of the gel must be seen")
 
-    def seen(image: Image) -> Image:
-        return np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8)
+    return _seen(side, lambda image: np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8))
+
+
+def through_view(side: Side, view: GelView) -> Side:
+    """The side as metric pictures of the gel. Raises BadSide for pictures of another size than the view's."""
+    if side.shape != view.image_shape:
+        raise BadSide(
+            f"{side.name} is {side.shape[1]} x {side.shape[0]} px, the view of its calibration is of {view.lens.width} "
+            f"x {view.lens.height}; it belongs to another sensor or setting"
+        )
+    return _seen(side, metric_picture(view))
+
+
+def _seen(side: Side, through: Callable[[Image], Image]) -> Side:
+    """All pictures of a side, changed."""
 
     def shots(of: tuple[Shot, ...]) -> tuple[Shot, ...]:
-        return tuple(Shot(shot.name, seen(shot.image), shot.surface) for shot in of)
+        return tuple(Shot(shot.name, through(shot.image), shot.surface) for shot in of)
 
-    return Side(side.name, seen(side.reference), side.reference_from, shots(side.shots), shots(side.untouched))
+    return Side(side.name, through(side.reference), side.reference_from, shots(side.shots), shots(side.untouched))
 
 
 def rectangle(corners: Corners) -> tuple[int, int]:

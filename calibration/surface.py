@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.depth import Integrator
+from calibration.drift import THIN, DriftFinder, size_of
 from calibration.gradient import GradientModel
 from tacsim.optics.geometry import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
@@ -24,9 +25,7 @@ Mask = NDArray[np.bool_]
 INK = 0.6  # a pixel darker than this in all channels, relative to the mean of the gel, shows a printed dot
 DOT_RIM = 1  # pixels round a dot that its blurred edge reaches
 BRIDGE = 1.5  # slopes under a dot are those around it, weighted by a Gaussian so wide [px]
-CALM = 0.08  # a pixel that changes less than this, drift apart, is not touched [-]
-LEAST_CALM = 0.15  # share of the view that must be calm for a drift to be told
-DRIFT_THIN = 3  # every so many pixels say enough of it
+PROBE = 0.02  # change of colour by which the slopes that it stands for are told [-]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +35,8 @@ class FoundSurface:
     height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
     gradient: Float32  # (h, w, 2) [-]
     beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
+    drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it to tell
+    background: float | None  # mean angle of the slopes that this change would be taken for [degrees]
 
 
 class SurfaceFinder:
@@ -46,6 +47,7 @@ class SurfaceFinder:
         valid: (H, W) of :func:`view`, as the rectification gives it.
         dots: dots are printed on the gel.
         drifts: the light changes in time, as that of any real sensor; what changes where nothing touches is removed.
+            It is measured in any case: see `FoundSurface.background`.
     """
 
     def __init__(
@@ -55,7 +57,8 @@ class SurfaceFinder:
         self._box = seen_box(valid)
         self._unseen = ~valid[self._box]
         pitch = grid.pitch / grid.image_scale
-        self._drift = _Drift(self._unseen.shape) if drifts else None
+        self._drift, self._drifts = DriftFinder(self._unseen.shape), drifts
+        self._response = _response(slopes, self._unseen.shape)
         self._integrate = Integrator(self._unseen.shape, pitch)
         self._shape = valid.shape
         self._any_unseen = bool(self._unseen.any())
@@ -72,8 +75,10 @@ class SurfaceFinder:
             np.multiply(change[(*self._box, channel)], known.gain[channel], out=planes[channel])
         if self._dots:
             hidden = hidden | _ink(known.planes + planes)
-        if self._drift is not None:
-            self._drift(planes, hidden)
+        drift = self._drift(planes, hidden)
+        changed = self._drift.at(drift) if drift.told else None
+        if self._drifts:
+            self._drift.remove(planes, drift)
         gradient, beyond = self._slopes(np.moveaxis(planes, 0, -1))
         by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
         if self._dots:
@@ -85,7 +90,15 @@ class SurfaceFinder:
             height=self._cells(height),
             gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
             beyond=float(np.count_nonzero(beyond & ~hidden) / beyond.size),
+            drift=None if changed is None else size_of(changed),
+            background=None if changed is None else self._angle(changed),
         )
+
+    def _angle(self, change: Float32) -> float:
+        """Mean angle [degrees] over the gel of the slopes that changes of colour (n, 3) at every THIN-th pixel are."""
+        slope = np.einsum("nsc,nc->ns", self._response, change)
+        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::THIN, ::THIN].ravel()]
+        return float(np.degrees(np.arctan(steepness)).mean())
 
     def _prepared(self, picture: Float32) -> _Known:
         reference = picture[self._box]
@@ -147,34 +160,15 @@ def _ink(relative: Float32) -> Mask:
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
 
 
-class _Drift:
-    """How colour has changed where nothing touches: a quadratic in the place through the calm pixels, twice, the second
-    time through those near the first; their median where too few are calm to tell more."""
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self._u, self._v = (np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape))
-        u, v = np.meshgrid(self._u[::DRIFT_THIN], self._v[::DRIFT_THIN])
-        self._few = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6)
-
-    def __call__(self, planes: Float32, hidden: Mask) -> None:
-        """Takes the drift off relative changes (3, H, W), of which those `hidden` (H, W) say nothing."""
-        seen = planes[:, ::DRIFT_THIN, ::DRIFT_THIN].reshape(3, -1)
-        told = ~hidden[::DRIFT_THIN, ::DRIFT_THIN].ravel()
-        weights = np.zeros((6, 3), dtype=np.float32)
-        if told.any():
-            weights[0] = np.median(seen[:, told], axis=1)
-        for _ in range(2):
-            rest = np.abs(seen - np.einsum("ni,ic->cn", self._few, weights))
-            calm = told & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < CALM)
-            if calm.mean() < LEAST_CALM:
-                break
-            terms = self._few[calm].astype(np.float64)
-            # einsum: products so small would wake the threads of BLAS, which cost more than they give
-            square = np.einsum("ni,nj->ij", terms, terms) + 1e-6 * len(terms) * np.eye(6)
-            weights = np.linalg.solve(square, np.einsum("ni,cn->ic", terms, seen[:, calm])).astype(np.float32)
-        for plane, (one, u, v, uu, uv, vv) in zip(planes, weights.T, strict=True):
-            plane -= (one + v * self._v + vv * self._v * self._v)[:, None] + (u * self._u + uu * self._u * self._u)
-            plane -= (uv * self._v)[:, None] * self._u
+def _response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
+    """(n, 2, 3) how the slope answers to a small change of colour, at every THIN-th row and column."""
+    answers = []
+    for channel in range(3):
+        change = np.zeros((*shape, 3), dtype=np.float32)
+        change[..., channel] = PROBE
+        up, down = slopes(change)[0], slopes(-change)[0]
+        answers.append(((up - down) / (2 * PROBE))[::THIN, ::THIN].reshape(-1, 2))
+    return np.stack(answers, axis=-1)
 
 
 def _bridge(slopes: tuple[Float32, Float32], hidden: Mask) -> None:

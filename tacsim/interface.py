@@ -216,6 +216,10 @@ class Normaliser(Protocol):
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
 
+    def diagnostics(self) -> Mapping[str, float]:
+        """How far the last observation is to be trusted; see tacsim.record.trust. Empty where that is no question."""
+        ...
+
 
 @runtime_checkable
 class Policy(Protocol):

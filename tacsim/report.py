@@ -24,10 +24,12 @@ def summary(episode: Episode) -> dict[str, Any]:
 
     `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
     `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.record.timing; null unless the rig is
-    live). What is unknown or not finite is null.
+    live), `trust` (tacsim.record.trust; null where nothing is found in pictures). What is unknown or not finite is
+    null.
     """
     from tacsim.figure import contact_signals, normal_force, signal_against_force
     from tacsim.record.timing import timing
+    from tacsim.record.trust import trust
 
     meta, done = episode.meta, [step for step in episode.steps if step.index > 0]
     signals = contact_signals(Episode(meta, done))
@@ -49,6 +51,7 @@ def summary(episode: Episode) -> dict[str, Any]:
         "seconds": [_number(step.seconds) for step in done],
         "settled": settled,
         "timing": timing(episode),
+        "trust": trust(episode),
         "complete": episode.complete,
         "dropped": episode.dropped,
         "versions": dict(meta.versions),
@@ -93,6 +96,7 @@ def end_table(facts: Mapping[str, Any], paths: Iterable[Path]) -> Table:
 
 def _results(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     from tacsim.record.timing import timing_rows
+    from tacsim.record.trust import trust_rows
 
     known = [(value, k) for k, value in zip(facts["step"], facts["distance"], strict=True) if value is not None]
     best = min(known, default=None)
@@ -112,6 +116,8 @@ def _results(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("settled", f"{facts['settled']} of {facts['steps']} steps"))
     if facts["timing"] is not None:
         rows += timing_rows(facts["timing"])
+    if facts["trust"] is not None:
+        rows += trust_rows(facts["trust"])
     if facts["dropped"]:
         rows.append(("dropped", f"{facts['dropped']} steps were not recorded"))
     return rows

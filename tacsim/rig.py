@@ -151,8 +151,12 @@ class Rig:
         return None if self._truth is None else self._truth()
 
     def diagnostics(self) -> Mapping[str, float]:
-        """Numbers about the last control step, e.g. the residual of the simulation's settling."""
-        return self._diagnostics()
+        """Numbers about the last control step, e.g. the residual of the simulation's settling; those of a sensor, such
+        as `stale_upper`, end in its name."""
+        found = dict(self._diagnostics())
+        for name, normaliser in self._normalisers.items():
+            found |= {f"{key}_{name}": value for key, value in normaliser.diagnostics().items()}
+        return found
 
     def stop(self) -> None:
         """Stops all arms, each even when another fails to stop."""

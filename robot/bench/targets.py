@@ -148,7 +148,7 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "squeeze of 64,000 particles, faster than textbook MLS-MPM", "x", 6, 10,
         ratio(_BOOK, pick(_PARTICLE, "plasticine_step")), True,
-    ),  # fmt: skip
+    ),
     Target("gel step, two standard gels, CPU", "ns an element", 60, 25, pick(_ELEMENT, "gel_step")),
     Target("press of a ball R 4 mm, 1 mm deep, h 0.5 mm", "s", 0.3, 0.05, _press("seconds")),
     Target("... error of its surface", "µm rms", 6, 3, _press("error")),

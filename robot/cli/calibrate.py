@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.output import Out, busy, make, new_directory, notes, quantity, say_files, writing
+from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, quantity, say_files, writing
+from robot.cli.pressing import pressed
 
 if TYPE_CHECKING:
     from calibration.ballpress import Fit
     from calibration.bundle import Calibration
+    from calibration.frames import Frames
     from calibration.view import GelView
     from tacsim.optics.geometry import Markers
 
@@ -27,10 +29,17 @@ def _group() -> None:
     epilog='Example: [bold]tacsim calibrate sensor frames --ball-radius "2.92 mm" --pixel-pitch "0.0593 mm"[/]'
 )
 def sensor(
-    frames: Annotated[Path, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more.")],
+    frames: Annotated[
+        Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
+    ] = None,
     ball_radius: Annotated[
         Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help='Of the ball, for example "2.92 mm".')
-    ],
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(metavar="RIG/SENSOR", help="Press now, before this camera of a rig; no arm is connected."),
+    ] = None,
+    presses: Annotated[int, typer.Option(min=1, max=100, help="How many; with --camera.")] = 8,
     pixel_pitch: Annotated[
         Any,
         typer.Option(
@@ -49,13 +58,21 @@ def sensor(
         str, typer.Option(help="Serial number of the sensor that the calibration belongs to.")
     ] = "unknown",
     markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False,
+    set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Calibrate a sensor's light from presses of a ball: colour of every slope, and slope of every colour.
 
     Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, and prints how
     well each press is predicted by the others.
+
+    With --camera it leads you through it: the gel without contact, then press after press, each judged at once. The
+    pictures are kept in frames/ beside the bundle, to calibrate from them again; Ctrl-C keeps what was taken.
     """
+    if (frames is None) == (camera is None):
+        raise typer.BadParameter("give either a folder of frames, or --camera to press now")
+    if ball_radius is None:
+        raise typer.BadParameter("give the ball's radius: without it no slope is known", param_hint="--ball-radius")
     if (pixel_pitch is None) == (view is None):
         raise typer.BadParameter("give either --pixel-pitch or --view")
     seen = None if view is None else _load_view(view)
@@ -65,11 +82,13 @@ def sensor(
     folder = new_directory(out, "calibration")
     with busy("loading"):
         from calibration.ballpress import BadPresses, calibrate_light
-        from calibration.bundle import write_bundle
         from calibration.frames import read_presses, rectified
-        from calibration.residual_picture import draw
     try:
-        read = read_presses(frames, reference)
+        if camera is not None:
+            read = pressed(camera, set_ or [], folder, ball / pitch, presses, seen, serial)
+        else:
+            assert frames is not None
+            read = read_presses(frames, reference)
         if seen is not None:
             read = rectified(read, seen)
         if read.estimated:
@@ -77,16 +96,29 @@ def sensor(
         with busy(f"calibrating from {len(read.presses)} presses"):
             fit = calibrate_light(read.reference, read.presses, ball / pitch)
     except BadPresses as error:
-        raise typer.BadParameter(str(error), param_hint="FRAMES") from None
+        hint = "FRAMES" if camera is None else "--camera"
+        raise typer.BadParameter(str(error), param_hint=hint) from None
+    _write(folder, fit, read, serial, ball, pitch, markers=markers, view=seen)
+
+
+def _write(
+    folder: Path, fit: Fit, read: Frames, serial: str, ball: float, pitch: float, *, markers: bool, view: GelView | None
+) -> None:
+    """Shows the calibration and writes its bundle."""
+    from calibration.bundle import write_bundle
+    from calibration.residual_picture import draw
+
     found = _markers(fit, pitch) if markers else None
     _show(fit, pitch)
+    if found is None:
+        _look_for_dots(fit)
     if found is not None:
         notes.print(
             f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
             f"{found.radius * 1e3:.2g} mm"
         )
-    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, seen)
-    with writing(make(folder)):
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, view)
+    with writing(folder if folder.exists() else make(folder)):  # there already, if frames were taken into it
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
             written.append(folder / "residuals.png")
@@ -115,6 +147,17 @@ def _markers(fit: Fit, pitch: float) -> Markers:
         ) from None
     rows, columns = lattice.present.shape
     return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
+def _look_for_dots(fit: Fit) -> None:
+    """A word on dots that nobody told of."""
+    from calibration.markers import require_no_markers
+    from calibration.reference import UnusableReference
+
+    try:
+        require_no_markers(fit.reference)
+    except UnusableReference:
+        notes.print("look at this: dots seem to be printed on the gel; give --markers, or each will pass for a dent")
 
 
 def _bundle(

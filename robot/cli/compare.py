@@ -79,7 +79,7 @@ def compare(
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
     bundles = [None if path is None else _calibration(path) for path in (calibration_a, calibration_b)]
     try:
-        truth = _read(b, reference_b, sensor_b)
+        truth = _metric(_read(b, reference_b, sensor_b), bundles[1])
         if _is_scene(a):
             if corners_a or corners_b or reference_a or sensor_a:
                 raise BadSide(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
@@ -87,7 +87,9 @@ def compare(
         else:
             if set_:
                 raise BadSide(f"--set changes a scene, but A is no scene: {a}")
-            made = _read(Path(a), reference_a, sensor_a)
+            made = _metric(_read(Path(a), reference_a, sensor_a), bundles[0])
+        # from here on all pictures are metric where a calibration says how
+        bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
         made, truth = _straight(made, truth, (corners_a, corners_b), bundles)
         with progress() as bar:
             row = bar.add_task("comparing", total=None)
@@ -122,6 +124,13 @@ def _read(path: Path, reference: Path | None, sensor: str) -> Side:
 
     with busy(f"reading {path}"):
         return read_side(path, reference, sensor)
+
+
+def _metric(side: Side, bundle: Calibration | None) -> Side:
+    """The side through lens and perspective of its calibration, where that has a view."""
+    from calibration.sides import through_view
+
+    return side if bundle is None or bundle.view is None else through_view(side, bundle.view)
 
 
 def _is_scene(a: str) -> bool:

@@ -172,6 +172,54 @@ def test_a_ball_smaller_than_its_contact_is_doubted(sensor: HiddenSensor) -> Non
     assert any("is the ball's radius (or the pixel pitch) right" in warning for warning in fit.warnings)
 
 
+def test_a_picture_without_contact_of_another_light_is_doubted(sensor: HiddenSensor) -> None:
+    stale = np.clip(sensor.empty() + np.array([15, 0, 3]), 0, 255).astype(np.uint8)
+    fit = calibrate_light(stale, named(sensor.presses(5)), BALL_PX)
+    assert fit.left_out == ()
+    assert [words for words in fit.warnings if "with the same light, just before?" in words]
+    assert angle_in_contact(fit, sensor.press(0.5e-3, 150, 90, drift=np.array([15.0, 0, 3]))) < 2.0  # it is removed
+
+
+def test_a_picture_without_contact_that_shows_one_is_doubted(sensor: HiddenSensor) -> None:
+    presses = sensor.presses(5)
+    with pytest.raises(BadPresses, match="second contact"):
+        calibrate_light(presses[0].image, named(presses), BALL_PX)
+    frames = [("empty", sensor.empty()), ("again", sensor.empty()), *named(presses[1:2])]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    assert any("does the picture without contact really show none?" in words for words in fit.warnings)
+
+
+@pytest.mark.parametrize("which", ["frames", "reference"])
+def test_exchanged_colours_are_called_by_their_name(sensor: HiddenSensor, which: str) -> None:
+    frames, reference = named(sensor.presses(3)), sensor.empty()
+    if which == "frames":
+        frames = [(name, image[..., ::-1].copy()) for name, image in frames]
+    else:
+        reference = reference[..., ::-1].copy()
+    with pytest.raises(BadPresses, match="only with red and blue exchanged"):
+        calibrate_light(reference, frames, BALL_PX)
+
+
+def test_presses_in_one_place_are_doubted(sensor: HiddenSensor) -> None:
+    places = [(130, 100), (140, 104), (124, 96)]
+    fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, *place) for place in places]), BALL_PX)
+    assert any("all presses are in one place" in words for words in fit.warnings)
+
+
+def test_a_press_of_another_ball_is_left_out(sensor: HiddenSensor) -> None:
+    other = sensor.press(0.5e-3, 60, 150, ball=2 * BALL_PX)
+    fit = calibrate_light(sensor.empty(), [*named(sensor.presses(4)), ("other", other.image)], BALL_PX)
+    doubted = [name for name, _ in fit.left_out] + [words.partition(" ")[0] for words in fit.warnings]
+    assert doubted == ["other"]
+
+
+def test_a_wrong_radius_scales_every_slope_and_nothing_gives_it_away(sensor: HiddenSensor) -> None:
+    """Why the ball must be measured: the docs say so."""
+    right, wrong = (calibrate_light(sensor.empty(), named(sensor.presses(4)), k * BALL_PX) for k in (1.0, 1.3))
+    assert wrong.warnings == right.warnings == ()
+    assert wrong.steepest < 0.85 * right.steepest
+
+
 def test_nothing_usable_is_refused_with_every_reason(sensor: HiddenSensor) -> None:
     with pytest.raises(BadPresses, match=r"(?s)a: no ball's contact.*b: no ball's contact"):
         calibrate_light(sensor.empty(), [("a", sensor.empty()), ("b", sensor.empty())], BALL_PX)

@@ -1,5 +1,7 @@
 import hashlib
 import json
+import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +111,48 @@ def test_what_is_missing_or_foreign_is_named(bundle: Path, tmp_path_factory: pyt
         read_bundle(bundle)
 
 
+def test_what_is_no_file_or_too_large_is_refused_unread(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    with pytest.raises(BadBundle, match="cannot be read"):
+        read_bundle(bundle / ("x" * 300))
+    for name in (FILE, REFERENCE):
+        folder = tmp_path_factory.mktemp("odd")
+        write_bundle(folder, calibration(), PICTURE)
+        with (folder / name).open("r+b") as file:
+            file.truncate(1 << 27)  # of holes
+        with pytest.raises(BadBundle, match="is too much for a calibration"):
+            read_bundle(folder)
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+        with pytest.raises(BadBundle, match="is no file"):
+            read_bundle(folder)
+    with pytest.raises(BadBundle, match=r"is no calibration|cannot be read"):
+        read_bundle(bundle / REFERENCE)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: text.replace("format: 2", "format: 2\nformat: 1", 1),
+        lambda text: text + "more: 1\n",
+        lambda text: "format: 2\nx: !!python/object/apply:os.system [false]\n",
+        lambda text: "format: 2\nx: " + "[" * 5000,
+        lambda text: re.sub(r"steepest: [0-9.]+", "steepest: .nan", text),
+    ],
+    ids=["half", "empty", "twice", "unknown key", "code", "deep", "nan"],
+)
+def test_damage_of_any_kind_is_refused(bundle: Path, spoil) -> None:
+    (bundle / FILE).write_text(spoil((bundle / FILE).read_text(encoding="utf-8")), encoding="utf-8")
+    with pytest.raises(BadBundle, match=re.escape(str(bundle))):
+        read_bundle(bundle)
+
+
+def test_the_gel_is_as_large_as_the_picture_shows() -> None:
+    with pytest.raises(ValueError, match="the picture of its geometry shows"):
+        Calibration.model_validate(calibration().model_dump() | {"gel_size": (1.0, 1.0)})
+
+
 def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
     write_bundle(tmp_path, calibration(), PICTURE[:100].copy())
     with pytest.raises(BadBundle, match=r"\(100, 160, 3\), the calibration is of \(120, 160, 3\)"):
@@ -167,7 +211,9 @@ def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> No
     with pytest.raises(BadBundle, match="calibrated on pictures of 320 x 240 px, this sensor delivers 160 x 120"):
         for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid())
     normalise = for_camera(camera(tmp_path, 320, 240), (1.0, 1.0), CanonicalGrid())
-    native = RNG.integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
+    native = (
+        np.random.default_rng(7).integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
+    )
     normalise.take_reference(TactileFrame(image=native, time=0.0, index=0))
     brighter = native.copy()
     u, v = np.rint(view.project(np.array([[3e-3, -2e-3]]))[0]).astype(int)

@@ -69,6 +69,9 @@ class Hand:
     def touch(self) -> None:
         pass
 
+    def diagnostics(self) -> dict[str, float]:
+        return {"stale": 0.0}
+
     def take_reference(self, frame: TactileFrame) -> None:
         pass
 

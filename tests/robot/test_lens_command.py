@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -89,6 +90,14 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
         radius = residual.circle[2] * calibration.geometry.pixel_pitch
         assert radius == pytest.approx(truth[residual.frame], rel=0.06)
     assert np.median([residual.angle for residual in calibration.residuals]) < 4.0  # degrees
+    # Compared with its own frames, whose pictures are the camera's: through the view, and on the gel.
+    bundles = ["--calibration-a", str(tmp_path / "bundle"), "--calibration-b", str(tmp_path / "bundle")]
+    words = ["compare", str(frames), str(frames), *bundles, "--out", str(tmp_path / "compared")]
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    overall = json.loads((tmp_path / "compared" / "compare.json").read_text())["overall"]
+    assert overall["contact_iou"]["mean"] == pytest.approx(1.0)
+    assert overall["gradient_angle"]["mean"] == pytest.approx(0.0, abs=1e-3)
     code, _, err = run("sensor", frames, *ball, *seen, "--pixel-pitch", "0.08 mm", "--out", tmp_path / "no")
     assert code == 2 and "either --pixel-pitch or --view" in err
     (frames / "background.png").write_bytes(encode_png(pictures["background"]))

@@ -59,6 +59,16 @@ def test_every_shipped_sensor_loads(name: str) -> None:
     assert load_sensor(name).name == name
 
 
+@pytest.mark.parametrize("name", ["digit", "gelsight-mini", "gelsight-wedge"])
+def test_geometries_like_known_sensors_name_their_public_source(name: str) -> None:
+    sensor = load_sensor(name)
+    assert "github.com" in sensor.source and "calibrate it" in sensor.source.replace(
+        "calibrate the sensor", "calibrate it"
+    )
+    shown = [1e3 * side * sensor.geometry.pixel_pitch for side in (sensor.geometry.width, sensor.geometry.height)]
+    assert all(10.0 < side < 30.0 for side in shown)  # a finger's gel [mm]
+
+
 @pytest.mark.parametrize("name", names("material"))
 def test_every_shipped_material_loads_and_names_its_source(name: str) -> None:
     source = load(GelMaterial, name).source if name == "silicone" else load(BodyMaterial, name).source

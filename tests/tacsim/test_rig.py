@@ -70,6 +70,9 @@ class Parts:
     def touch(self) -> None:
         self.note("touch")
 
+    def diagnostics(self) -> dict[str, float]:
+        return {"stale": 0.0}
+
     def take_reference(self, frame: TactileFrame) -> None:
         self.note("reference")
         self.reference = frame

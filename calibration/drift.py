@@ -1,0 +1,68 @@
+"""How the light has changed since the reference was taken, told by where nothing touches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+CALM = 0.08  # a pixel that changes less than this, drift apart, is not touched [-]
+LEAST_CALM = 0.15  # share of the view that must be calm for a drift to be told
+THIN = 5  # every so many pixels say enough of it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """One picture's drift, a quadratic in the place."""
+
+    weights: Float32  # (6, 3) of 1, u, v, uu, uv, vv with u, v in -1..1 across the view
+    told: bool  # enough of the gel was calm; otherwise it is but the median of all
+
+
+def size_of(change: Float32) -> float:
+    """Mean over the gel of changes of colour (n, 3), in the channel that changed most [-]."""
+    return float(np.abs(change).mean(axis=0).max())
+
+
+class DriftFinder:
+    """Finds the drift in a view of `shape` (H, W): a quadratic in the place through the calm pixels, twice, the second
+    time through those near the first; their median where too few are calm to tell more."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._u, self._v = (np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape))
+        u, v = np.meshgrid(self._u[::THIN], self._v[::THIN])
+        self._few = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6)
+
+    def __call__(self, planes: Float32, hidden: Mask) -> Drift:
+        """The drift in relative changes (3, H, W), of which those `hidden` (H, W) say nothing."""
+        seen = planes[:, ::THIN, ::THIN].reshape(3, -1)
+        on_gel = ~hidden[::THIN, ::THIN].ravel()
+        weights = np.zeros((6, 3), dtype=np.float32)
+        if on_gel.any():
+            weights[0] = np.median(seen[:, on_gel], axis=1)
+        told = False
+        for _ in range(2):
+            rest = np.abs(seen - np.einsum("ni,ic->cn", self._few, weights))
+            calm = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < CALM)
+            told = bool(calm.mean() >= LEAST_CALM)
+            if not told:
+                break
+            terms = self._few[calm].astype(np.float64)
+            # einsum: products so small would wake the threads of BLAS, which cost more than they give
+            square = np.einsum("ni,nj->ij", terms, terms) + 1e-6 * len(terms) * np.eye(6)
+            weights = np.linalg.solve(square, np.einsum("ni,cn->ic", terms, seen[:, calm])).astype(np.float32)
+        return Drift(weights, told)
+
+    def remove(self, planes: Float32, drift: Drift) -> None:
+        """Takes the drift off relative changes (3, H, W)."""
+        for plane, (one, u, v, uu, uv, vv) in zip(planes, drift.weights.T, strict=True):
+            plane -= (one + v * self._v + vv * self._v * self._v)[:, None] + (u * self._u + uu * self._u * self._u)
+            plane -= (uv * self._v)[:, None] * self._u
+
+    def at(self, drift: Drift) -> Float32:
+        """(n, 3) the drift at every THIN-th row and column [-]."""
+        return np.asarray(np.einsum("ni,ic->nc", self._few, drift.weights), dtype=np.float32)

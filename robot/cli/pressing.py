@@ -1,0 +1,88 @@
+"""The live part of `tacsim calibrate sensor`: a person presses a ball before the camera and is led through it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import make, notes, progress, writing
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from calibration.frames import Frames
+    from calibration.view import GelView
+
+
+def pressed(
+    camera: str,
+    overrides: list[str],
+    folder: Path,
+    ball: float,
+    presses: int,
+    view: GelView | None,
+    serial: str,
+) -> Frames:
+    """Frames taken now, native, and kept in `folder`/frames. camera: RIG/SENSOR; ball: its radius [px].
+
+    A signal ends the command; what was taken is kept then, too. Raises CannotPress, BadPresses, DeviceError.
+    """
+    from calibration.ballpress import BadPresses
+    from calibration.frames import Frames, check_size, metric_picture
+    from robot.camera import Camera
+    from robot.pressing import PressPlan, camera_facts, record_presses
+    from tacsim.config import load_rig
+    from tacsim.record.images import encode_png
+
+    rig, _, sensor = camera.rpartition("/")
+    if not rig:
+        raise typer.BadParameter(
+            f"'{camera}': give rig and sensor, such as ur5e/upper or my.yaml/upper", param_hint="--camera"
+        )
+    facts = camera_facts(load_rig(rig, overrides=overrides).facts, sensor)
+    if view is not None:
+        check_size([(facts.height, facts.width)], view)
+    frames = folder / "frames"
+
+    def keep(name: str, image: NDArray[np.uint8]) -> None:
+        with writing(frames if frames.exists() else make(frames)):
+            (frames / name).write_bytes(encode_png(image))
+
+    with Camera(facts, sensor) as eye:
+        _await_person()
+        with Interrupt() as interrupt, progress() as bar:
+            row = bar.add_task("presses", total=presses)
+            plan = PressPlan(ball, presses, rectify=None if view is None else metric_picture(view))
+            try:
+                taken = record_presses(
+                    eye,
+                    plan,
+                    keep,
+                    say=lambda words: notes.print(words, markup=False),
+                    tell=lambda done: bar.update(row, completed=done),
+                    stop=interrupt,
+                )
+            finally:
+                if frames.exists():
+                    again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(serial)} ..."
+                    notes.print(f"frames kept in {frames}; to calibrate from them again: {again}", markup=False)
+    if interrupt():
+        complain(f"stopped by a signal; {len(taken.presses)} presses are kept, nothing is calibrated")
+        raise typer.Exit(interrupt.exit_code)
+    if taken.reference is None or not taken.presses:
+        raise BadPresses("the source was over before a press was taken")
+    return Frames(taken.reference, tuple(taken.presses), estimated=False)
+
+
+def _await_person() -> None:
+    """Without a terminal nobody is asked: the gel counts as free once its picture rests."""
+    if sys.stdin.isatty():
+        while not typer.confirm("Is nothing touching the gel?", default=True, err=True):
+            notes.print("Take everything off the gel first.")

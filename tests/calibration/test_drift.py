@@ -1,0 +1,188 @@
+"""A reference that does not fit any more: light that changes after it was taken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from calibration.ballpress import normal_angle
+from calibration.drift import THIN, DriftFinder
+from calibration.inverse import to_normal
+from calibration.normaliser import FrameNormaliser, for_calibrated, for_camera, for_pictures, for_simulated
+from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, exchanged
+from tacsim.hardware import CameraSensorFacts
+from tacsim.interface import TactileFrame, TactileObservation
+from tacsim.optics.geometry import CanonicalGrid, SensorModel
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import surface_map
+from tests.calibration.presses import COLUMNS, PITCH, ROWS, HiddenSensor, Made
+from tests.calibration.sources import calibrated
+from tests.tacsim.optics.surfaces import dent, flat
+
+GRID = CanonicalGrid()
+CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "gain": lambda image: 0.7 * image,
+    "white balance": lambda image: image * (1.2, 1.0, 0.85),
+    "offset": lambda image: image + 25.0,
+}
+
+
+def frame(image: np.ndarray, surface: object = None) -> TactileFrame:
+    return TactileFrame(np.clip(np.rint(image), 0, 255).astype(np.uint8), time=0.0, index=0, surface=surface)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def sensor() -> HiddenSensor:
+    return HiddenSensor(3)
+
+
+@pytest.fixture(scope="module")
+def bundle(sensor: HiddenSensor):
+    return calibrated(sensor)
+
+
+@pytest.fixture
+def normalise(bundle) -> FrameNormaliser:
+    return for_calibrated(bundle[0], GRID, bundle[1])
+
+
+def angle(seen: TactileObservation, press: Made) -> float:
+    """Mean error of the normal in contact [degrees]."""
+    at = (np.arange(64) - 31.5) * GRID.pitch / PITCH
+    u, v = np.meshgrid(at + (COLUMNS - 1) / 2, at + (ROWS - 1) / 2)
+    true = press.gradient[np.rint(v).clip(0, ROWS - 1).astype(int), np.rint(u).clip(0, COLUMNS - 1).astype(int)]
+    inside = seen.valid & (np.hypot(u - press.circle[0], v - press.circle[1]) < press.circle[2])
+    assert seen.gradient is not None
+    return float(normal_angle(to_normal(seen.gradient.astype(float)), to_normal(true))[inside].mean())
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_stale_reference_is_seen_in_contact_and_without(
+    change, normalise: FrameNormaliser, sensor: HiddenSensor, bundle
+) -> None:
+    press = sensor.press(0.5e-3, 130, 100)
+    for image in (sensor.empty(), press.image):
+        normalise.take_reference(frame(bundle[1]))
+        normalise(frame(image), 0.0)
+        assert not normalise.stale and normalise.background < 0.6
+        assert normalise.diagnostics()["stale"] == 0.0
+        normalise(frame(change(image.astype(float))), 0.0)
+        assert normalise.stale and normalise.background > STALE
+        told = normalise.diagnostics()
+        assert told["stale"] == 1.0 and told["background"] == normalise.background
+        normalise.take_reference(frame(change(sensor.empty().astype(float))))  # a fresh one
+        normalise(frame(change(image.astype(float))), 0.0)
+        assert not normalise.stale and normalise.background < 0.6
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_with_the_drift_removed_a_stale_reference_costs_little(
+    change, normalise: FrameNormaliser, sensor: HiddenSensor, bundle
+) -> None:
+    """17 to 21 degrees where nothing is removed."""
+    press = sensor.press(0.5e-3, 130, 100)
+    normalise.take_reference(frame(bundle[1]))
+    assert angle(normalise(frame(press.image), 0.0), press) < 1.5
+    assert angle(normalise(frame(change(press.image.astype(float))), 0.0), press) < 6.0
+
+
+def test_a_reference_becomes_stale_by_and_by(normalise: FrameNormaliser, sensor: HiddenSensor, bundle) -> None:
+    press = sensor.press(0.5e-3, 130, 100)
+    normalise.take_reference(frame(bundle[1]))
+    told: list[tuple[float, float, bool]] = []
+    for gain in (1.0, 0.98, 0.95, 0.9, 0.8, 0.7):
+        normalise(frame(gain * press.image.astype(float)), 0.0)
+        told.append((normalise.background, normalise.drift, normalise.stale))
+    assert np.all(np.diff([background for background, _, _ in told]) > 0)
+    assert [drift for _, drift, _ in told] == pytest.approx([0.0, 0.02, 0.05, 0.1, 0.2, 0.3], abs=0.01)
+    assert not told[1][2] and told[3][2]  # before it costs a degree, and after
+
+
+@pytest.mark.parametrize(
+    "change", [lambda image: image * (0.1, 1, 1), lambda image: 0.05 * image], ids=["a lamp out", "all lamps out"]
+)
+def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, sensor: HiddenSensor, bundle) -> None:
+    normalise.take_reference(frame(bundle[1]))
+    with pytest.raises(StaleReference, match=r"Is a lamp out.*take a fresh reference"):
+        normalise(frame(change(sensor.press(0.5e-3, 130, 100).image.astype(float))), 0.0)
+    assert normalise.background > LOST or normalise.drift > LOST_COLOUR
+
+
+def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
+    """Three lights alike: dimmed together they leave the background flat, and heights too low."""
+    model = SensorModel()
+    normalise = for_pictures(model, (20e-3, 20e-3), GRID)
+    render = Renderer(model, (20e-3, 20e-3))
+    normalise.take_reference(frame(render(flat())))
+    deep = normalise(frame(render(dent())), 0.0).height.max()
+    assert normalise(frame(0.8 * render(dent()).astype(float)), 0.0).height.max() < 0.9 * deep
+    assert normalise.background < STALE and normalise.stale
+
+
+def test_where_too_little_is_untouched_the_last_word_stays(
+    normalise: FrameNormaliser, sensor: HiddenSensor, bundle
+) -> None:
+    normalise.take_reference(frame(bundle[1]))
+    assert normalise.background is None and not normalise.stale and normalise.diagnostics() == {}
+    normalise(frame(0.8 * bundle[1].astype(float)), 0.0)
+    before = normalise.background
+    checks = 40.0 * (-1) ** np.add.outer(np.arange(ROWS) // 20, np.arange(COLUMNS) // 20)[..., None]
+    normalise(frame(bundle[1] + checks), 0.0)  # pressed all over
+    assert normalise.background == before and normalise.stale
+
+
+def test_a_large_contact_is_no_drift_and_a_simulation_has_none() -> None:
+    model = SensorModel()
+    normalise = for_pictures(model, (20e-3, 20e-3), GRID)
+    render = Renderer(model, (20e-3, 20e-3))
+    normalise.take_reference(frame(render(flat())))
+    normalise(frame(render(dent(depth=1e-3))), 0.0)
+    assert normalise.background < 0.5 and not normalise.stale
+    known = for_simulated(model, (20e-3, 20e-3), GRID)
+    known.take_reference(frame(render(flat())))
+    known(frame(0.7 * render(flat()).astype(float), surface_map(flat(), GRID, None)), 0.0)
+    assert known.diagnostics() == {} and not known.stale
+
+
+def test_a_sensor_without_slopes_is_watched_by_its_colour() -> None:
+    corners = ((0.0, 0.0), (319.0, 0.0), (319.0, 239.0), (0.0, 239.0))
+    facts = CameraSensorFacts(driver="camera", source="x", corners=corners, width=320, height=240)
+    normalise = for_camera(facts, (1.0, 1.0), GRID)
+    image = Renderer(SensorModel(), (20e-3, 20e-3))(dent()).astype(float)
+    normalise.take_reference(frame(Renderer(SensorModel(), (20e-3, 20e-3))(flat())))
+    normalise(frame(image), 0.0)
+    assert normalise.diagnostics() == {"stale": 0.0, "drift": pytest.approx(0.0, abs=0.02)}
+    normalise(frame(0.9 * image), 0.0)
+    assert normalise.diagnostics() == {"stale": 1.0, "drift": pytest.approx(0.1, abs=0.02)}
+    with pytest.raises(StaleReference, match="of its colour"):
+        normalise(frame(0.3 * image), 0.0)
+
+
+def test_swapped_colours_are_told_by_the_calibrations_own_picture(
+    normalise: FrameNormaliser, sensor: HiddenSensor, bundle
+) -> None:
+    for change in CHANGES.values():  # no drift looks like it
+        normalise.take_reference(frame(change(sensor.empty().astype(float))))
+    with pytest.raises(UnusableReference, match="red and blue are exchanged"):
+        normalise.take_reference(frame(sensor.empty()[..., ::-1]))
+    even = np.full((80, 80, 3), (90.0, 100.0, 110.0), dtype=np.float32)
+    assert not exchanged(even[..., ::-1], even, np.ones((80, 80), dtype=np.bool_))  # nothing tells them apart
+
+
+def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
+    v, u = np.mgrid[-1:1:120j, -1:1:160j].astype(np.float32)
+    true = np.stack([0.03 + 0.05 * u, 0.02 * v * v - 0.01, -0.04 * u * v])
+    touched = np.hypot(u, v) < 0.4
+    planes = (true + np.where(touched, 0.5, 0.0)).astype(np.float32)
+    planes[:, :20] = 9.0  # hidden
+    hidden = np.zeros((120, 160), dtype=np.bool_)
+    hidden[:20] = True
+    finder = DriftFinder((120, 160))
+    drift = finder(planes, hidden)
+    assert drift.told
+    np.testing.assert_allclose(finder.at(drift), true[:, ::THIN, ::THIN].reshape(3, -1).T, atol=2e-4)
+    finder.remove(planes, drift)
+    assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
+    assert not finder(planes, np.ones_like(hidden)).told

@@ -256,7 +256,7 @@ def _doubts(presses: Sequence[Press], ball: float, mean: Float64, refused: int) 
         doubts.append("most frames were left out: does the picture without contact really show none?")
     if len(presses) == 1:
         return [*doubts, "only one press: it says little"]
-    height, width = presses[0].lit.shape
+    height, width = presses[0].shape
     if max(np.ptp([p.circle.x for p in presses]) / width, np.ptp([p.circle.y for p in presses]) / height) < ONE_PLACE:
         doubts.append("all presses are in one place: nothing is known of light elsewhere on the gel; spread them")
     return doubts

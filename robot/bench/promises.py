@@ -206,6 +206,13 @@ PROMISES: tuple[Promise, ...] = (
         (UR + "the_loop_counts_its_periods",),
         (
             _at_most("rate", "p99", 4, "ms", "99th percentile of the period, two arms"),
+            Target(
+                "... of a loop that does nothing, in the same run",
+                "ms",
+                None,
+                None,
+                pick("error", "rate", "empty loop"),
+            ),
             _at_most("one_instant", "look", 5, "µs", "one look at the state"),
         ),
     ),

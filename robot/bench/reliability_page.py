@@ -69,8 +69,9 @@ def lines(rows: Sequence[Row]) -> list[list[str]]:
         for figure in promise.figures:
             value, verdict = figure.judge(rows)
             worst = _worst(figure, rows)
-            assert figure.must is not None
-            if verdict == "met" and worst is not None and worst > figure.must:
+            if figure.must is None:
+                words = "to compare with"
+            elif verdict == "met" and worst is not None and worst > figure.must:
                 words = "met, worst beyond"
             else:
                 words = f"**{verdict}**" if verdict == "missed" else verdict

@@ -25,6 +25,10 @@ class StubArm:
     def __init__(self, name: str, pose: Pose, log: list[object]) -> None:
         self.name, self.pose, self._log = name, pose, log
         self.stopped = False
+        self.told: object = "what was seen last"
+
+    def tell(self, shown: object) -> None:
+        self.told = shown
 
     def state(self) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
@@ -110,6 +114,7 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
         Pose(np.array([5e-3, 0, 10e-3]), UPPER.quaternion),
     )
     scene.start.clear(0)
+    assert scene.lower.told is scene.upper.told is None  # until it sees anew, nothing is decided by what it saw
     back = dict(scene.motions()[:2])
     assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT])
     assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT])  # it faces down

@@ -6,7 +6,7 @@ import base64
 import csv
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -204,8 +204,8 @@ def _inline(picture: Image) -> str:
 def _known(record: Any, leave: str = "") -> dict[str, Any]:
     """The fields of a flat record, NaN and infinity as None."""
     fields: Iterable[str] = record.__slots__
-    keep: Callable[[Any], Any] = lambda value: _number(value) if isinstance(value, float) else value  # noqa: E731
-    return {name: keep(getattr(record, name)) for name in fields if name != leave}
+    values = ((name, getattr(record, name)) for name in fields if name != leave)
+    return {name: _number(value) if isinstance(value, float) else value for name, value in values}
 
 
 def _number(value: float | None) -> float | None:

@@ -40,7 +40,7 @@ from tacsim import pose as se3
 from tacsim.guard import Touch
 from tacsim.hardware import UrArmFacts
 from tacsim.interface import Action, ArmState, Pose
-from tacsim.limits import ActionError, admit, check_action, region
+from tacsim.limits import ActionError, admit, check_action
 
 CONNECT_TIMEOUT = 10.0  # of the constructor and of recover [s]
 CLOSE_TIMEOUT = 1.2  # for the worker to ramp down and end its program; then it is killed [s]
@@ -85,10 +85,7 @@ class URArm:
     ) -> None:
         _check_host(facts, name)
         self.name, self.facts, self._timeout = name, facts, timeout
-        limits = facts.limits
-        self._region = region(
-            limits.workspace.lower, limits.workspace.upper, [(wall.point, wall.normal) for wall in limits.planes]
-        )
+        self._region = facts.limits.region
         self._kinematics = Kinematics(facts.model)
         self._lock = threading.RLock()
         self._closed = False

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from tacsim import pose as se3
 from tacsim.interface import Pose
+from tacsim.limits import Region, region
 from tacsim.optics.geometry import SensorModel
 from tacsim.quantity import Acceleration, Angle, Facts, Force, Length, Speed, Time
 
@@ -77,6 +78,11 @@ class ArmLimits(Facts):
     torque: Annotated[float, Field(gt=0, le=50.0)] = 3.0  # |torque| about the sensor's origin [N m]
     depth: Annotated[Length, Field(gt=0)] | None = None  # how deep the gel may be pressed; None: not watched [m]
     shear: Annotated[Length, Field(gt=0)] | None = None  # how far its surface may be dragged; None: not watched [m]
+
+    @property
+    def region(self) -> Region:
+        """Where the sensor's origin may be: the workspace, cut by the planes."""
+        return region(self.workspace.lower, self.workspace.upper, [(wall.point, wall.normal) for wall in self.planes])
 
 
 class Payload(Facts):

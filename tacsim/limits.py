@@ -24,7 +24,8 @@ class ActionError(ValueError):
 
 
 class LimitExceeded(RuntimeError):
-    """A limit of an arm (force, torque, depth, shear) was exceeded: the arm follows nothing until `recover`."""
+    """A limit of an arm (force, torque, depth, shear) was exceeded. A real or mock arm follows nothing until
+    `recover`, a simulated one as long as it is exceeded."""
 
 
 def check_action(action: object, movable: Collection[str], rig: str) -> Action:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.hardware import ArmLimits
 from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap, TactileFrame, Truth
-from tacsim.limits import LimitExceeded, admit, overload, region, shorten
+from tacsim.limits import LimitExceeded, admit, overload, shorten
 from tacsim.physics.world import MoveStats, World
 from tacsim.scene import GelSurface
 
@@ -125,8 +125,7 @@ class SimArm:
         self._world, self._clock, self._frame = world, clock, frame
         self._longest, self._widest = longest, widest
         self._limits, self._apart = limits, tuple(apart)
-        walls = None if limits is None else [(wall.point, wall.normal) for wall in limits.planes]
-        self._region = None if limits is None else region(limits.workspace.lower, limits.workspace.upper, walls or ())
+        self._region = None if limits is None else limits.region
 
     def state(self, at: float | None = None) -> ArmState:
         """Pictures and arms are of one instant in simulation, so `at` makes no difference."""

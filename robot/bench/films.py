@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from robot.bench.labels import BadData, Image
+from robot.bench.labels import BadData, Image, find
 from robot.bench.measure import Measurement, Timing
 from robot.bench.runner import Case
 from tacsim.quantity import Facts
@@ -52,7 +52,11 @@ def read_films(folder: Path) -> dict[Film, Path]:
 
     own = folder / OWN
     labels = load(Films, own if own.is_file() else SHIPPED)
-    found = {film: path for film in labels.films if (path := _find(folder, film.frames)) is not None}
+    found = {}
+    for film in labels.films:
+        path = find(folder, film.frames) or (folder if folder.name in film.frames else None)
+        if path is not None:
+            found[film] = path
     if own.is_file() and len(found) < len(labels.films):
         missing = next(film for film in labels.films if film not in found)
         raise BadData(f"{own} names '{missing.name}', but {folder} has none of {', '.join(missing.frames)}")
@@ -129,16 +133,6 @@ def _frames(path: Path) -> Iterator[Image]:
         yield from (folder_images(list_pictures(path)) if path.is_dir() else video_images(path))
     except EpisodeError as error:
         raise BadData(str(error)) from None
-
-
-def _find(folder: Path, names: tuple[str, ...]) -> Path | None:
-    for name in names:
-        found = sorted(folder.rglob(name))
-        if len(found) > 1:
-            raise BadData(f"'{name}' is there twice: {found[0]} and {found[1]}. Name the one folder that is meant")
-        if found:
-            return found[0]
-    return folder if folder.name in names else None
 
 
 def cases(folder: Path) -> tuple[Case, ...]:

@@ -30,7 +30,6 @@ from robot.ur import URArm
 from tacsim import pose as se3
 from tacsim.hardware import ArmLimits, MockArmFacts, Placement, Plane, UrArmFacts, Workspace
 from tacsim.interface import FloatArray, Pose
-from tacsim.limits import Region, region
 
 ROOM = 24  # second number of the loopback addresses
 PATIENCE = 20.0  # for anything that has to happen [s]
@@ -71,13 +70,6 @@ def facts(at: str, limits: Mapping[str, object] | None = None, **changes: object
         mock=MockArmFacts(realtime=True),
     )
     return made.model_copy(update={"watchdog": 1.0, **changes})
-
-
-def walls(given: UrArmFacts) -> Region:
-    """Where the sensor of an arm may be."""
-    limits = given.limits
-    planes = [(wall.point, wall.normal) for wall in limits.planes]
-    return region(limits.workspace.lower, limits.workspace.upper, planes)
 
 
 def moved(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:

@@ -30,7 +30,6 @@ from robot.bench.rehearsal import (
     sound,
     under_way,
     until,
-    walls,
 )
 from robot.bench.repeated import COUNT, Disturbed, Figure, repeated
 from robot.bench.runner import Case
@@ -52,7 +51,7 @@ def box_guard(repeat: int) -> list[Measurement]:
 
     def once() -> dict[str, float]:
         rng = np.random.default_rng(5)
-        inside = walls(facts(host(1), {"planes": (SLOPE,)}))
+        inside = facts(host(1), {"planes": (SLOPE,)}).limits.region
         rows = hostile(rng, GUARDED)
         ends = rows[finite_targets(rows), :3]
         begins = START + rng.uniform(-0.03, 0.03, ends.shape)
@@ -83,7 +82,7 @@ def box_wire(repeat: int) -> list[Measurement]:
         speeds = np.diff(path, axis=0) / PERIOD
         accelerations = np.diff(speeds, axis=0) / PERIOD
         return {
-            "outside": float((~(walls(given).excess(path) <= 1e-8)).sum()),
+            "outside": float((~(given.limits.region.excess(path) <= 1e-8)).sum()),
             "speed": 100 * float(np.linalg.norm(speeds, axis=1).max()) / limits.speed,
             "acceleration": 100 * float(np.linalg.norm(accelerations, axis=1).max()) / limits.acceleration,
             "joint step": 100 * float(np.abs(np.diff(joints, axis=0)).max()) / (limits.joint_speed * PERIOD),
@@ -114,7 +113,7 @@ def box_measured(repeat: int) -> list[Measurement]:
                 if not arm.status().is_fault:  # a stop at the wall is no breach of it
                     arm.command(moved(start, *rng.uniform(-0.5, 0.5, 3)))
                     time.sleep(0.3)
-            worst = float(walls(given).excess(watcher.records()["position"][1:]).max())
+            worst = float(given.limits.region.excess(watcher.records()["position"][1:]).max())
         return {"beyond": 1e3 * max(worst, 0.0)}
 
     rng = np.random.default_rng(1)

@@ -44,6 +44,12 @@ class Target:
         return value >= limit if self.at_least else value <= limit
 
 
+def _numbers(rows: Sequence[Row], what: str, case: str, variant: str, method: str) -> list[float]:
+    """`what` of those rows of a case and method whose variant begins so."""
+    chosen = [r for r in rows if (r.case, r.method) == (case, method) and r.variant.startswith(variant)]
+    return [value for row in chosen if (value := _number(row, what)) is not None]
+
+
 def pick(
     what: str, case: str, variant: str = "", *, method: str = "tacsim", resolution: str = "", scale: float = 1.0
 ) -> Find:
@@ -53,14 +59,7 @@ def pick(
     """
 
     def find(rows: Sequence[Row]) -> float | None:
-        found = [
-            value
-            for row in rows
-            if (row.case, row.method) == (case, method)
-            and row.variant.startswith(variant)
-            and row.resolution.startswith(resolution)
-            and (value := _number(row, what)) is not None
-        ]
+        found = _numbers([row for row in rows if row.resolution.startswith(resolution)], what, case, variant, method)
         return max(found) * scale if found else None
 
     return find
@@ -80,14 +79,7 @@ def mean(what: str, case: str, variant: str = "", ending: str = "", *, method: s
     """The mean of `what` over the rows of a case whose variant begins and ends so."""
 
     def find(rows: Sequence[Row]) -> float | None:
-        found = [
-            value
-            for row in rows
-            if (row.case, row.method) == (case, method)
-            and row.variant.startswith(variant)
-            and row.variant.endswith(ending)
-            and (value := _number(row, what)) is not None
-        ]
+        found = _numbers([row for row in rows if row.variant.endswith(ending)], what, case, variant, method)
         return sum(found) / len(found) if found else None
 
     return find

@@ -10,7 +10,7 @@ import pytest
 from robot.frames import pose_of
 from robot.kinematics import Kinematics, pose, rotation
 from robot.link import STATE, ArmStatus, Kind, Orders, Partner, command, touch
-from robot.servo import HARD, Servo, measured
+from robot.servo import HARD, STEEPEST, Servo, measured
 from robot.snapshot import Record
 from robot.trajectory import PERIOD
 from tacsim.interface import FloatArray, Pose
@@ -392,3 +392,12 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
     bench.run(100)
     assert bench.servo.status == ArmStatus.OK
     assert bench.at.position[0] - held[0] > 5e-3
+
+
+def test_a_singular_value_changes_no_faster_than_the_servo_relies_on() -> None:
+    random = np.random.default_rng(3)
+    for _ in range(300):
+        q = random.uniform(-np.pi, np.pi, 6)
+        turned = random.normal(0.0, 10.0 ** random.uniform(-3, 0), 6)
+        change = abs(KINEMATICS.singularity(q + turned) - KINEMATICS.singularity(q))
+        assert change <= STEEPEST * np.abs(turned).sum()

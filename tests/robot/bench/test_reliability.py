@@ -164,7 +164,7 @@ def test_hostile_targets_are_hostile() -> None:
     rows = rehearsal.hostile(np.random.default_rng(0), 10_000, bad=0.4)
     broken = ~np.isfinite(rows).all(axis=1)
     assert 0.15 < broken.mean() < 0.35
-    outside = rehearsal.walls(rehearsal.facts("127.0.0.2")).excess(np.nan_to_num(rows[:, :3])) > 0
+    outside = rehearsal.facts("127.0.0.2").limits.region.excess(np.nan_to_num(rows[:, :3])) > 0
     assert outside.mean() > 0.5
     calm = rehearsal.hostile(np.random.default_rng(0), 1_000, bad=0.0, run=100)[:, :3]
     assert len(np.unique(calm, axis=0)) == 10 and all((a == b).all() for a, b in pairwise(calm[:100]))

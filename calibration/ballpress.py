@@ -6,7 +6,9 @@ forward model (slope -> colour) and the inverse one (colour -> slope) to the sam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +21,7 @@ from calibration.photometry import FEW, Equations, Order, choose_order, equation
 from calibration.reference import SATURATED, STALE_COLOUR, UnusableReference, exchanged, make_reference
 from calibration.refine import BLUR as RIM_BLUR
 from calibration.refine import Refined, Window, refine
-from tacsim.optics.photometric import PhotometricLight, PhotometricModel, place_in_image
+from tacsim.optics.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -95,18 +97,27 @@ class Fit:
         return self.forward.steepest
 
 
-def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball: float) -> Fit:
+def calibrate_light(
+    reference: Image,
+    frames: Sequence[tuple[str, Image]],
+    ball: float,
+    erase: Callable[[Image], Image] | None = None,
+) -> Fit:
     """Calibrates the light of one sensor.
 
     Args:
         reference: (H, W, 3) uint8 RGB without contact.
         frames: names and pictures of presses, same size.
         ball: radius of the ball [px].
+        erase: takes away the dots that are printed on the gel.
 
     Raises BadPresses, with what is wrong in every frame, when no press can be used.
     """
     _check_frames(reference, frames)
     _check_order(reference, frames)
+    shown = reference
+    if erase is not None:
+        reference, frames = erase(reference), [(name, erase(image)) for name, image in frames]
     mean = untouched_mean(reference)
     found: list[Press] = []
     refused: list[tuple[str, str]] = []
@@ -120,22 +131,30 @@ def calibrate_light(reference: Image, frames: Sequence[tuple[str, Image]], ball:
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     order = choose_order(forward_sets)
+    every = functools.reduce(operator.add, forward_sets)
     steepest = max(rim_slope(press.circle, ball) for press in presses)
     scores = tuple(
-        _score(i, presses, labels, forward_sets, inverse_sets, order, steepest, mean, reference)
-        for i in range(len(presses))
+        _score(
+            press,
+            labels[i],
+            _forward_model(every - forward_sets[i], order, steepest),
+            fit_inverse([*inverse_sets[:i], *inverse_sets[i + 1 :]], place=len(presses) - 1 > FEW),
+            mean,
+            reference,
+        )
+        for i, press in enumerate(presses)
         if len(presses) > 1
     )
     warnings = [*_doubts(presses, ball, mean, len(refused)), *_doubts_of(scores)]
     return Fit(
-        forward=_forward_model(forward_sets, order, steepest),
+        forward=_forward_model(every, order, steepest),
         inverse=_inverse_model(inverse_sets, steepest),
         order=order,
         skirt=refined.skirt,
         scores=scores,
         left_out=tuple(refused),
         warnings=tuple(warnings),
-        reference=reference,
+        reference=shown,
         presses=tuple(presses),
     )
 
@@ -211,7 +230,8 @@ def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:
         return np.broadcast_to(level, difference.shape).copy()
     u, v = np.meshgrid(*place_in_image(difference.shape[1], difference.shape[0]))
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    weights, *_ = np.linalg.lstsq(terms[untouched], difference[untouched], rcond=None)
+    seen = terms[untouched]
+    weights = np.linalg.solve(seen.T @ seen, seen.T @ difference[untouched])
     quadratic: Float64 = terms @ weights
     return quadratic
 
@@ -319,8 +339,8 @@ def _inverse_equations(press: Press, gradient: Float64) -> tuple[Float64, Float6
     return terms.T @ terms, terms.T @ target[use]
 
 
-def _forward_model(sets: Sequence[Equations], order: Order, steepest: float) -> PhotometricModel:
-    weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(sets, order))
+def _forward_model(pixels: Equations, order: Order, steepest: float) -> PhotometricModel:
+    weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(pixels, order))
     return PhotometricModel(degree=order.degree, position=order.position, weights=weights, steepest=steepest, blur=BLUR)
 
 
@@ -330,35 +350,26 @@ def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> 
 
 
 def _score(
-    i: int,
-    presses: Sequence[Press],
-    labels: Sequence[Float64],
-    forward: Sequence[Equations],
-    inverse: Sequence[tuple[Float64, Float64]],
-    order: Order,
-    steepest: float,
-    mean: Float64,
-    reference: Image,
+    press: Press, gradient: Float64, model: PhotometricModel, inverse: Float64, mean: Float64, reference: Image
 ) -> Score:
-    """Press i, by models of all the others."""
-    press, gradient = presses[i], labels[i]
+    """A press, labelled `gradient` (H, W, 2), by a forward model and the inverse's weights that are not of it."""
     shape = press.shape
     v, u = np.mgrid[: shape[0], : shape[1]]
     away = np.hypot(u - press.circle.x, v - press.circle.y) / press.circle.radius
-    others = [*range(i), *range(i + 1, len(presses))]
-    model = _forward_model([forward[k] for k in others], order, steepest)
-    light, _ = PhotometricLight(model, shape).change(gradient.astype(np.float32), slice(0, shape[0]))
+    light, _ = PhotometricLight(model).change(gradient.astype(np.float32), *places_in_image(shape[1], shape[0]))
     predicted = _smooth(light.astype(np.float64), BLUR) * mean
     still = np.float64(reference) + press.drift  # what this frame would show without contact
     predicted = np.clip(still + predicted, 0.0, 255.0) - still
     real = press.change * mean
     contact = away < 1.5
-    weights = fit_inverse([inverse[k] for k in others], place=len(others) > FEW)
     at_u, at_v = place_in_image(shape[1], shape[0])
-    terms = inverse_features(
-        _smooth(press.change, INVERSE_BLUR).reshape(-1, 3), 2 * at_u[u.ravel()], 2 * at_v[v.ravel()]
-    )
-    angle = normal_angle((terms @ weights).reshape(*shape, 2), to_normal(gradient))
+    smooth = _smooth(press.change, INVERSE_BLUR)
+
+    def angle(where: NDArray[np.bool_]) -> float:
+        rows, columns = np.nonzero(where)
+        terms = inverse_features(smooth[where], 2 * at_u[columns], 2 * at_v[rows])
+        return float(normal_angle(terms @ inverse, to_normal(gradient[where])).mean())
+
     return Score(
         press.name,
         press.circle,
@@ -367,8 +378,8 @@ def _score(
         correlation=float(np.corrcoef(predicted[contact].ravel(), real[contact].ravel())[0, 1]),
         predicted=predicted.astype(np.float32),
         real=real.astype(np.float32),
-        angle=float(angle[away < 1].mean()),
-        untouched_angle=float(angle[away > FAR].mean()) if (away > FAR).any() else 0.0,
+        angle=angle(away < 1),
+        untouched_angle=angle(away > FAR) if (away > FAR).any() else 0.0,
     )
 
 

@@ -23,14 +23,14 @@ from calibration.inverse import InverseModel
 from calibration.view import GelView
 from tacsim.config import ConfigError, load
 from tacsim.hardware import Placement
-from tacsim.optics.geometry import Lighting, Markers, SensorGeometry, SensorModel
+from tacsim.optics.geometry import CameraNoise, Lighting, Markers, SensorGeometry, SensorModel
 from tacsim.optics.photometric import PhotometricModel
 from tacsim.quantity import Facts, Length, Time
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
-FORMAT = 2
-READABLE = (1, 2)  # 1: without view
+FORMAT = 3
+LATER = {1: {"view", "noise"}, 2: {"noise"}, 3: set[str]()}  # by format: what it had not yet
 FILE, REFERENCE = "calibration.yaml", "reference.png"
 LARGEST_FILE, LARGEST_PICTURE = 1 << 20, 1 << 26  # [bytes] of the YAML, and of the picture
 
@@ -67,7 +67,7 @@ class Provenance(Facts):
 class Calibration(Facts):
     """Everything that is known of one sensor."""
 
-    format: Literal[1, 2]
+    format: Literal[1, 2, 3]
     serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
@@ -77,6 +77,7 @@ class Calibration(Facts):
     skirt_fraction: Annotated[float, Field(gt=0)]
     view: GelView | None = None  # where the gel lies in the native picture; None: the native picture is metric
     markers: Markers | None = None  # None: no dots are printed on the gel
+    noise: CameraNoise | None = None  # of the picture that the models are for; None: not measured
     tool_from_sensor: Placement | None = None  # None: not measured
     latency: Annotated[Time, Field(ge=0)] | None = None  # from exposure to arrival; None: not measured [s]
     residuals: tuple[Residual, ...] = ()
@@ -99,17 +100,20 @@ class Calibration(Facts):
 
     @model_validator(mode="after")
     def _view_gives_the_geometry(self) -> Self:
-        if self.view is not None:
-            if self.format == 1:
-                raise ValueError("format 1 has no view")
-            if self.view.geometry != self.geometry:
-                raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
+        if self.view is not None and self.view.geometry != self.geometry:
+            raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
+        return self
+
+    @model_validator(mode="after")
+    def _format_has_all_that_is_given(self) -> Self:
+        for name in sorted(LATER[self.format]):
+            if getattr(self, name) is not None:
+                raise ValueError(f"format {self.format} has no {name}")
         return self
 
     def digest(self) -> str:
         """What `checksum` must be."""
-        later = {"view"} if self.format == 1 else set()  # what that format had not
-        content = self.model_dump(mode="json", exclude={"checksum"} | later)
+        content = self.model_dump(mode="json", exclude={"checksum"} | LATER[self.format])
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -150,8 +154,8 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
     version = re.search(r"^format:\s*(\S+)", text, re.MULTILINE)
     if version is None:
         raise BadBundle(f"{file} is no calibration: it names no format")
-    if version[1] not in map(str, READABLE):
-        known = " and ".join(map(str, READABLE))
+    if version[1] not in map(str, LATER):
+        known = ", ".join(map(str, LATER))
         raise BadBundle(f"{file} has format {version[1]}, this version of tacsim reads {known}; {again}")
     try:
         calibration = load(Calibration, file)
@@ -174,7 +178,8 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
 
 
 def sensor_model(path: Path) -> SensorModel:
-    """The simulated twin of a calibrated sensor, as its rectified picture shows it: geometry, untouched picture, light.
+    """The simulated twin of a calibrated sensor, as its rectified picture shows it: geometry, untouched picture, light,
+    and the camera's noise if it was measured.
 
     Raises BadBundle.
     """
@@ -186,5 +191,6 @@ def sensor_model(path: Path) -> SensorModel:
         lighting=Lighting(background=str(folder / REFERENCE)),
         photometric=calibration.forward,
         texture=0.0,  # the picture has the gel's own
+        noise=calibration.noise,
         source=f"calibration of {calibration.serial}, {calibration.provenance.made}",
     )

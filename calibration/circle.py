@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 
 BLUR = 1.5  # of images and of the dent that is fitted [px]: noise of the camera, and the skin of the gel
-DEGREE = 2  # of the polynomial
 REACH = 2.0  # the fit looks at this many times the size of the bright patch
 LEAST = 4.0  # radius of a circle that can be told from noise [px]
 STEEPEST = 0.98  # contact radius over ball radius, at most: beyond it the slope is no number
@@ -66,13 +65,14 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
     window = round(REACH * size) + 6
     columns = np.arange(max(round(x) - window, 0), min(round(x) + window + 1, image.shape[1]))
     rows = np.arange(max(round(y) - window, 0), min(round(y) + window + 1, image.shape[0]))
-    seen = difference[np.ix_(rows, columns)].reshape(-1, 3)
+    seen = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
+    power = float((seen**2).sum()), float(((seen - seen.mean(axis=1, keepdims=True)) ** 2).sum())
     largest = STEEPEST * ball_radius
 
     def unexplained(guess: Float64) -> float:
         if not LEAST / 2 < guess[2] < largest:
             return 2.0
-        return _unexplained(seen, columns - guess[0], rows - guess[1], float(guess[2]), ball_radius)
+        return _unexplained(seen, power, columns - guess[0], rows - guess[1], float(guess[2]), ball_radius)
 
     start = np.array([x, y, min(size, 0.95 * largest)])
     simplex = start + np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, -0.15 * start[2]]])
@@ -90,9 +90,10 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
 
 
 def _blurred(image: Float64) -> Float64:
-    from scipy.ndimage import gaussian_filter
+    import cv2
 
-    return np.asarray(gaussian_filter(image, (BLUR, BLUR, 0)), dtype=np.float64)
+    side = 2 * round(4 * BLUR) + 1
+    return np.asarray(cv2.GaussianBlur(image, (side, side), BLUR, borderType=cv2.BORDER_REFLECT), dtype=np.float64)
 
 
 def _patch(difference: Float64) -> tuple[float, float, float]:
@@ -110,14 +111,16 @@ def _patch(difference: Float64) -> tuple[float, float, float]:
     return float(columns.min()) + width / 2, float(rows.min()) + height / 2, max(width, height) / 2
 
 
-def _unexplained(seen: Float64, dx: Float64, dy: Float64, contact: float, ball: float) -> float:
-    """Share of the variance of `seen` (n, 3) that no polynomial of the dent's slopes explains."""
+def _unexplained(
+    seen: Float64, power: tuple[float, float], dx: Float64, dy: Float64, contact: float, ball: float
+) -> float:
+    """Share of the variance of `seen` (3, n) that no polynomial of the dent's slopes explains; `power`: sums of the
+    squares of `seen`, and of its variations."""
     r = np.hypot(dx[None, :], dy[:, None])
     steepness = dent_slope(r, contact, ball) / np.maximum(r, 1e-12)
-    slopes = _blurred(np.stack([steepness * dx[None, :], steepness * dy[:, None]], axis=-1)).reshape(-1, 2)
-    powers = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
-    features = np.stack([slopes[:, 0] ** i * slopes[:, 1] ** j for i, j in powers], axis=1)
+    x, y = (_blurred(steepness * part).ravel() for part in (dx[None, :], dy[:, None]))
+    features = np.stack([np.ones_like(x), y, y * y, x, x * y, x * x])
     # normal equations: few well-scaled columns, and a hundred solutions an image
-    weights, *_ = np.linalg.lstsq(features.T @ features, features.T @ seen, rcond=None)
-    rest = seen - features @ weights
-    return float((rest**2).sum() / ((seen - seen.mean(axis=0)) ** 2).sum())
+    right = features @ seen.T
+    weights, *_ = np.linalg.lstsq(features @ features.T, right, rcond=None)
+    return (power[0] - float((weights * right).sum())) / power[1]

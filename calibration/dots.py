@@ -12,6 +12,7 @@ Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 LEVELS = (0.2, 0.35, 0.5)  # a dot takes at least such a share of the light round it; the higher part it from others
+FAINT = 0.15  # share of the light that the blurred edge of a dot takes at least
 LEAST_FILLED = 0.4  # share of its bounding box that a dot fills
 LARGEST = 2.5  # radius of the largest dot that is one, in radii of the usual one
 LEAST_AREA, LARGEST_AREA = 0.2, 7.0  # of one dot, in areas of the usual one: dots are painted over, and half hidden
@@ -98,3 +99,22 @@ def light_taken(image: Image, side: int, blur: float) -> Float32:
     bright = cv2.morphologyEx(levels, cv2.MORPH_CLOSE, np.ones((side, side), dtype=np.uint8))
     share = calm / np.maximum(bright, 1).astype(np.float32)
     return np.asarray(np.float32(1.0) - share, dtype=np.float32)
+
+
+class DotEraser:
+    """Paints dots of about one radius [px] over with what surrounds them (Telea 2004): light is calibrated without
+    them, since under a press they move."""
+
+    def __init__(self, radius: float) -> None:
+        """Raises ValueError for dots too small to be found."""
+        if not radius >= SMALLEST:
+            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {SMALLEST:g} px are needed")
+        self._side, self._blur = 2 * int(np.ceil(LARGEST * radius)) + 1, BLUR * radius
+
+    def __call__(self, image: Image) -> Image:
+        """The picture (H, W, 3) without its dots."""
+        import cv2
+
+        inked = (light_taken(image, self._side, self._blur) > FAINT).astype(np.uint8)
+        wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
+        return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,14 +37,32 @@ class Frames:
     reference: Image  # (H, W, 3) RGB
     presses: tuple[tuple[str, Image], ...]  # names and pictures
     estimated: bool  # True: no frame without contact was given, the median of the presses stands for it
+    untouched: tuple[Image, ...] = ()  # all frames without contact, `reference` among them, in the order taken
+
+
+def named_untouched(paths: Iterable[Path]) -> list[Path]:
+    """Those whose name says that nothing touches: background.png, background_2.png, ...; frame0.png only with just this
+    name. In the order of UNTOUCHED, those with a number last."""
+    rank = {name: place for place, name in enumerate(UNTOUCHED)}
+    numbered = UNTOUCHED[: rank["frame0"]]
+    found = [
+        path for path in paths
+        if (stem := path.stem.lower()) in rank or stem.rstrip("0123456789").rstrip("_- ") in numbered
+    ]  # fmt: skip
+    return sorted(found, key=lambda path: (rank.get(path.stem.lower(), len(rank)), path))
 
 
 def rectified(frames: Frames, view: GelView) -> Frames:
     """The same frames as metric pictures of the gel. Raises BadPresses for pictures of another size than the view's."""
-    sizes = {image.shape[:2] for image in (frames.reference, *(image for _, image in frames.presses))}
-    check_size(sizes, view)
+    all_images = (frames.reference, *frames.untouched, *(image for _, image in frames.presses))
+    check_size({image.shape[:2] for image in all_images}, view)
     metric = metric_picture(view)
-    return Frames(metric(frames.reference), tuple((n, metric(i)) for n, i in frames.presses), frames.estimated)
+    return Frames(
+        metric(frames.reference),
+        tuple((name, metric(image)) for name, image in frames.presses),
+        frames.estimated,
+        tuple(metric(image) for image in frames.untouched),
+    )
 
 
 def check_size(sizes: Collection[tuple[int, ...]], view: GelView) -> None:
@@ -71,20 +89,25 @@ def metric_picture(view: GelView) -> Callable[[Image], Image]:
 
 def read_presses(folder: Path, reference: Path | None = None) -> Frames:
     """Reads all pictures of a folder. `reference`: the one without contact; None: the one with a name of UNTOUCHED, or
-    the median of all. Raises BadPresses, naming every file that is no picture."""
+    the median of all. Others with such a name show no contact either. Raises BadPresses, naming every file that is no
+    picture."""
     if not folder.is_dir():
         raise BadPresses(f"{folder} is no folder; name the folder that holds the frames")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    if reference is None:
-        reference = next((p for name in UNTOUCHED for p in paths if p.stem.lower() == name), None)
-    pressed = [path for path in paths if reference is None or path.resolve() != reference.resolve()]
+    untouched = named_untouched(paths)
+    if reference is None and untouched:
+        reference = untouched[0]
+    if reference is not None:
+        untouched = [reference, *(path for path in untouched if path.resolve() != reference.resolve())]
+    known = {path.resolve() for path in untouched}
+    pressed = [path for path in paths if path.resolve() not in known]
     if not pressed:
         raise BadPresses(f"{folder} holds no frame of a press ({', '.join(PICTURES)})")
     if len(pressed) > MOST:
         raise BadPresses(f"{folder} holds {len(pressed)} pictures; 5 to 8 presses are enough, {MOST} the most")
     images: dict[Path, Image] = {}
     unreadable = []
-    for path in pressed if reference is None else [reference, *pressed]:
+    for path in [*untouched, *pressed]:
         try:
             images[path] = read_image(path)
         except EpisodeError as error:
@@ -92,7 +115,8 @@ def read_presses(folder: Path, reference: Path | None = None) -> Frames:
     if unreadable:
         raise BadPresses("\n".join(unreadable))
     if reference is not None:
-        return Frames(images[reference], tuple((path.name, images[path]) for path in pressed), estimated=False)
+        presses = tuple((path.name, images[path]) for path in pressed)
+        return Frames(images[reference], presses, False, tuple(images[path] for path in untouched))
     shapes = {image.shape for image in images.values()}
     if len(pressed) < MEDIAN_OF or len(shapes) > 1:
         raise BadPresses(

@@ -70,15 +70,18 @@ class PolynomialSlopes:
 
 
 def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:
-    """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1."""
-    inputs = [*(GAIN * change).T, x, y]
-    columns = [
-        np.prod([inputs[i] for i in (*colour, *(3 + axis for axis in place))], axis=0)
-        if colour or place
-        else np.ones(len(x))
-        for colour, place in _terms()
-    ]
-    return np.stack(columns, axis=1)
+    """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1; each term lies together in memory."""
+    inputs = np.stack([*(GAIN * change).T, x, y])
+    found: dict[tuple[int, ...], int] = {}
+    terms = np.empty((TERMS, len(x)))
+    for row, (colour, place) in enumerate(_terms()):
+        factors = (*colour, *(3 + axis for axis in place))
+        found[factors] = row
+        if not factors:
+            terms[row] = 1.0
+        else:  # a term of one factor less, which comes before it, times its last
+            np.multiply(terms[found[factors[:-1]]], inputs[factors[-1]], out=terms[row])
+    return terms.T
 
 
 def to_normal(gradient: Float64) -> Float64:

@@ -65,6 +65,7 @@ class FrameNormaliser:
             raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
         self._rectify, self._grid, self._find, self._markers = rectify, grid, find, markers
         self._on_image: NDArray[np.bool_] = window(rectify.valid, grid)
+        self._off_image = np.nonzero(~self._on_image)
         self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
         self._valid.flags.writeable = False
         self._reference: Reference | None = None
@@ -158,13 +159,23 @@ class FrameNormaliser:
         return found
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
-        """The observation of `frame` at time `now` [s]. Raises NoReference; StaleReference when the light is another;
-        MarkersLost when too few markers are seen; ValueError for a frame of another shape."""
+        """The observation of `frame` at time `now` [s].
+
+        Where a real light is behind the picture (`drifts`) and enough of the gel is untouched to tell its drift since
+        the reference, that drift, one quadratic over the gel, is taken off the canonical image as it is off gradient
+        and height. Sources that know their surface, and simulated lights, have none: nothing is taken off.
+
+        Raises NoReference; StaleReference when the light is another; MarkersLost when too few markers are seen;
+        ValueError for a frame of another shape.
+        """
         if self._reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
         seen = self._reference.difference(self._rectify(frame.image))
         change: NDArray[np.float32] = window(seen, self._grid)
-        height, gradient, flow = self._surface(frame, seen)
+        height, gradient, flow, drift = self._surface(frame, seen)
+        if drift is not None:
+            change = np.subtract(change, drift, out=drift)
+            change[self._off_image] = 0.0  # what is not seen has no drift either
         return TactileObservation(
             image=_byte_image(change),
             gradient=gradient,
@@ -183,31 +194,32 @@ class FrameNormaliser:
         window(inside, self._grid)[...] = self._on_image
         return inside
 
-    def _surface(
-        self, frame: TactileFrame, change: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None, NDArray[np.float32] | None]:
-        """Height, gradient and flow, from the source or from the picture."""
+    def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
+        """Height, gradient and flow, from the source or from the picture; and the drift that is to be taken off the
+        canonical image."""
         self._beyond, self._sought = 0.0, False
         if frame.surface is not None:
             self._check(frame.surface)
-            return frame.surface.height, frame.surface.gradient, frame.surface.flow
-        height = gradient = flow = None
+            return frame.surface.height, frame.surface.gradient, frame.surface.flow, None
+        height = gradient = flow = removed = None
         self._sought = any(part is not None for part in (self._find, self._markers, self._watched))
         if self._watched is not None:
             drift = self._watched(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
-            self._drift = size_of(self._watched.at(drift)) if drift.told else self._drift
+            if drift.told:
+                self._drift = size_of(self._watched.at(drift))
+                removed = self._watched.part(drift, (0, 0), self._on_image.shape)
         if self._find is not None:
             assert self._reference is not None
             found = self._find(change, self._reference.relative)
             self._beyond = found.beyond
             if found.drift is not None:
                 self._drift, self._background = found.drift, found.background
-            height, gradient = found.height, found.gradient
+            height, gradient, removed = found.height, found.gradient, found.removed
         self._require_light()
         if self._markers is not None:
             deep = None if height is None else (height, canonical_cells(self._grid))
             flow = self._markers(frame.image, frame.index, deep)
-        return height, gradient, flow
+        return height, gradient, flow, removed
 
     def _require_light(self) -> None:
         """Raises StaleReference."""

@@ -6,6 +6,8 @@ the pixels.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +23,7 @@ ORDERS = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2)
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3)  # times the mean of the diagonal of the normal equations
 FEW = 3  # presses up to this number cover too little of the image to know how its light varies
 FEW_RIDGE = 1e-3
+CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
 WORTH = 0.98  # a larger model must lower the left-out error to this
 
 
@@ -47,12 +50,24 @@ class Equations:
     power: float  # sum of the squares of the changes of colour
     count: int  # numbers summed
 
+    def __add__(self, other: Equations) -> Equations:
+        """Of the pixels of both."""
+        return Equations(
+            self.square + other.square, self.right + other.right, self.power + other.power, self.count + other.count
+        )
+
+    def __sub__(self, part: Equations) -> Equations:
+        """Without the pixels of a part."""
+        return Equations(
+            self.square - part.square, self.right - part.right, self.power - part.power, self.count - part.count
+        )
+
 
 def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: int) -> Float64:
     """(n, terms) for slopes (n, 2) at places u, v (n,) in -1/2..1/2."""
-    normal = np.stack(normal_terms(gradient, degree), axis=-1)
+    normal = np.ascontiguousarray(np.moveaxis(normal_terms(gradient, degree), 0, -1))
     place = np.stack(position_terms(u, v, position), axis=-1)
-    return (place[:, :, None] * normal[:, None, :]).reshape(len(gradient), -1)
+    return np.asarray((place[:, :, None] * normal[:, None, :]).reshape(len(gradient), -1), dtype=np.float64)
 
 
 def equations(
@@ -60,22 +75,71 @@ def equations(
 ) -> Equations:
     """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
     and counts; None: all."""
-    terms = features(gradient, u, v, *LARGEST)
-    square = terms.T @ terms
     if lit is None or lit.all():
-        return Equations(square[None], terms.T @ change, float((change**2).sum()), change.size)
-    burnt = [terms[~lit[:, channel]] for channel in range(3)]
+        square, right = _normal_equations(gradient, u, v, change)
+        return Equations(square[None], right, float((change**2).sum()), change.size)
     counted = change * lit
-    squares = np.stack([square - lost.T @ lost for lost in burnt])
-    return Equations(squares, terms.T @ counted, float((counted**2).sum()), int(lit.sum()))
+    square, right = _normal_equations(gradient, u, v, counted)
+    squares = []
+    for burnt in (~lit).T:
+        lost, _ = _normal_equations(gradient[burnt], u[burnt], v[burnt], counted[burnt])
+        squares.append(square - lost)
+    return Equations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
 
 
-def solve(presses: Sequence[Equations], order: Order) -> Float64:
-    """(terms, 3) ridge weights."""
-    use = _terms_of(order)
-    square = sum((_part(p, use) for p in presses), np.zeros((1, len(use), len(use))))
-    right = sum((p.right[use] for p in presses), np.zeros((len(use), 3)))
-    return ridge_solution(square, right, order.ridge)
+def _normal_equations(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
+    """F^T F and F^T `change` for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is a term
+    of the normal times one of the place, and of the products of two columns most are the same powers. What is left are
+    87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
+    degree, position = LARGEST
+    normals, places = len(_powers(degree)), len(_places(position))
+    sums = np.zeros((len(_products()), len(_places(2 * position))))
+    right = np.zeros((normals, places * 3))
+    for start in range(0, len(gradient), CHUNK):
+        part = slice(start, start + CHUNK)
+        normal = normal_terms(gradient[part], 2 * degree)
+        normal = np.concatenate([normal, normal[2] * normal[:normals]])  # as _products has them
+        place = np.stack(position_terms(u[part], v[part], 2 * position))
+        sums += normal @ place.T
+        right += normal[:normals] @ (place[:places, None] * change[part].T).reshape(places * 3, -1).T
+    of_normals, of_places = _pairs()
+    square = sums[of_normals[None, :, None, :], of_places[:, None, :, None]]  # (places, normals, places, normals)
+    by_place = right.reshape(normals, places, 3).swapaxes(0, 1)
+    return square.reshape(places * normals, -1), by_place.reshape(-1, 3)
+
+
+def _powers(degree: int) -> list[tuple[int, ...]]:
+    """Powers of nx, ny and 1 - nz of the terms of the normal, in their order."""
+    higher = [(order - b, b, 0) for order in range(2, degree + 1) for b in range(order + 1)]
+    return [(1, 0, 0), (0, 1, 0), (0, 0, 1), *higher]
+
+
+def _products() -> list[tuple[int, ...]]:
+    """The same of all products of two terms of the normal (and a few more): terms of twice the degree, and the terms
+    times 1 - nz."""
+    return [*_powers(2 * LARGEST[0]), *((a, b, c + 1) for a, b, c in _powers(LARGEST[0]))]
+
+
+def _places(position: int) -> list[tuple[int, ...]]:
+    """Powers of u and v of the terms of the place."""
+    return [(order - b, b) for order in range(position + 1) for b in range(order + 1)]
+
+
+@functools.cache
+def _pairs() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where the products of each two terms stand: those of the normal (n, n), and those of the place (m, m)."""
+
+    def where(powers: list[tuple[int, ...]], products: list[tuple[int, ...]]) -> NDArray[np.intp]:
+        return np.array([[products.index(tuple(np.add(one, other))) for other in powers] for one in powers])
+
+    degree, position = LARGEST
+    return where(_powers(degree), _products()), where(_places(position), _places(2 * position))
+
+
+def solve(pixels: Equations, order: Order) -> Float64:
+    """(terms, 3) ridge weights; `pixels`: the sum of all presses that count."""
+    part = _part(pixels, _terms_of(order))
+    return ridge_solution(part.square, part.right, order.ridge)
 
 
 def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
@@ -89,20 +153,18 @@ def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
     return np.asarray(np.linalg.solve(regular, right.T[..., None])[..., 0].T, dtype=np.float64)
 
 
-def left_out_error(presses: Sequence[Equations], order: Order) -> float:
+def left_out_error(presses: Sequence[Equations], ridge: float) -> float:
     """Root mean square error of each press predicted from all others [relative change of colour]."""
-    use = _terms_of(order)
-    square = sum((_part(p, use) for p in presses), np.zeros((1, len(use), len(use))))
-    right = sum((p.right[use] for p in presses), np.zeros((len(use), 3)))
-    error, count = 0.0, 0
+    every = functools.reduce(operator.add, presses)
+    error = 0.0
     for press in presses:
-        own, wanted = _part(press, use), press.right[use]
-        weights = ridge_solution(square - own, right - wanted, order.ridge)
+        others = every - press
+        weights = ridge_solution(others.square, others.right, ridge)
+        own, wanted = press.square, press.right
         seen = own @ weights if len(own) == 1 else own @ weights.T[..., None]  # (1, terms, 3) or (3, terms, 1)
         seen = seen[0] if len(own) == 1 else seen[..., 0].T
         error += press.power - 2 * float((weights * wanted).sum()) + float((weights * seen).sum())
-        count += press.count
-    return float(np.sqrt(max(error, 0.0) / count))
+    return float(np.sqrt(max(error, 0.0) / every.count))
 
 
 def choose_order(presses: Sequence[Equations]) -> Order:
@@ -115,16 +177,19 @@ def choose_order(presses: Sequence[Equations]) -> Order:
         return Order(3, 0, FEW_RIDGE)
     best: tuple[float, Order] | None = None
     for degree, position in sorted(ORDERS, key=lambda order: term_count(*order)):
-        tried = [(left_out_error(presses, order), order) for order in (Order(degree, position, r) for r in RIDGES)]
-        error, order = min(tried, key=lambda pair: pair[0])
+        use = _terms_of(Order(degree, position, RIDGES[0]))
+        parts = [_part(press, use) for press in presses]
+        error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
+        order = Order(degree, position, ridge)
         if best is None or error < WORTH * best[0]:
             best = (error, order)
     assert best is not None
     return best[1]
 
 
-def _part(press: Equations, use: list[int]) -> Float64:
-    return press.square[:, use][:, :, use]
+def _part(of: Equations, use: list[int]) -> Equations:
+    """The equations of some of the terms."""
+    return Equations(of.square[:, use][:, :, use], of.right[use], of.power, of.count)
 
 
 def _terms_of(order: Order) -> list[int]:

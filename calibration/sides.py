@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.frames import MEDIAN_OF, UNTOUCHED, metric_picture
+from calibration.frames import MEDIAN_OF, UNTOUCHED, metric_picture, named_untouched
 from calibration.lens import BadCorners, Corners
 from calibration.reference import SATURATED
 from calibration.view import GelView
@@ -148,21 +148,13 @@ def rectangle(corners: Corners) -> tuple[int, int]:
 
 def _of_folder(folder: Path, reference: Path | None) -> Side:
     paths = list_pictures(folder)
-    named = [path for path in paths if _says_untouched(path)]
+    named = named_untouched(paths)
     if reference is None and named:
-        order = {name: rank for rank, name in enumerate(UNTOUCHED)}
-        reference = min(named, key=lambda path: order.get(path.stem.lower(), len(order)))
-        named.remove(reference)
+        reference = named.pop(0)
     given = reference.resolve() if reference is not None else None
     wanted = [path for path in paths if path.resolve() != given and path not in named]
     shots = _read(folder, wanted)
     return _side(folder, shots, reference, None, tuple(_read(folder, named)))
-
-
-def _says_untouched(path: Path) -> bool:
-    """True for background.png, background_2.png, ...; frame0.png is only one with just this name."""
-    stem = path.stem.lower()
-    return stem in UNTOUCHED or stem.rstrip("0123456789").rstrip("_- ") in UNTOUCHED[: UNTOUCHED.index("frame0")]
 
 
 def _read(folder: Path, paths: list[Path]) -> list[Shot]:

@@ -37,6 +37,7 @@ class FoundSurface:
     beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
     drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it to tell
     background: float | None  # mean angle of the slopes that this change would be taken for [degrees]
+    removed: Float32 | None  # (H, W, 3) part of the canonical image's change that is drift; None: none told or removed
 
 
 class SurfaceFinder:
@@ -58,6 +59,10 @@ class SurfaceFinder:
         self._unseen = ~valid[self._box]
         pitch = grid.pitch / grid.image_scale
         self._drift, self._drifts = DriftFinder(self._unseen.shape), drifts
+        # the canonical image in the seen box: its first row and column, and its size
+        self._image = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
+        corner = [(there - own) // 2 for there, own in zip(valid.shape, self._image, strict=True)]
+        self._corner = (corner[0] - self._box[0].start, corner[1] - self._box[1].start)
         self._response = _response(slopes, self._unseen.shape)
         self._integrate = Integrator(self._unseen.shape, pitch)
         self._shape = valid.shape
@@ -92,6 +97,9 @@ class SurfaceFinder:
             beyond=float(np.count_nonzero(beyond & ~hidden) / beyond.size),
             drift=None if changed is None else size_of(changed),
             background=None if changed is None else self._angle(changed),
+            removed=self._drift.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
+            if self._drifts and drift.told
+            else None,
         )
 
     def _angle(self, change: Float32) -> float:

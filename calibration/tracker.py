@@ -33,6 +33,9 @@ JUMP = 2.6  # jumps of the whole lattice that are looked for [pitches]
 JUMPS = 4  # of these, how many are tried
 WITNESSES = 3  # dots whose surroundings propose such jumps
 MISSING = 0.04  # share of dots, and of points, without a partner from which on a jump is suspected
+DIRT = 0.1  # a dot so far from where those around lead may be a speck of dirt [pitches]
+ODD = 4.0  # ... if it is so many times as far as usual
+BETTER = 0.25  # another point is the dot if it is so much nearer to where they lead
 SUPPORT = 2  # neighbours that must be known where a dot is looked for
 
 TINY = 1e-9  # keeps the map of a dot without any neighbour solvable
@@ -95,6 +98,8 @@ class DotTracker:
             partner = self._best(expected, points, trusted)
         elif int((partner >= 0).sum()) < min(len(partner), len(points)):
             partner = self._extended(partner, points)  # a dot that has turned round is where its neighbours lead
+        if len(points) > int((partner >= 0).sum()):
+            partner = self._told_from_dirt(partner, points)
         seen = partner >= 0
         displacement = np.zeros_like(self._rest)
         displacement[seen] = points[partner[seen]] - self._rest[seen]
@@ -190,6 +195,30 @@ class DotTracker:
                 break
             checked = np.where(odd > 0.9 * odd.max(), -1, checked)
         return checked
+
+    def _told_from_dirt(self, partner: Index, points: Float64) -> Index:
+        """`partner`, but where a point that nobody claims fits far better to the dots around than the claimed one, it
+        is the dot, and the claimed one a speck of dirt."""
+        known = partner >= 0
+        if not known.any():
+            return partner
+        moved = np.where(known[:, None], points[partner] - self._rest, 0.0)
+        odd = np.linalg.norm(self._continued(np.arange(len(partner)), known, moved) - moved, axis=1)
+        doubted = np.flatnonzero(known & (odd > max(DIRT * self._pitch, ODD * float(np.median(odd[known])))))
+        if not len(doubted):
+            return partner
+        told = partner.copy()
+        told[doubted] = -1
+        free = np.setdiff1d(np.arange(len(points)), told[told >= 0])
+        moved[doubted] = 0.0  # a speck misleads its neighbours, too
+        led = self._continued(doubted, told >= 0, moved)
+        found = self._match(self._rest[doubted] + led, points[free], SURE)
+        other = free[found]
+        away = [np.linalg.norm(points[p] - self._rest[doubted] - led, axis=1) for p in (other, partner[doubted])]
+        better = (found >= 0) & (away[0] < BETTER * away[1])
+        told[doubted] = np.where(better, other, partner[doubted])
+        once = np.bincount(told[told >= 0], minlength=len(points)).max() <= 1
+        return told if once else partner
 
     def _continued(self, asked: Index, known: Mask, moved: Float64) -> Float64:
         """(k, 2) displacement of the dots `asked`, from that (n, 2) of the dots `known`."""

@@ -207,6 +207,7 @@ def _driven_frames(facts: RigFacts, scene: Scene) -> dict[str, str]:
 
 
 def _sim_sensor(world: World, clock: SimClock, name: str, facts: SimSensorFacts, rig: RigFacts) -> SimSensor:
+    from tacsim.optics.noise import noise_source
     from tacsim.optics.render import Renderer
     from tacsim.optics.surface import surface_map
     from tacsim.sensor import SimSensor
@@ -220,7 +221,8 @@ def _sim_sensor(world: World, clock: SimClock, name: str, facts: SimSensorFacts,
         arm=facts.arm,
     )
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
-    return SimSensor(world, clock, name, spec, Renderer(model, rig.scene.gel.size[:2]), sample)
+    render = Renderer(model, rig.scene.gel.size[:2])
+    return SimSensor(world, clock, name, spec, render, sample, noise_source(model, name))
 
 
 class _Rewind:

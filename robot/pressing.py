@@ -7,8 +7,10 @@ next one is asked for once the gel looks untouched again.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +18,10 @@ from numpy.typing import NDArray
 
 from calibration.ballpress import BadPresses
 from calibration.collect import PressCollection
+from calibration.dots import DotEraser
 from calibration.errors import Unusable
+from calibration.lattice import NoLattice
+from calibration.markers import find_markers
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.rigfile import RigFacts
@@ -33,6 +38,7 @@ HOLD = 0.5  # a picture that has not moved for so long stands still [s]
 REST = 1.5  # the same for the one without contact, which everything is measured against [s]
 RESTLESS = 5.0  # a press that does not come to rest for so long is worth a word [s]
 REFERENCE = "background.png"
+NOISE_FRAMES = 8  # pictures without contact that tell the camera's noise
 
 
 class CannotPress(Unusable):
@@ -53,6 +59,7 @@ class PressPlan:
     presses: int = 8
     patience: float = 180.0  # for each step of the person's [s]
     rectify: Callable[[Image], Image] | None = None  # native picture -> metric one; None: they are the same
+    markers: bool = False  # dots are printed on the gel
 
 
 @dataclass(slots=True)
@@ -60,6 +67,7 @@ class PressRecord:
     """What came of a plan."""
 
     reference: Image | None = None
+    untouched: tuple[Image, ...] = ()  # pictures without contact, native; the reference is the last
     presses: list[tuple[str, Image]] = field(default_factory=list)  # names and native pictures
     refused: list[str] = field(default_factory=list)  # why, in order
 
@@ -86,9 +94,9 @@ def record_presses(
     tell: Callable[[int], None] = lambda done: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> PressRecord:
-    """Leads a person through one picture without contact and the presses of `plan`.
+    """Leads a person through the pictures without contact and the presses of `plan`.
 
-    keep: is given name and native picture of each as soon as it is taken, the one without contact first.
+    keep: is given name and native picture of each as soon as it is taken, those without contact first.
     say: is told what to do next, and what became of it, a sentence at a time.
     tell: how many presses are done.
 
@@ -100,9 +108,12 @@ def record_presses(
     watch = _Watch(camera, plan.patience, stop)
     try:
         say("Take everything off the gel.")
-        record.reference = watch.rest()
-        collection = PressCollection(record.reference, plan.ball, plan.rectify)
+        record.untouched = watch.rest()
+        record.reference = record.untouched[-1]
+        collection = PressCollection(record.reference, plan.ball, _to_judge(plan, record.reference))
         keep(REFERENCE, record.reference)
+        for number, image in enumerate(record.untouched[:-1], start=1):
+            keep(f"{Path(REFERENCE).stem}_{number}.png", image)
         watch.untouched(record.reference)
         while len(record.presses) < plan.presses:
             tell(len(record.presses))
@@ -130,6 +141,19 @@ def record_presses(
     return record
 
 
+def _to_judge(plan: PressPlan, reference: Image) -> Callable[[Image], Image] | None:
+    """Native picture -> the metric one that presses are judged by, without dots. Raises BadPresses."""
+    if not plan.markers:
+        return plan.rectify
+    rectify = plan.rectify if plan.rectify is not None else lambda image: image
+    try:
+        _, radius = find_markers(rectify(reference))
+    except NoLattice as nothing:
+        raise BadPresses(f"{nothing}; leave --markers out if none are printed") from None
+    erase = DotEraser(radius)
+    return lambda image: erase(rectify(image))
+
+
 class _Stopped(Exception):
     """Somebody asked for the end."""
 
@@ -148,14 +172,18 @@ class _Watch:
         """What is touched is told by the difference from `image`."""
         self._cells = _cells(image)
 
-    def rest(self) -> Image:
-        """A picture that has not moved for REST."""
+    def rest(self) -> tuple[Image, ...]:
+        """The last pictures, NOISE_FRAMES at most, of a time of REST in which none has moved."""
         begun = None
+        shown: deque[Image] = deque(maxlen=NOISE_FRAMES)
         while True:
             frame, still, _ = self._next()
             begun = frame.time if begun is None else begun
+            if still == 0.0:
+                shown.clear()
+            shown.append(frame.image)
             if still >= REST:
-                return frame.image
+                return tuple(shown)
             self._give_up(frame.time - begun, "the picture does not come to rest; is something moving before the gel?")
 
     def press(self, restless: Callable[[], None]) -> Image:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
@@ -109,8 +109,10 @@ def record_sights(
     plan: SightPlan,
     stop: Callable[[], bool] = lambda: False,
     tell: Callable[[int], None] = lambda done: None,
+    keep: Callable[[Sequence[Sight]], None] = lambda sights: None,
 ) -> SightRecord:
-    """Looks at the board from all poses of the plan and returns to the first. Raises CannotSee when the board is not
+    """Looks at the board from all poses of the plan and returns to the first; `keep` is given all sights so far after
+    each one. Raises CannotSee when the board is not
     in view at the beginning, before anything has moved; and what the arm or the camera raise: the arm is stopped then.
     """
     spread = swing(np.stack([turn.as_matrix() for turn in schedule(plan)]))
@@ -144,6 +146,7 @@ def record_sights(
                 continue
             sensor = se3.compose(base_from_world, arm.state().pose)
             record.sights.append(Sight(se3.compose(sensor, sensor_from_flange), board))
+            keep(record.sights)
         go(arm, arm.name, begun, TRAVEL)
     finally:
         arm.stop()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -103,8 +103,10 @@ def record_touches(
     plan: TouchPlan,
     stop: Callable[[], bool] = lambda: False,
     tell: Callable[[int], None] = lambda done: None,
+    keep: Callable[[Sequence[Touch]], None] = lambda touches: None,
 ) -> TouchRecord:
     """Resets the rig, touches, and leaves the arm lifted and stopped. `facts`: those that the rig was opened with.
+    `keep` is given all touches so far after each one.
 
     A stop ends it early. Raises NoTouch when the first approach meets nothing, DeviceError when most of the others
     fail, and what the reset, the arm or the camera raise; the arm is stopped then.
@@ -140,6 +142,7 @@ def record_touches(
                 continue
             balls.append(se3.transform(pose, np.array([*contact, plan.ball_radius - depth])))
             record.touches.append(Touch(se3.compose(pose, sensor_from_tool), contact, depth))
+            keep(record.touches)
     finally:
         rig.stop()
     return record

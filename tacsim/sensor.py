@@ -14,6 +14,7 @@ from tacsim import pose as se3
 from tacsim.hardware import ArmLimits
 from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap, TactileFrame, Truth
 from tacsim.limits import LimitExceeded, admit, overload, shorten
+from tacsim.optics.noise import NoiseSource
 from tacsim.physics.world import MoveStats, World
 from tacsim.scene import GelSurface
 
@@ -200,6 +201,7 @@ class SimSensor:
     Args:
         render: gel surface -> (H, W, 3) uint8 RGB.
         sample: gel surface -> height, gradient and flow on the canonical grid.
+        noise: of its camera; that of a picture follows from the episode's seed and the frame's index. None: none.
     """
 
     def __init__(
@@ -210,12 +212,13 @@ class SimSensor:
         spec: SensorSpec,
         render: Callable[[GelSurface], NDArray[np.uint8]],
         sample: Callable[[GelSurface], SurfaceMap],
+        noise: NoiseSource | None = None,
     ) -> None:
         self._world, self._clock, self._frame, self._spec = world, clock, frame, spec
-        self._render, self._sample = render, sample
+        self._render, self._sample, self._noise = render, sample, noise
         self._newest: TactileFrame | None = None
         self._version = -1  # of the world in the newest frame
-        self._index = 0
+        self._index = self._episode = 0
 
     @property
     def spec(self) -> SensorSpec:
@@ -225,15 +228,18 @@ class SimSensor:
         """The picture of the world as it is now; simulation never times out."""
         if self._newest is None or self._version != self._clock.version:
             surface = self._world.surface(self._frame)
+            image = self._render(surface)
+            if self._noise is not None:
+                image = self._noise(image, self._index, self._episode)
             self._newest = TactileFrame(
-                image=self._render(surface), time=self._clock.now(), index=self._index, surface=self._sample(surface)
+                image=image, time=self._clock.now(), index=self._index, surface=self._sample(surface)
             )
             self._version, self._index = self._clock.version, self._index + 1
         return self._newest
 
-    def restart(self) -> None:
-        """Counts frames from zero again."""
-        self._newest, self._index = None, 0
+    def restart(self, episode: int = 0) -> None:
+        """Counts frames from zero again; `episode`: seed of the noise in this one."""
+        self._newest, self._index, self._episode = None, 0, episode
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -271,7 +277,7 @@ class SimStart:
             self._world.move({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
         self._clock.restart()
         for sensor in self._sensors.values():
-            sensor.restart()
+            sensor.restart(seed)
         return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}
 
     def touch(self) -> None:

@@ -1,4 +1,5 @@
-"""Real group: the dots of a real gel, followed through a film of a press; the user brings the film.
+"""Real group: the dots of a real gel, followed through a film of a press, and the noise of its camera; the user brings
+the film.
 
 What is followed is found in the first frame, which shows no contact, by nothing but that frame; the labels only say how
 many dots a person counts there.
@@ -7,6 +8,7 @@ many dots a person counts there.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -27,6 +29,7 @@ CASE = "marker_film"
 OWN = "films.yaml"
 SHIPPED = Path(__file__).parent / "references" / OWN
 STILL = 3.0  # a frame that differs less from the first, in the mean, shows the gel at rest [grey levels]
+REST_FRAMES = 8  # that tell the camera's noise
 MOST_FRAMES = 2000
 
 
@@ -68,6 +71,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     from calibration.dots import DotFinder
     from calibration.lattice import NoLattice, usual_pitch
     from calibration.markers import find_markers
+    from calibration.noise import NoiseUnknown, measure_noise
     from calibration.tracker import DotTracker
 
     frames = _frames(path)
@@ -84,7 +88,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     samples, processor, still, moved = [], [], [], np.zeros_like(rest)
     seen = np.ones(len(rest), dtype=np.bool_)
     always, fewest, out = seen.copy(), len(rest), np.zeros_like(seen)
-    resting = True
+    resting, at_rest = True, [first]
     for image in islice(frames, MOST_FRAMES):
         wall, cpu = perf_counter(), process_time()
         tracked = tracker(find(image).centres)
@@ -97,6 +101,7 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
         resting = resting and float(np.abs(image.astype(np.float32) - first).mean()) < STILL
         if resting:
             still.append(np.where(tracked.seen[:, None], tracked.displacement, np.nan))
+            at_rest = [*at_rest, image][:REST_FRAMES]
     if not samples:
         raise BadData(f"{path}: a film of a single frame")
     kept = int(always.sum())
@@ -111,6 +116,10 @@ def marker_film(film: Film, path: Path, repeat: int) -> list[Measurement]:
     }
     if len(still) > 2:
         figures["jitter_px"] = float(np.nanmedian(np.nanstd(np.array(still), axis=0)))
+    with suppress(NoiseUnknown):
+        noise = measure_noise(at_rest)
+        figures |= {f"noise_{name}": value for name, value in zip("rgb", noise.deviation, strict=True)}
+        figures["noise_neighbours"] = float(np.mean(noise.neighbours))
     timing = Timing(tuple(samples), float(np.median(processor)))
     left = int((out & ~always).sum())
     note = f"{left} dots leave the picture" if left else ""

@@ -15,7 +15,7 @@ from robot.bench.press import press, press_scene
 from robot.bench.runner import Case
 from tacsim.interface import TactileFrame
 from tacsim.optics.geometry import CanonicalGrid, SensorGeometry, SensorModel
-from tacsim.optics.photometric import PhotometricModel, place_in_image, term_count
+from tacsim.optics.photometric import PhotometricModel, place_in_image, places_in_image, term_count
 from tacsim.scene import Sphere
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def made_up(width: int) -> Calibration:
         steepest=1.0, blur=0.8,
     )  # fmt: skip
     slopes = rng.uniform(-0.6, 0.6, (*shape, 2)).astype(np.float32)
-    change, _ = PhotometricLight(forward, shape).change(slopes, slice(0, shape[0]))
+    change, _ = PhotometricLight(forward).change(slopes, *places_in_image(shape[1], shape[0]))
     u, v = np.meshgrid(*place_in_image(shape[1], shape[0]))
     terms = inverse_features(change.reshape(-1, 3).astype(np.float64), 2 * u.ravel(), 2 * v.ravel())
     target = to_normal(slopes.reshape(-1, 2).astype(np.float64))

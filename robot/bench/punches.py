@@ -81,12 +81,13 @@ class Draw:
     """Draws dents of a punch in calibrated light."""
 
     def __init__(self, fit: Fit, labels: Presses) -> None:
-        from tacsim.optics.photometric import PhotometricLight
+        from tacsim.optics.photometric import PhotometricLight, places_in_image
 
         self.reference = fit.reference
         self._still = fit.reference.astype(np.float32)
         self._mean = self._still.mean(axis=(0, 1))
-        self._light = PhotometricLight(fit.forward, fit.reference.shape[:2])
+        self._light = PhotometricLight(fit.forward, tuple(self._mean.tolist()))
+        self._places = places_in_image(self._still.shape[1], self._still.shape[0])
         self._blur = fit.forward.blur
         self._pitch, self._thickness = labels.pixel_pitch, labels.gel_thickness[0]
 
@@ -113,10 +114,10 @@ class Draw:
         v, u = np.mgrid[:rows, :columns].astype(np.float32)
         at = [np.float32(BOX // 2) + axis - np.float32(middle) for axis, middle in ((u, x), (v, y))]
         seen = np.asarray(cv2.remap(slopes, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
-        change, _ = self._light.change(seen, slice(0, rows))
+        change, _ = self._light.change(seen, *self._places)
         if self._blur > 0:
             change = np.asarray(cv2.GaussianBlur(change, (0, 0), self._blur), dtype=np.float32)
-        picture: Image = np.rint(np.clip(self._still + change * self._mean, 0, 255)).astype(np.uint8)
+        picture: Image = np.rint(np.clip(self._still + change, 0, 255)).astype(np.uint8)
         return picture
 
 

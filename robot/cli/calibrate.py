@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, quantity, say_files, writing
+from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, quantity, say_files, writing
 from robot.cli.pressing import pressed
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from calibration.bundle import Calibration
     from calibration.frames import Frames
     from calibration.view import GelView
-    from tacsim.optics.geometry import Markers
+    from tacsim.optics.geometry import CameraNoise, Markers
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
 
@@ -52,7 +52,11 @@ def sensor(
     ] = None,
     reference: Annotated[
         Path | None,
-        typer.Option(help="The picture without contact.", show_default="background.png or the like in FRAMES"),
+        typer.Option(
+            help="The picture without contact; the camera's noise is told by more of them, background_1.png and so on "
+            "beside it.",
+            show_default="background.png or the like in FRAMES",
+        ),
     ] = None,
     serial: Annotated[
         str, typer.Option(help="Serial number of the sensor that the calibration belongs to.")
@@ -82,10 +86,11 @@ def sensor(
     folder = new_directory(out, "calibration")
     with busy("loading"):
         from calibration.ballpress import BadPresses, calibrate_light
+        from calibration.dots import DotEraser
         from calibration.frames import read_presses, rectified
     try:
         if camera is not None:
-            read = pressed(camera, set_ or [], folder, ball / pitch, presses, seen, serial)
+            read = pressed(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
         else:
             assert frames is not None
             read = read_presses(frames, reference)
@@ -93,22 +98,31 @@ def sensor(
             read = rectified(read, seen)
         if read.estimated:
             notes.print("no picture without contact: the median of all presses stands for it")
+        found = _markers(read, pitch) if markers else None
+        erase = None if found is None else DotEraser(found.radius / pitch)
         with busy(f"calibrating from {len(read.presses)} presses"):
-            fit = calibrate_light(read.reference, read.presses, ball / pitch)
+            fit = calibrate_light(read.reference, read.presses, ball / pitch, erase)
     except BadPresses as error:
         hint = "FRAMES" if camera is None else "--camera"
         raise typer.BadParameter(str(error), param_hint=hint) from None
-    _write(folder, fit, read, serial, ball, pitch, markers=markers, view=seen)
+    _write(folder, fit, read, serial, ball, pitch, found, view=seen)
 
 
 def _write(
-    folder: Path, fit: Fit, read: Frames, serial: str, ball: float, pitch: float, *, markers: bool, view: GelView | None
+    folder: Path,
+    fit: Fit,
+    read: Frames,
+    serial: str,
+    ball: float,
+    pitch: float,
+    found: Markers | None,
+    *,
+    view: GelView | None,
 ) -> None:
     """Shows the calibration and writes its bundle."""
     from calibration.bundle import write_bundle
     from calibration.residual_picture import draw
 
-    found = _markers(fit, pitch) if markers else None
     _show(fit, pitch)
     if found is None:
         _look_for_dots(fit)
@@ -117,8 +131,9 @@ def _write(
             f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
             f"{found.radius * 1e3:.2g} mm"
         )
-    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, view)
-    with writing(folder if folder.exists() else make(folder)):  # there already, if frames were taken into it
+    noise = _noise(read)
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, view, noise)
+    with writing(made(folder)):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
             written.append(folder / "residuals.png")
@@ -133,20 +148,37 @@ def _load_view(path: Path) -> GelView:
     return load(GelView, path)
 
 
-def _markers(fit: Fit, pitch: float) -> Markers:
+def _markers(read: Frames, pitch: float) -> Markers:
     """The lattice of dots in the picture without contact."""
     from calibration.lattice import NoLattice
     from calibration.markers import find_markers
     from tacsim.optics.geometry import Markers
 
     try:
-        lattice, radius = find_markers(fit.reference)
+        lattice, radius = find_markers(read.reference)
     except NoLattice as nothing:
         raise typer.BadParameter(
             f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
         ) from None
     rows, columns = lattice.present.shape
     return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
+def _noise(read: Frames) -> CameraNoise | None:
+    """The camera's noise, and a word on it."""
+    from calibration.noise import NoiseUnknown, measure_noise
+
+    try:
+        noise = measure_noise(read.untouched)
+    except NoiseUnknown as why:
+        notes.print(f"camera's noise not measured: {why}", markup=False)
+        return None
+    spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
+    notes.print(
+        f"camera's noise, from {len(read.untouched)} pictures without contact: R, G, B {spread} grey levels; "
+        f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
+    )
+    return noise
 
 
 def _look_for_dots(fit: Fit) -> None:
@@ -161,7 +193,14 @@ def _look_for_dots(fit: Fit) -> None:
 
 
 def _bundle(
-    fit: Fit, serial: str, ball: float, pitch: float, names: list[str], markers: Markers | None, view: GelView | None
+    fit: Fit,
+    serial: str,
+    ball: float,
+    pitch: float,
+    names: list[str],
+    markers: Markers | None,
+    view: GelView | None,
+    noise: CameraNoise | None,
 ) -> Calibration:
     from datetime import UTC, datetime
     from importlib import metadata
@@ -181,6 +220,7 @@ def _bundle(
         skirt_fraction=fit.skirt.fraction,
         view=view,
         markers=markers,
+        noise=noise,
         residuals=tuple(
             Residual(
                 frame=score.name,

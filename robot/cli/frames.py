@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +13,7 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, quantity, results, say_files
+from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, progress, quantity, results, say_files
 from robot.cli.output import writing as writing_into
 from robot.cli.run import ask
 
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from calibration.records import SightFile, TouchFile
     from calibration.touch import TouchNoise
     from robot.sighting import SightPlan
+    from robot.touching import TouchPlan
     from tacsim.interface import Pose
     from tacsim.rigfile import RigFacts
 
@@ -68,7 +72,7 @@ def touch(
     _one_source(touches, rig)
     folder = new_directory(out, "touch")
     if touches is not None:
-        _tell_touch(read_touches(touches), noise, folder, arm or "ARM", live=False)
+        _tell_touch(read_touches(touches), noise, folder, arm or "ARM")
         return
     from robot.touching import TouchPlan
 
@@ -83,11 +87,11 @@ def touch(
         depth=_within(depth, 0.05e-3, 2e-3, "--depth"),
         lift=_within(lift, 2e-3, 50e-3, "--lift"),
     )
-    record = _touched(rig, arm, sensor, plan, set_ or [])
-    _tell_touch(record, noise, folder, arm, live=True)
+    _tell_touch(_touched(rig, arm, sensor, plan, set_ or [], folder), noise, folder, arm)
 
 
-def _touched(rig: str, arm: str, sensor: str, plan: Any, overrides: list[str]) -> TouchFile:
+def _touched(rig: str, arm: str, sensor: str, plan: TouchPlan, overrides: list[str], folder: Path) -> TouchFile:
+    """Touches now; what was recorded is kept in `folder`, whatever ends it."""
     from calibration.records import touch_file
     from robot.open import CannotOpen, open_rig
     from robot.touching import CannotTouch, alone, record_touches
@@ -99,28 +103,56 @@ def _touched(rig: str, arm: str, sensor: str, plan: Any, overrides: list[str]) -
     except CannotTouch as wrong:
         raise CannotOpen(str(wrong)) from wrong
     _confirm(facts, f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?")
-    with Interrupt() as interrupt:
-        with progress() as bar, open_rig(opened, confirm=lambda question: True) as running:
-            row = bar.add_task("touching", total=plan.touches)
-            taken = record_touches(
-                running, opened, arm, sensor, plan, interrupt, lambda done: bar.update(row, completed=done)
-            )
-        if interrupt():
-            complain("stopped by a signal; nothing is measured")
-            raise typer.Exit(interrupt.exit_code)
+    with (
+        Interrupt() as interrupt,
+        _kept(folder / "touches.yaml", "touch") as keep,
+        progress() as bar,
+        open_rig(opened, confirm=lambda question: True) as running,
+    ):
+        row = bar.add_task("touching", total=plan.touches)
+        taken = record_touches(
+            running,
+            opened,
+            arm,
+            sensor,
+            plan,
+            interrupt,
+            lambda done: bar.update(row, completed=done),
+            lambda touches: keep(touch_file(touches, plan.ball_radius)),
+        )
+    _end_if_stopped(interrupt, f"{len(taken.touches)} touches")
     for missed in taken.missed:
         notes.print(f"left out: {missed}", markup=False)
     return touch_file(taken.touches, plan.ball_radius)
 
 
-def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str, *, live: bool) -> None:
-    from calibration.records import plain, write_record
+@contextmanager
+def _kept(path: Path, command: str) -> Iterator[Callable[[TouchFile | SightFile], None]]:
+    """Gives what writes each state of a record to `path`, and says at the end where it is, also of a failure."""
+    from calibration.records import write_record
+
+    def keep(record: TouchFile | SightFile) -> None:
+        with writing_into(made(path.parent)):
+            write_record(path, record)
+
+    try:
+        yield keep
+    finally:
+        if path.exists():
+            again = f"tacsim calibrate {command} {shlex.quote(str(path))}"
+            notes.print(f"recorded: {path}; to calibrate from it again, without the arm: {again}", markup=False)
+
+
+def _end_if_stopped(interrupt: Interrupt, what: str) -> None:
+    if interrupt():
+        complain(f"stopped by a signal; {what} are kept, nothing is calibrated")
+        raise typer.Exit(interrupt.exit_code)
+
+
+def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
+    from calibration.records import plain
     from calibration.touch import fit_touches
 
-    if live:  # before anything else can go wrong
-        with writing_into(make(folder)):
-            kept = write_record(folder / "touches.yaml", record)
-            notes.print(f"touches kept in {kept}", markup=False)
     with busy(f"fitting {len(record.touches)} touches"):
         fit = fit_touches(record.measurements(), record.ball_radius, noise)
     _table(
@@ -196,7 +228,6 @@ def hand_eye(
         _tell_hand_eye(read_sights(poses), noise, folder)
         return
     from calibration.board import parse_board
-    from calibration.records import write_record
     from calibration.view import Lens
     from robot.sighting import SightPlan
     from tacsim.config import load
@@ -213,26 +244,36 @@ def hand_eye(
         tilt=_within(tilt, 0.1, 1.0, "--tilt"),
         pivot=_within(pivot, 0.0, 2.0, "--pivot"),
     )
-    record = _sighted(rig, arm, camera, plan, set_ or [], fixed=fixed)
-    with writing_into(make(folder)):
-        notes.print(f"poses kept in {write_record(folder / 'poses.yaml', record)}", markup=False)
-    _tell_hand_eye(record, noise, folder)
+    _tell_hand_eye(_sighted(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
 
 
-def _sighted(rig: str, arm: str, camera: str, plan: SightPlan, overrides: list[str], *, fixed: bool) -> SightFile:
+def _sighted(
+    rig: str, arm: str, camera: str, plan: SightPlan, overrides: list[str], folder: Path, *, fixed: bool
+) -> SightFile:
+    """Looks now; what was recorded is kept in `folder`, whatever ends it."""
     from calibration.records import sight_file
     from robot.sighting import open_camera, opened, record_sights
     from tacsim.config import load_rig
 
     facts = load_rig(rig, overrides=overrides).facts
     _confirm(facts, f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?")
-    with Interrupt() as interrupt:
-        with progress() as bar, opened(facts, arm) as mover, open_camera(camera, plan.lens) as eye:
-            row = bar.add_task("looking", total=plan.poses)
-            taken = record_sights(mover, eye, plan, interrupt, lambda done: bar.update(row, completed=done))
-        if interrupt():
-            complain("stopped by a signal; nothing is measured")
-            raise typer.Exit(interrupt.exit_code)
+    with (
+        Interrupt() as interrupt,
+        _kept(folder / "poses.yaml", "hand-eye") as keep,
+        progress() as bar,
+        opened(facts, arm) as mover,
+        open_camera(camera, plan.lens) as eye,
+    ):
+        row = bar.add_task("looking", total=plan.poses)
+        taken = record_sights(
+            mover,
+            eye,
+            plan,
+            interrupt,
+            lambda done: bar.update(row, completed=done),
+            lambda sights: keep(sight_file(sights, fixed=fixed)),
+        )
+    _end_if_stopped(interrupt, f"{len(taken.sights)} poses")
     for missed in taken.missed:
         notes.print(f"left out: {missed}", markup=False)
     return sight_file(taken.sights, fixed=fixed)
@@ -325,6 +366,6 @@ def _degrees(radians: float) -> float:
 
 def _keep(folder: Path, name: str, report: dict[str, Any]) -> None:
     path = folder / name
-    with writing_into(folder if folder.exists() else make(folder)):
+    with writing_into(made(folder)):
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     say_files(path)

@@ -7,7 +7,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.output import Out, busy, make, new_directory, progress, quantities, results, say_files, writing
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import (
+    Out,
+    Overrides,
+    busy,
+    made,
+    new_directory,
+    notes,
+    progress,
+    quantities,
+    results,
+    say_files,
+    writing,
+)
+from robot.cli.pressing import keeping, named_camera
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,8 +36,9 @@ PICTURES = 200  # at most
 
 def lens(
     frames: Annotated[
-        Path, typer.Argument(help="A folder of pictures of a board: the lens. One picture of it on the gel: the view.")
-    ],
+        Path | None,
+        typer.Argument(help="A folder of pictures of a board: the lens. One picture of it on the gel: the view."),
+    ] = None,
     board: Annotated[
         str | None,
         typer.Option(help="dots:COLUMNSxROWS:PITCH or charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]."),
@@ -37,10 +53,18 @@ def lens(
     lens_file: Annotated[
         Path | None, typer.Option("--lens", help="lens.yaml of the same camera; else distortion is fitted along.")
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(metavar="RIG/SENSOR", help="Take the pictures now, with this camera of a rig; no arm moves."),
+    ] = None,
+    views: Annotated[
+        int, typer.Option(min=1, max=PICTURES, help="How many, with --camera; 1: of the board on the gel, its view.")
+    ] = 12,
     centre: Annotated[str | None, typer.Option(help="u,v of the sensor's axis [px]; default: the middle.")] = None,
     size: Annotated[
         Any, typer.Option(parser=quantities("length", 2), metavar="LENGTH,LENGTH", help="Width, height of the gel.")
     ] = None,
+    set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Calibrate a camera's lens, or its view of a gel, from pictures of a board.
@@ -49,8 +73,13 @@ def lens(
     picture of a board that lies on the gel gives view.yaml and rectified.png: where each point of the gel is seen, for
     `tacsim calibrate sensor --view`.
 
+    With --camera it leads you through it: view after view, each taken once the board is found and held still. The
+    pictures are kept in frames/ beside the result; Ctrl-C keeps what was taken.
+
     Example: tacsim calibrate lens board.png --board "dots:9x7:2.5 mm" --reference empty.png
     """
+    if (frames is None) == (camera is None):
+        raise typer.BadParameter("give either pictures, or --camera to take them now")
     from calibration.board import parse_board
     from calibration.view import Lens
     from tacsim.config import load
@@ -60,15 +89,63 @@ def lens(
     if (board is None) == (corners is None):
         raise typer.BadParameter("give either --board or --corners")
     if corners is not None:
+        if frames is None:
+            raise typer.BadParameter("corners are read off a picture: give it, or a --board", param_hint="--corners")
         _view_by_corners(frames, _numbers(corners, 8, "--corners"), size, folder)
         return
     assert board is not None
     described = parse_board(board)
+    if camera is not None:
+        frames = _viewed(camera, set_ or [], folder, described, views, reference)
+    assert frames is not None
     if frames.is_dir():
         _lens(frames, described, folder)
         return
     axis = None if centre is None else _numbers(centre, 2, "--centre")
     _view(frames, described, reference, known, None if axis is None else (axis[0], axis[1]), size, folder)
+
+
+def _viewed(camera: str, overrides: list[str], folder: Path, board: Board, views: int, reference: Path | None) -> Path:
+    """Pictures taken now: the folder that keeps them, or the only one. A signal ends the command; what was taken is
+    kept then, too. Raises CannotPress, CannotView, DeviceError."""
+    from calibration.view import FEWEST_PICTURES
+    from robot.camera import Camera
+    from robot.viewing import CannotView, ViewPlan, record_views
+
+    if 1 < views < FEWEST_PICTURES:
+        raise typer.BadParameter(
+            f"{views}: a lens needs {FEWEST_PICTURES} views, 12 are good; the board on the gel needs 1",
+            param_hint="--views",
+        )
+    facts, sensor = named_camera(camera, overrides)
+    empty = None if reference is None else _picture(reference)
+    if empty is not None and empty.shape[:2] != (facts.height, facts.width):
+        raise typer.BadParameter(
+            f"it is {empty.shape[1]} x {empty.shape[0]} px, the camera's pictures are {facts.width} x {facts.height}",
+            param_hint="--reference",
+        )
+    plan = ViewPlan(board, views, on_gel=views == 1, reference=empty)
+    frames = folder / "frames"
+    with Camera(facts, sensor) as eye, Interrupt() as interrupt, progress() as bar:
+        row = bar.add_task("views", total=views)
+        try:
+            taken = record_views(
+                eye,
+                plan,
+                keeping(frames),
+                say=lambda words: notes.print(words, markup=False),
+                tell=lambda done: bar.update(row, completed=done),
+                stop=interrupt,
+            )
+        finally:
+            if frames.exists():
+                notes.print(f"pictures kept in {frames}", markup=False)
+    if interrupt():
+        complain(f"stopped by a signal; {len(taken.views)} views are kept, nothing is calibrated")
+        raise typer.Exit(interrupt.exit_code)
+    if len(taken.views) < views:
+        raise CannotView(f"the source was over after {len(taken.views)} of {views} views")
+    return frames / taken.views[0][0] if plan.on_gel else frames
 
 
 def _lens(pictures: Path, board: Board, folder: Path) -> None:
@@ -105,7 +182,7 @@ def _lens(pictures: Path, board: Board, folder: Path) -> None:
         f"focal length {lens_.focal[0]:.1f}, {lens_.focal[1]:.1f} px; centre {lens_.centre[0]:.1f}, "
         f"{lens_.centre[1]:.1f} px; residual {lens_.residual:.2f} px"
     )
-    with writing(make(folder)):
+    with writing(made(folder)):
         say_files(_write(folder / "lens.yaml", lens_))
 
 
@@ -151,7 +228,7 @@ def _tell_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
         f"pixel on the sensor's axis; the gel, {1e3 * view.size[0]:.2f} x {1e3 * view.size[1]:.2f} mm, becomes "
         f"{geometry.width} x {geometry.height} px"
     )
-    with writing(make(folder)):
+    with writing(made(folder)):
         (folder / "rectified.png").write_bytes(encode_png(np.rint(to_metric(view)(image)).astype(np.uint8)))
         say_files(_write(folder / "view.yaml", view), folder / "rectified.png")
 

@@ -41,6 +41,11 @@ def make(folder: Path) -> Path:
     return folder
 
 
+def made(folder: Path) -> Path:
+    """The folder, made unless this command has put something into it already. Raises what :func:`make` does."""
+    return folder if folder.exists() else make(folder)
+
+
 @contextmanager
 def writing(folder: Path) -> Iterator[Path]:
     """Makes an OSError name `folder` when it names no file: a disk that fills up in the middle of a write says

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import make, notes, progress, writing
+from robot.cli.output import made, notes, progress, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from calibration.frames import Frames
     from calibration.view import GelView
+    from tacsim.hardware import CameraSensorFacts
 
 
 def pressed(
@@ -29,6 +31,8 @@ def pressed(
     presses: int,
     view: GelView | None,
     serial: str,
+    *,
+    markers: bool,
 ) -> Frames:
     """Frames taken now, native, and kept in `folder`/frames. camera: RIG/SENSOR; ball: its radius [px].
 
@@ -37,34 +41,22 @@ def pressed(
     from calibration.ballpress import BadPresses
     from calibration.frames import Frames, check_size, metric_picture
     from robot.camera import Camera
-    from robot.pressing import PressPlan, camera_facts, record_presses
-    from tacsim.config import load_rig
-    from tacsim.record.images import encode_png
+    from robot.pressing import PressPlan, record_presses
 
-    rig, _, sensor = camera.rpartition("/")
-    if not rig:
-        raise typer.BadParameter(
-            f"'{camera}': give rig and sensor, such as ur5e/upper or my.yaml/upper", param_hint="--camera"
-        )
-    facts = camera_facts(load_rig(rig, overrides=overrides).facts, sensor)
+    facts, sensor = named_camera(camera, overrides)
     if view is not None:
         check_size([(facts.height, facts.width)], view)
     frames = folder / "frames"
-
-    def keep(name: str, image: NDArray[np.uint8]) -> None:
-        with writing(frames if frames.exists() else make(frames)):
-            (frames / name).write_bytes(encode_png(image))
-
     with Camera(facts, sensor) as eye:
         _await_person()
         with Interrupt() as interrupt, progress() as bar:
             row = bar.add_task("presses", total=presses)
-            plan = PressPlan(ball, presses, rectify=None if view is None else metric_picture(view))
+            plan = PressPlan(ball, presses, rectify=None if view is None else metric_picture(view), markers=markers)
             try:
                 taken = record_presses(
                     eye,
                     plan,
-                    keep,
+                    keeping(frames),
                     say=lambda words: notes.print(words, markup=False),
                     tell=lambda done: bar.update(row, completed=done),
                     stop=interrupt,
@@ -78,7 +70,31 @@ def pressed(
         raise typer.Exit(interrupt.exit_code)
     if taken.reference is None or not taken.presses:
         raise BadPresses("the source was over before a press was taken")
-    return Frames(taken.reference, tuple(taken.presses), estimated=False)
+    return Frames(taken.reference, tuple(taken.presses), False, taken.untouched)
+
+
+def named_camera(camera: str, overrides: list[str]) -> tuple[CameraSensorFacts, str]:
+    """The sensor RIG/SENSOR, and its name. Raises CannotPress where nobody can be before its camera."""
+    from robot.pressing import camera_facts
+    from tacsim.config import load_rig
+
+    rig, _, sensor = camera.rpartition("/")
+    if not rig:
+        raise typer.BadParameter(
+            f"'{camera}': give rig and sensor, such as ur5e/upper or my.yaml/upper", param_hint="--camera"
+        )
+    return camera_facts(load_rig(rig, overrides=overrides).facts, sensor), sensor
+
+
+def keeping(folder: Path) -> Callable[[str, NDArray[np.uint8]], None]:
+    """What writes pictures into `folder`, which the first one makes."""
+    from tacsim.record.images import encode_png
+
+    def keep(name: str, image: NDArray[np.uint8]) -> None:
+        with writing(made(folder)):
+            (folder / name).write_bytes(encode_png(image))
+
+    return keep
 
 
 def _await_person() -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping
+from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,6 +42,7 @@ class HertzBench:
     """
 
     def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
+        from tacsim.optics.noise import noise_source
         from tacsim.optics.render import Renderer
 
         unknown = sorted(set(models) - set(scene.sensors))
@@ -52,6 +54,8 @@ class HertzBench:
         ahead = Pose(np.array([0.0, 0.0, RADIUS + GAP]))
         self._balls = {name: se3.compose(pose, ahead).position for name, pose in self._poses.items()}
         self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
+        self._noise = {name: noise_source(model, name) for name, model in models.items()}
+        self._looks = count()
         self._drawn: OrderedDict[tuple[str | int, ...], tuple[NDArray[np.uint8], SurfaceMap]] = OrderedDict()
 
     @property
@@ -89,7 +93,9 @@ class HertzBench:
 
     def look(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
         """Picture (H, W, 3) and surface of a sensor."""
-        return self._look(name, *_contact(self._poses[name], self._balls[name]))
+        image, surface = self._look(name, *_contact(self._poses[name], self._balls[name]))
+        noise = self._noise[name]
+        return image if noise is None else noise(image, next(self._looks)), surface
 
     def _wrench(self, depth: float, x: float, y: float) -> FloatArray:
         """(6,) on the sensor, about its origin: the ball pushes along its -z."""

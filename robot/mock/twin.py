@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal, Protocol, Self
 
@@ -236,6 +237,7 @@ class WorldBench:
     """The simulated world and its renderers."""
 
     def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
+        from tacsim.optics.noise import noise_source
         from tacsim.optics.render import Renderer
         from tacsim.physics.world import make_world
 
@@ -243,6 +245,8 @@ class WorldBench:
         self._initial = self.world.snapshot()
         self._models, self._grid = models, grid
         self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
+        self._noise = {name: noise_source(model, name) for name, model in models.items()}
+        self._looks = count()
         self.stats: dict[str, float] = {}
 
     def poses(self) -> dict[str, Pose]:
@@ -270,7 +274,10 @@ class WorldBench:
         from tacsim.optics.surface import surface_map
 
         surface = self.world.surface(name)
-        return self._renderers[name](surface), surface_map(surface, self._grid, self._models[name].markers)
+        image, noise = self._renderers[name](surface), self._noise[name]
+        if noise is not None:
+            image = noise(image, next(self._looks))
+        return image, surface_map(surface, self._grid, self._models[name].markers)
 
     def truth(self) -> Truth | None:
         return self.world.truth()

@@ -1,9 +1,11 @@
-"""Facts of one tactile sensor: the one geometry of its image, its light, its markers, its noise."""
+"""Facts of one tactile sensor: the one geometry of its image, its light, its markers, its texture and noise."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from tacsim.optics.photometric import PhotometricModel
@@ -11,6 +13,9 @@ from tacsim.quantity import Facts, Length
 
 Channel = Annotated[float, Field(ge=0, le=4)]
 Rgb = tuple[Channel, Channel, Channel]
+Deviation = Annotated[float, Field(ge=0, le=32)]
+Correlation = Annotated[float, Field(ge=-1, le=1)]
+Neighbour = Annotated[float, Field(ge=-0.95, le=0.95)]
 
 
 def _colour_or_picture(value: Any) -> str:
@@ -97,6 +102,26 @@ class Markers(Facts):
     radius: Annotated[Length, Field(gt=0)] = 0.25e-3  # [m]
 
 
+class CameraNoise(Facts):
+    """Noise of the pictures that a camera delivers, rounding to whole grey levels included."""
+
+    deviation: tuple[Deviation, Deviation, Deviation]  # of R, G, B [grey levels]
+    colours: tuple[Correlation, Correlation, Correlation] = (0.0, 0.0, 0.0)  # of R with G, R with B, G with B
+    neighbours: tuple[Neighbour, Neighbour] = (0.0, 0.0)  # correlation of pixels side by side along x, along y
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _correlations_are_possible(self) -> Self:
+        if np.linalg.eigvalsh(self.colour_matrix())[0] < -1e-6:
+            raise ValueError(f"colours {self.colours}: no three colours can be correlated so")
+        return self
+
+    def colour_matrix(self) -> NDArray[np.float64]:
+        """(3, 3) correlations of R, G, B."""
+        red_green, red_blue, green_blue = self.colours
+        return np.array([[1.0, red_green, red_blue], [red_green, 1.0, green_blue], [red_blue, green_blue, 1.0]])
+
+
 class SensorModel(Facts):
     """Everything that makes a gel surface into a picture."""
 
@@ -108,6 +133,7 @@ class SensorModel(Facts):
     markers: Markers | None = None
     texture: Annotated[Length, Field(ge=0)] = 2e-6  # standard deviation of the gel's surface texture [m]
     texture_seed: Annotated[int, Field(ge=0)] = 0
+    noise: CameraNoise | None = None  # of each picture that a sensor delivers; None: a camera without noise
     source: str = ""
 
     @model_validator(mode="after")

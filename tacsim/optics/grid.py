@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,13 @@ class PixelGrid:
         inside_x = np.abs(self.x) <= size[0] / 2 + margin
         inside_y = np.abs(self.y) <= size[1] / 2 + margin
         return inside_y[:, None] & inside_x[None, :]
+
+    def in_image(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """u, v: where points x, y [m] lie across an image of these pixels, each from -1/2 to 1/2."""
+        middle_x = self.x0 + (self.columns - 1) / 2 * self.pitch
+        middle_y = self.y0 + (self.rows - 1) / 2 * self.pitch
+        wide, high = self.columns * self.pitch, self.rows * self.pitch
+        return (x - np.float32(middle_x)) / np.float32(wide), (y - np.float32(middle_y)) / np.float32(high)
 
     def refined(self, factor: int) -> PixelGrid:
         """The same area with `factor` x `factor` points for each one."""

@@ -50,22 +50,29 @@ def term_count(degree: int, position: int) -> int:
     return len(_powers(degree)) * len(_places(position))
 
 
-def normal_terms(gradient: NDArray[np.floating], degree: int) -> list[NDArray[np.floating]]:
-    """The terms of the normal for slopes (..., 2), each (...,), in the order of the weights."""
+def normal_terms(gradient: NDArray[np.floating], degree: int) -> NDArray[np.floating]:
+    """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights."""
     gx, gy = gradient[..., 0], gradient[..., 1]
+    terms = np.empty((term_count(degree, 0), *gx.shape), dtype=gradient.dtype)
     nz = 1.0 / np.sqrt(1.0 + gx * gx + gy * gy)
-    nx, ny = -gx * nz, -gy * nz
-    terms: list[NDArray[np.floating]] = [nx, ny, 1.0 - nz]
-    last = [nx, ny]
+    terms[0], terms[1], terms[2] = gx * -nz, gy * -nz, 1.0 - nz
+    last, here = [0, 1], 3
     for _ in range(degree - 1):  # nx^a ny^b of one order higher: each by nx, and the last by ny
-        last = [*(term * nx for term in last), last[-1] * ny]
-        terms += last
+        for term, factor in [*((term, 0) for term in last), (last[-1], 1)]:
+            np.multiply(terms[term], terms[factor], out=terms[here, ...])
+            here += 1
+        last = list(range(here - len(last) - 1, here))
     return terms
 
 
 def position_terms(u: NDArray[np.floating], v: NDArray[np.floating], position: int) -> list[NDArray[np.floating]]:
     """The terms of the place in the image for u, v (...,) in -1/2..1/2."""
-    return [u**a * v**b for a, b in _places(position)]
+    products = [np.ones_like(u)]  # each by u, and the last by v, from one order to the next
+    last = products
+    for _ in range(position):
+        last = [*(term * u for term in last), last[-1] * v]
+        products = products + last
+    return products
 
 
 def place_in_image(columns: int, rows: int) -> tuple[Float64, Float64]:
@@ -73,47 +80,45 @@ def place_in_image(columns: int, rows: int) -> tuple[Float64, Float64]:
     return (np.arange(columns) + 0.5) / columns - 0.5, (np.arange(rows) + 0.5) / rows - 0.5
 
 
-def clipped(gradient: Float32, steepest: float) -> tuple[Float32, NDArray[np.bool_]]:
-    """Slopes (..., 2) no steeper than `steepest`, of unchanged direction, and (...,) where they had been."""
-    gx, gy = gradient[..., 0], gradient[..., 1]
-    square = gx * gx + gy * gy
-    beyond = square > steepest * steepest
-    if not beyond.any():
-        return gradient, beyond
-    shorter = gradient.copy()
-    shorter[beyond] *= (steepest / np.sqrt(square[beyond]))[:, None]
-    return shorter, beyond
+def places_in_image(columns: int, rows: int) -> tuple[Float32, Float32]:
+    """u and v (rows, columns) of the pixels of an image."""
+    u, v = np.meshgrid(*place_in_image(columns, rows))
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def clipped(gradient: Float32, steepest: float) -> tuple[Float32, int]:
+    """Slopes (..., 2) no steeper than `steepest`, of unchanged direction, and how many had been. In memory the slopes
+    by x and those by y lie apart."""
+    planes = np.ascontiguousarray(np.moveaxis(gradient, -1, 0))
+    square = planes[0] * planes[0] + planes[1] * planes[1]
+    beyond = square > np.float32(steepest * steepest)
+    count = int(np.count_nonzero(beyond))
+    if count:
+        planes = np.where(beyond, planes * (np.float32(steepest) / np.sqrt(np.maximum(square, 1e-30))), planes)
+    return np.moveaxis(planes, 0, -1), count
 
 
 class PhotometricLight:
-    """A model made ready for the pixels of one image."""
+    """A model made ready for use: its weights as arrays."""
 
-    def __init__(self, model: PhotometricModel, shape: tuple[int, int]) -> None:
-        """`shape`: rows, columns."""
-        self._model, self._shape = model, shape
-        terms = len(_powers(model.degree))
-        weights = np.array(model.weights, dtype=np.float64).reshape(-1, terms, 3)  # (places, terms, 3)
-        u, v = place_in_image(shape[1], shape[0])
-        places = np.stack(position_terms(*np.meshgrid(u, v), model.position))  # (places, rows, columns)
-        # (terms, 3, rows, columns): the polynomial in the normal that holds at each pixel; one number where they agree
-        self._weights: Float32 = np.einsum("ptc,pij->tcij", weights, places if model.position else places[:, :1, :1])
-        self._weights = np.ascontiguousarray(self._weights, dtype=np.float32)
+    def __init__(self, model: PhotometricModel, mean: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
+        """mean: the untouched image's mean colour, by which changes are multiplied; 1: they stay relative."""
+        self._model = model
+        self._terms = term_count(model.degree, 0)
+        weights = (np.array(model.weights) * mean).astype(np.float32).reshape(-1, self._terms, 3)
+        self._weights = np.ascontiguousarray(weights.transpose(0, 2, 1)).reshape(-1, self._terms)  # place and channel
 
-    def change(self, gradient: Float32, rows: slice) -> tuple[Float32, int]:
-        """(n, columns, 3) relative change of colour under slopes (n, columns, 2) of the image rows `rows`, before blur,
-        and how many of these slopes were clipped to the calibrated range."""
+    def change(self, gradient: Float32, u: Float32, v: Float32) -> tuple[Float32, int]:
+        """(..., 3) change of colour under slopes (..., 2) at places u, v (...) in -1/2..1/2, before blur, and
+        how many of these slopes were clipped to the calibrated range."""
+        import cv2
+
         slopes, beyond = clipped(gradient, self._model.steepest)
-        terms = normal_terms(slopes, self._model.degree)
-        weights = self._weights[:, :, rows] if self._model.position else self._weights
-        change = np.empty((*gradient.shape[:2], 3), dtype=np.float32)
-        product = np.empty(gradient.shape[:2], dtype=np.float32)
-        for channel in range(3):
-            total = terms[0] * weights[0, channel]
-            for term, weight in zip(terms[1:], weights[1:], strict=True):
-                np.multiply(term, weight[channel], out=product)
-                total += product
-            change[..., channel] = total
-        return change, int(np.count_nonzero(beyond))
+        places = np.stack(position_terms(u.ravel(), v.ravel(), self._model.position))
+        # Most of the work is one product of matrices, which BLAS does at the speed of the processor.
+        at_places = self._weights @ normal_terms(slopes, self._model.degree).reshape(self._terms, -1)
+        change = np.einsum("pcn,pn->cn", at_places.reshape(len(places), 3, -1), places)
+        return np.asarray(cv2.merge(list(change)), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from tacsim.optics.geometry import Light, Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.markers import check_fits, marker_transmission
-from tacsim.optics.photometric import PhotometricLight
+from tacsim.optics.photometric import PhotometricLight, places_in_image
 from tacsim.optics.spline import line_matrices
-from tacsim.optics.surface import sample_surface
+from tacsim.optics.surface import SurfaceTable, sample_surface
 from tacsim.scene import GelSurface
 
 Float32 = NDArray[np.float32]
@@ -31,12 +31,14 @@ Float32 = NDArray[np.float32]
 # Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
 TEXTURE_PITCH = 0.12e-3
+WHITE = np.float32(255.0)
 
 
 class Renderer:
     """Makes the images of one simulated sensor. All that does not change from frame to frame is computed once.
 
-    The texture stays where it is in the image: reference and contact frames share it, also under sideways motion.
+    The texture stays where it is in the image: reference and contact frames share it, also under sideways motion. The
+    camera's noise is not part of it: sensors lay that on the pictures they deliver (tacsim.optics.noise).
     Raises ValueError when markers do not fit on the gel or the background picture does not fit the image.
     """
 
@@ -48,53 +50,61 @@ class Renderer:
         if model.markers is not None:
             check_fits(model.markers, gel_size)
         self._texture = texture_gradient(self._grid, gel_size, model.texture, model.texture_seed)
-        self._beyond = 0
+        self._beyond = 0.0
         self._light: PhotometricLight | None = None
         if model.photometric is None:
-            self._unlit = unlit_image(model.lighting, self._grid.shape)
+            self._unlit = WHITE * unlit_image(model.lighting, self._grid.shape)  # what is seen beside the light
         else:
-            self._unlit = untouched_image(model.lighting, self._grid.shape)
-            self._mean = self._unlit.mean(axis=(0, 1))
-            self._light = PhotometricLight(model.photometric, self._grid.shape)
+            self._unlit = WHITE * untouched_image(model.lighting, self._grid.shape)
+            red, green, blue = self._unlit.mean(axis=(0, 1)).tolist()
+            self._light = PhotometricLight(model.photometric, (red, green, blue))
+            if model.texture > 0:
+                places = places_in_image(self._grid.columns, self._grid.rows)
+                self._unlit += self._light.change(self._texture, *places)[0]
 
     @property
     def beyond(self) -> float:
-        """Share of the pixels of the last image whose slope was clipped to the calibrated range; 0 for Phong lights."""
-        return self._beyond / (self._grid.rows * self._grid.columns)
+        """Share of the last image's surface whose slope was clipped to the calibrated range; 0 for Phong lights."""
+        return self._beyond
 
     def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
         import cv2
 
-        gradient = sample_surface(surface, self._grid).gradient
+        light = self._shaded(surface) if self._light is None else self._calibrated(self._light, surface)
         dots = None if self._markers is None else marker_transmission(surface, self._markers, self.model.geometry)
-        image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
-        change = None if self._light is None else self._change(self._light, gradient)
+        image = np.empty(light.shape, dtype=np.uint8)
+
         for strip in strips(self._grid.rows):
-            if change is None:
-                light = shade(gradient[strip] + self._texture[strip], self.model.lighting)
-            else:
-                light = change[strip] * self._mean
-            light += self._unlit[strip]
+            lit, unlit = light[strip], self._unlit[strip]
             if dots is not None:
-                light *= dots[strip, :, None]
-            np.maximum(light, 0.0, out=light)
-            image[strip] = cv2.convertScaleAbs(light, alpha=255.0)  # rounds, and saturates at white
+                lit, unlit = lit * dots[strip, :, None], unlit * dots[strip, :, None]
+            cv2.add(lit, unlit, image[strip], dtype=cv2.CV_8U)  # rounds, and saturates at black and white
         return image
 
-    def _change(self, light: PhotometricLight, gradient: Float32) -> Float32:
-        """(H, W, 3) relative change of colour by the calibrated model, as its camera blurs it."""
+    def _shaded(self, surface: GelSurface) -> Float32:
+        """(H, W, 3) light of the lamps, by the slopes of the surface and of its texture; 255 is white."""
+        gradient = sample_surface(surface, self._grid).gradient
+        light = np.empty((*self._grid.shape, 3), dtype=np.float32)
+
+        for strip in strips(self._grid.rows):
+            light[strip] = WHITE * shade(gradient[strip] + self._texture[strip], self.model.lighting)
+        return light
+
+    def _calibrated(self, calibrated: PhotometricLight, surface: GelSurface) -> Float32:
+        """(H, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is white.
+
+        Evaluated at the points of the surface's table, of which there are fewer than pixels, and linear between them.
+        """
         import cv2
 
         assert self.model.photometric is not None
-        change = np.empty((*self._grid.shape, 3), dtype=np.float32)
-        self._beyond = 0
-        for strip in strips(self._grid.rows, 16):
-            change[strip], clipped = light.change(gradient[strip] + self._texture[strip], strip)
-            self._beyond += clipped
+        table = SurfaceTable(surface)
+        colours, beyond = calibrated.change(table.fields[..., 1:], *self._grid.in_image(*table.place))
+        self._beyond = beyond / (colours.size // 3)
+        change, _ = table.seen(colours, self._grid, fine=False)
         if self.model.photometric.blur > 0:
-            blur = self.model.photometric.blur
-            change = np.asarray(cv2.GaussianBlur(change, (0, 0), blur), dtype=np.float32)
+            cv2.GaussianBlur(change, (0, 0), self.model.photometric.blur, dst=change)
         return change
 
 

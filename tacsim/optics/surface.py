@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 
 from tacsim.interface import SurfaceMap
 from tacsim.optics.geometry import CanonicalGrid, Markers
-from tacsim.optics.grid import PixelGrid, canonical_cells, strips
+from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.spline import displacement_and_jacobian, line_matrices
 from tacsim.scene import GelSurface
@@ -34,7 +34,7 @@ Float32 = NDArray[np.float32]
 TABLE_PITCH = 0.125e-3  # the table is this fine or finer [m]: height then errs by 0.2 um rms, 2 um on steep flanks
 FIXED_POINT_STEPS = 20
 NEWTON_STEPS = 40
-CONVERGED = 1.0 / 32.0  # largest last step [table points]; OpenCV's remap resolves no less
+CONVERGED = 1.0 / 64.0  # largest last step [table points]: half of what OpenCV's remap resolves
 
 
 class SurfaceFolded(ValueError):
@@ -56,17 +56,69 @@ def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
     Raises ValueError for a surface that is no surface (shape, NaN, more sideways motion than the gel is wide),
     SurfaceFolded where it folds over.
     """
-    check_surface(surface)
-    fields, lateral = _table(surface)
-    seen_at = _table_coordinates(surface.origin, surface.spacing / _table_points(surface), grid)
-    seen = np.empty((*grid.shape, 3), dtype=np.float32)
-    valid = np.empty(grid.shape, dtype=np.bool_)
-    for strip in strips(grid.rows):
-        points = _material_points(surface, lateral, seen_at[strip])
-        seen[strip] = _look_up(fields, points)
-        valid[strip] = _on_gel(points, fields.shape[:2])
-    seen[~valid] = 0.0
+    table = SurfaceTable(surface)
+    seen, valid = table.seen(table.fields, grid)
     return SurfaceSample(seen[..., 0], seen[..., 1:], valid)
+
+
+class SurfaceTable:
+    """A gel surface at material points that halve the cells of its lattice; rows along y, columns along x."""
+
+    fields: Float32  # (rows, columns, 3) height [m], its derivatives by x and y in the image [-]
+    place: tuple[Float32, Float32]  # x and y (rows, columns) where each point is seen [m]
+
+    def __init__(self, surface: GelSurface) -> None:
+        """Raises what :func:`sample_surface` raises."""
+        check_surface(surface)
+        self._surface = surface
+        self.fields, self._lateral = _table(surface)
+        rows, columns = self.fields.shape[:2]
+        self._pitch = surface.spacing / _table_points(surface)  # [m]
+        pitch = np.float32(self._pitch)
+        x = np.float32(surface.origin[0]) + pitch * (np.arange(columns, dtype=np.float32) + self._lateral[..., 0])
+        y = np.float32(surface.origin[1]) + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
+        self.place = x, y
+
+    def seen(self, values: Float32, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
+        """`values` (rows, columns, n <= 4) of the table's points, linear between them, as seen at the points of `grid`:
+        (H, W, n), 0 outside the gel; and (H, W) False there. Not `fine` will do for colours. Raises SurfaceFolded.
+        """
+        # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
+        # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
+        # less than the look-up rounds, the second about as much.
+        block = max(1, int(self._pitch / (grid.pitch * (2 if fine else 1))))  # points for each coarse one, each way
+        points = self._material_points(grid if block == 1 else _coarse(grid, block))
+        inside = self._on_gel(points)
+        if block > 1:
+            points = _fine(points, block, grid.shape)
+            inside = np.ones(grid.shape, dtype=np.bool_) if inside.all() else self._on_gel(points)
+        seen = _look_up(values, points)
+        if not inside.all():
+            seen[~inside] = 0.0
+        return seen, inside
+
+    def _material_points(self, grid: PixelGrid) -> Float32:
+        """(rows, columns, 2) material points [table points] under the image points of `grid`: X <- x - u(X)."""
+        seen = _table_coordinates(self._surface.origin, self._pitch, grid)
+        points, change = seen, seen
+        for _ in range(FIXED_POINT_STEPS):
+            moved = seen - _look_up(self._lateral, points)
+            change = np.abs(moved - points)
+            points = moved
+            if float(change.max()) <= CONVERGED:
+                return points
+        restless = change.max(axis=2) > CONVERGED
+        exact = material_points(self._surface, self._surface.origin + self._pitch * seen[restless].astype(np.float64))
+        points[restless] = (exact - self._surface.origin) / self._pitch
+        return points
+
+    def _on_gel(self, points: Float32) -> NDArray[np.bool_]:
+        """(rows, columns) where material points [table points] lie on the table."""
+        import cv2
+
+        rows, columns = self.fields.shape[:2]
+        inside = cv2.inRange(points, (-CONVERGED, -CONVERGED), (columns - 1 + CONVERGED, rows - 1 + CONVERGED))
+        return np.asarray(inside, dtype=np.bool_)
 
 
 def surface_map(surface: GelSurface, grid: CanonicalGrid, markers: Markers | None) -> SurfaceMap:
@@ -173,20 +225,20 @@ def _table_coordinates(origin: tuple[float, float], pitch: float, grid: PixelGri
     return coordinates
 
 
-def _material_points(surface: GelSurface, lateral: Float32, seen: Float32) -> Float32:
-    """(rows, columns, 2) material points under the image points `seen` [both table points]: X <- x - u(X)."""
-    points, change = seen, seen
-    for _ in range(FIXED_POINT_STEPS):
-        moved = seen - _look_up(lateral, points)
-        change = np.abs(moved - points)
-        points = moved
-        if float(change.max()) <= CONVERGED:
-            return points
-    restless = change.max(axis=2) > CONVERGED
-    pitch = surface.spacing / _table_points(surface)
-    exact = material_points(surface, surface.origin + pitch * seen[restless].astype(np.float64))
-    points[restless] = (exact - surface.origin) / pitch
-    return points
+def _coarse(grid: PixelGrid, block: int) -> PixelGrid:
+    """The middles of blocks of `block` x `block` points, and one more block on each side."""
+    rows, columns = (-(-n // block) + 2 for n in grid.shape)
+    shift = grid.pitch * (-(block + 1) / 2)  # from the first point to the middle of the block before it
+    return PixelGrid(rows, columns, grid.pitch * block, grid.x0 + shift, grid.y0 + shift)
+
+
+def _fine(coarse: Float32, block: int, shape: tuple[int, int]) -> Float32:
+    """(rows, columns, 2) `coarse` values at the points of the grid of `shape` that :func:`_coarse` thinned out."""
+    import cv2
+
+    rows, columns = coarse.shape[:2]
+    fine = cv2.resize(coarse, (columns * block, rows * block), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(fine[block : block + shape[0], block : block + shape[1]], dtype=np.float32)
 
 
 def _look_up(field: Float32, points: Float32) -> Float32:
@@ -197,13 +249,6 @@ def _look_up(field: Float32, points: Float32) -> Float32:
     nothing = np.empty(0, dtype=np.float32)
     found = cv2.remap(field, points, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found, dtype=np.float32)
-
-
-def _on_gel(points: Float32, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(rows, columns) where material points [table points] lie on a table of `shape`."""
-    x, y = points[..., 0], points[..., 1]
-    low, high_x, high_y = -CONVERGED, shape[1] - 1 + CONVERGED, shape[0] - 1 + CONVERGED
-    return (x >= low) & (x <= high_x) & (y >= low) & (y <= high_y)
 
 
 def _folded(points: NDArray[np.float64]) -> SurfaceFolded:

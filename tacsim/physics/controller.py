@@ -22,7 +22,10 @@ from tacsim.scene import Settling
 
 MM = 1e3
 PEAK = 1.875  # peak slope of the quintic ramp over its mean
-CHECK = 20  # substeps between two looks at the residual
+RAMP = 2.0  # shortest motion, in times of the pressure wave through the gel
+PIECE = 20  # substeps of one launch on the way
+LOOK = 1.0  # time of the hold between two looks at the forces, in the same times
+LOOKS = 2  # earlier looks that a look is compared with: one alone may meet the same phase of what rings
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
@@ -35,7 +38,8 @@ def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
 class Path:
     """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
 
-    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal.
+    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. look: substeps of the hold
+    at its end between two looks at the forces.
     """
 
     start: Sequence[Pose]
@@ -43,6 +47,7 @@ class Path:
     substeps: int
     dt: float
     refine: int = 1
+    look: int = 20
 
     @property
     def step(self) -> float:
@@ -62,7 +67,9 @@ class Path:
             position = (a.position + s[:, None] * (b.position - a.position)) * MM
             turn_from = Rotation.from_quat(a.quaternion)
             vector = (Rotation.from_quat(b.quaternion) * turn_from.inv()).as_rotvec()
-            out[:, index, :3] = (Rotation.from_rotvec(s[1:, None] * vector) * turn_from).as_matrix()
+            # most motions turn nothing
+            turned = Rotation.from_rotvec(s[1:, None] * vector) * turn_from if vector.any() else turn_from
+            out[:, index, :3] = turned.as_matrix()
             out[:, index, 3] = position[1:]
             out[:, index, 4] = np.diff(position, axis=0) / step
             out[:, index, 5] = np.diff(s)[:, None] * vector / step
@@ -92,11 +99,12 @@ def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> flo
     return length
 
 
-def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float) -> Path:
-    """A path whose fastest point moves at peak Mach `mach`."""
+def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float) -> Path:
+    """A path whose fastest point moves at peak Mach `mach`; it lasts no less than RAMP gel thicknesses [mm], since a
+    shorter jolt mostly makes the gel ring."""
     length = longest_way(start, end, lever)
-    substeps = math.ceil(PEAK * length / (mach * dt)) if length > 0 else 0
-    return Path(start, end, substeps, dt)
+    lasting = max(PEAK * length / mach, RAMP * thickness) if length > 0 else 0.0
+    return Path(start, end, math.ceil(lasting / dt), dt, look=math.ceil(LOOK * thickness / dt))
 
 
 def force_floor(modulus: float, thickness: float) -> float:
@@ -143,6 +151,11 @@ class Launch:
     path: Path
     first: int
     last: int
+
+    @property
+    def held(self) -> bool:
+        """Nothing is driven any more."""
+        return self.path.substeps == 0
 
 
 @dataclass(frozen=True)
@@ -226,11 +239,11 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
     rest = replace(path, start=path.end, substeps=0)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
-        count = min(CHECK, settling.max_substeps - held)
+        count = min(path.look, settling.max_substeps - held)
         seen.append((yield Launch(rest, 0, count)))
         held += count
-        if len(seen) > 1:
-            worst = residual(seen[-1], seen[-2], balanced)
+        if len(seen) > LOOKS:
+            worst = max(residual(seen[-1], earlier, balanced) for earlier in seen[-1 - LOOKS : -1])
             if worst <= settling.tolerance:
                 break
     return _stats(seen, path.substeps, held, worst, settling)
@@ -245,8 +258,8 @@ def move_in_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
 
 def _driven(path: Path) -> Generator[Launch, Reading, list[Reading]]:
     seen: list[Reading] = []
-    for first in range(0, path.substeps, CHECK):
-        seen.append((yield Launch(path, first, min(first + CHECK, path.substeps))))
+    for first in range(0, path.substeps, PIECE):
+        seen.append((yield Launch(path, first, min(first + PIECE, path.substeps))))
     return seen
 
 

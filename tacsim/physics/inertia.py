@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from tacsim.interface import Pose
 from tacsim.physics.controller import PEAK, Path, longest_way
@@ -26,6 +26,11 @@ class Inertia:
     facts: Mapping[int, float]
     step: float  # nominal substep [mm]
     second: float = math.nan  # kernel time of one second [mm]; quasi-static motions have no real time
+    held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven any more
+
+    def entries(self, held: bool) -> dict[int, float]:
+        """The entries while the scene is held, or driven."""
+        return {**self.facts, **self.held} if held else dict(self.facts)
 
     @property
     def true(self) -> bool:

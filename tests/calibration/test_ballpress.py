@@ -6,8 +6,10 @@ import pytest
 from calibration.ballpress import BadPresses, Fit, calibrate_light, normal_angle
 from calibration.dent import ContactCircle, Skirt, dent_gradient
 from calibration.depth import Integrator
+from calibration.dots import DotEraser
 from calibration.inverse import PolynomialSlopes, to_normal
-from tacsim.optics.photometric import PhotometricLight, place_in_image
+from tacsim.optics.photometric import PhotometricLight, place_in_image, places_in_image
+from tests.calibration.dotted import draw, lattice_points
 from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
 
 
@@ -91,9 +93,8 @@ def test_skirt_and_depth_come_back_where_the_gel_is_as_assumed() -> None:
 def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]) -> None:
     fit, _ = calibrated
     unseen = sensor.press(0.45e-3, 140, 110)
-    change, _ = PhotometricLight(fit.forward, (ROWS, COLUMNS)).change(
-        unseen.gradient.astype(np.float32), slice(0, ROWS)
-    )
+    places = places_in_image(COLUMNS, ROWS)
+    change, _ = PhotometricLight(fit.forward).change(unseen.gradient.astype(np.float32), *places)
     drawn = fit.reference + change * fit.reference.mean(axis=(0, 1))
     v, u = np.mgrid[:ROWS, :COLUMNS]
     near = np.hypot(u - unseen.circle[0], v - unseen.circle[1]) < 1.5 * unseen.circle[2]
@@ -231,3 +232,35 @@ def test_frames_of_another_size_are_named(sensor: HiddenSensor) -> None:
     small = sensor.press(0.5e-3, 70, 60).image[:100]
     with pytest.raises(BadPresses, match=r"small \(260 x 100\)"):
         calibrate_light(sensor.empty(), [*named(sensor.presses(1)), ("small", small)], BALL_PX)
+
+
+def test_printed_dots_that_move_are_erased() -> None:
+    """Dots sink in and aside under a ball; taken for light, they would spoil circles and colours."""
+    sensor = HiddenSensor(5)
+    rest = lattice_points(8, 10, 24.0) + [(COLUMNS - 1) / 2, (ROWS - 1) / 2]
+
+    def dotted(made: Made | None) -> np.ndarray:
+        moved = rest
+        if made is not None:
+            away = rest - made.circle[:2]
+            distance = np.linalg.norm(away, axis=-1, keepdims=True)
+            moved = rest + 3.0 * away / distance * np.exp(-((distance / made.circle[2] - 1) ** 2))
+        image = sensor.empty() if made is None else made.image
+        return draw(moved, 4.0, (ROWS, COLUMNS), light=image.astype(float))
+
+    presses, reference = sensor.presses(6), dotted(None)
+    frames = [(f"press {i}", dotted(press)) for i, press in enumerate(presses)]
+    plain = calibrate_light(sensor.empty(), named(presses), BALL_PX)
+    erased = calibrate_light(reference, frames, BALL_PX, DotEraser(4.0))
+    assert erased.left_out == ()
+    for press, truth in zip(erased.presses, presses, strict=True):
+        assert (press.circle.x, press.circle.y) == pytest.approx(truth.circle[:2], abs=1.0)
+        assert press.circle.radius == pytest.approx(truth.circle[2], abs=1.5)
+
+    def left_out_error(fit: Fit) -> float:
+        return float(np.mean([score.error for score in fit.scores]))
+
+    assert left_out_error(erased) < 1.5 * left_out_error(plain)
+    np.testing.assert_array_equal(erased.reference, reference)
+    with pytest.raises(BadPresses, match="no frame can be used"):
+        calibrate_light(reference, frames, BALL_PX)

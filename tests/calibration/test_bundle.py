@@ -24,7 +24,7 @@ from calibration.normaliser import for_calibrated, for_camera
 from calibration.view import GelView, pinhole, view_of_corners
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame
-from tacsim.optics.geometry import CanonicalGrid, SensorGeometry
+from tacsim.optics.geometry import CameraNoise, CanonicalGrid, SensorGeometry
 from tacsim.optics.photometric import PhotometricModel
 from tacsim.optics.render import Renderer
 from tests.tacsim.optics.surfaces import dent, flat
@@ -36,7 +36,7 @@ PICTURE = RNG.integers(80, 120, (120, 160, 3), dtype=np.uint8)
 def calibration(serial: str = "gs-42") -> Calibration:
     weights = RNG.normal(0, 0.5, (3, 3))
     return Calibration(
-        format=2,
+        format=3,
         serial=serial,
         geometry=SensorGeometry(width=160, height=120, pixel_pitch=0.1e-3),
         gel_size=(16e-3, 12e-3),
@@ -75,10 +75,13 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 2", "format: 0", "has format 0, this version of tacsim reads 1 and 2"),
-        ("format: 2", "format: 3", "has format 3, this version of tacsim reads 1 and 2"),
-        ("format: 2", "format: 1", "was changed since it was written"),
-        ("format: 2", "form: 2", "names no format"),
+        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3"),
+        ("format: 3", "format: 4", "has format 4, this version of tacsim reads 1, 2, 3"),
+        ("format: 3", "format: 2", "was changed since it was written"),
+        ("format: 3", "form: 3", "names no format"),
+        ("noise: null", "noise: {deviation: [1, 1, 1]}", "was changed since it was written"),
+        ("noise: null", "noise: {deviation: [1, 1, -1]}", "is damaged"),
+        ("noise: null", "noise: {deviation: [1, 1, 1], colours: [0.9, 0.9, -0.9]}", "is damaged"),
         ("serial: gs-42", "serial: gs-43", "was changed since it was written"),
         ("degree: 1", "degree: 2", "is damaged"),
         ("skirt_fraction: 0.6", "skirt_fraction: six", "is damaged"),
@@ -134,7 +137,7 @@ def test_what_is_no_file_or_too_large_is_refused_unread(bundle: Path, tmp_path_f
     [
         lambda text: text[: len(text) // 2],
         lambda text: "",
-        lambda text: text.replace("format: 2", "format: 2\nformat: 1", 1),
+        lambda text: text.replace("format: 3", "format: 3\nformat: 1", 1),
         lambda text: text + "more: 1\n",
         lambda text: "format: 2\nx: !!python/object/apply:os.system [false]\n",
         lambda text: "format: 2\nx: " + "[" * 5000,
@@ -177,24 +180,29 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
     assert for_calibrated(read_bundle(bundle)[0], CanonicalGrid()).finds_height
 
 
-# What format 1 wrote, before there was a view; its checksum is of that content.
-def _format_1(folder: Path) -> Path:
-    path = write_bundle(folder, calibration().model_copy(update={"format": 1}), PICTURE)
+# What older formats wrote, before there was a view (1) or noise (2); their checksum is of that content.
+@pytest.mark.parametrize(("old", "without"), [(1, {"view", "noise"}), (2, {"noise"})])
+def test_a_bundle_of_an_older_format_still_loads(tmp_path: Path, old: int, without: set[str]) -> None:
+    path = write_bundle(tmp_path, calibration().model_copy(update={"format": old}), PICTURE)
     text = path.read_text(encoding="utf-8")
-    assert "view: null\n" in text
-    path.write_text(text.replace("view: null\n", ""), encoding="utf-8")
-    return path
-
-
-def test_a_bundle_of_format_1_still_loads(tmp_path: Path) -> None:
-    path = _format_1(tmp_path)
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for name in without:
+        assert f"{name}: null\n" in text
+        text = text.replace(f"{name}: null\n", "")
+    path.write_text(text, encoding="utf-8")
+    content = yaml.safe_load(text)
     checksum = content.pop("checksum")
-    canonical = Calibration.model_validate(content).model_dump(mode="json", exclude={"checksum", "view"})
+    canonical = Calibration.model_validate(content).model_dump(mode="json", exclude={"checksum"} | without)
     assert hashlib.sha256(json.dumps(canonical, sort_keys=True).encode()).hexdigest() == checksum
     read, _ = read_bundle(path)
-    assert read.format == 1 and read.view is None and read.image_shape == (120, 160)
+    assert read.format == old and read.view is None and read.noise is None and read.image_shape == (120, 160)
     assert for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid()).finds_height
+    assert sensor_model(path).noise is None
+
+
+def test_a_bundle_keeps_the_noise_and_gives_it_to_the_twin(tmp_path: Path) -> None:
+    noise = CameraNoise(deviation=(1.8, 1.5, 2.1), colours=(0.4, 0.4, 0.3), neighbours=(0.7, 0.75))
+    write_bundle(tmp_path, calibration().model_copy(update={"noise": noise}), PICTURE)
+    assert read_bundle(tmp_path)[0].noise == noise == sensor_model(tmp_path).noise
 
 
 def seen_askew() -> GelView:
@@ -236,4 +244,6 @@ def test_geometry_and_view_must_agree(tmp_path: Path) -> None:
         Calibration.model_validate(calibration().model_dump() | {"view": other.model_dump()})
     with pytest.raises(ValueError, match="format 1 has no view"):
         Calibration.model_validate(calibration().model_dump() | {"view": seen_askew().model_dump(), "format": 1})
+    with pytest.raises(ValueError, match="format 2 has no noise"):
+        Calibration.model_validate(calibration().model_dump() | {"noise": {"deviation": (1, 1, 1)}, "format": 2})
     assert pinhole((240, 320)).centre == (159.5, 119.5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.ballpress import normal_angle
-from calibration.drift import THIN, DriftFinder
+from calibration.drift import THIN, Drift, DriftFinder
 from calibration.inverse import to_normal
 from calibration.normaliser import FrameNormaliser, for_calibrated, for_camera, for_pictures, for_simulated
 from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, exchanged
@@ -186,3 +186,100 @@ def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
     finder.remove(planes, drift)
     assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
     assert not finder(planes, np.ones_like(hidden)).told
+
+
+def _smooth_drift(rows: int, columns: int) -> np.ndarray:
+    """(rows, columns, 3) grey levels by which a lamp that warms up changes the picture: smooth, and no quadratic."""
+    v, u = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : columns * 1j]
+    return np.stack([7 * np.cos(1.2 * u - 0.5), 5 * u - 3 * np.sin(v), -6 * np.exp(-((u - v) ** 2) / 3)], axis=-1)
+
+
+def test_the_drift_is_taken_off_the_canonical_image_and_the_contact_stays(
+    normalise: FrameNormaliser, sensor: HiddenSensor, bundle
+) -> None:
+    empty, press = sensor.empty(), sensor.press(0.5e-3, 130, 100).image
+    drift = _smooth_drift(ROWS, COLUMNS)
+    normalise.take_reference(frame(empty))
+    with_drift, without = (normalise(frame(press + d), 0.0).image.astype(int) for d in (drift, 0.0))
+    # the frame itself, 128 + 128 (I - I0) / mean(I0), pixel by pixel of its middle
+    assert normalise.reference is not None
+    raw, drifted = (
+        128 + 128 * _middle(normalise._rectify(image.astype(np.uint8)) - normalise.reference.image)
+        / normalise.reference.mean
+        for image in (press, np.rint(press + drift))
+    )  # fmt: skip
+    assert np.abs(drifted - raw).mean() > 4.0  # what the policy would see of it
+    for seen in (with_drift, without):
+        assert np.abs(seen - raw).mean() < 0.8
+        assert np.abs(seen - raw).max() < 4.0
+    contact = np.abs(raw - 128).max(axis=2) > 20
+    assert contact.sum() > 250
+    assert np.abs((with_drift - raw)[contact]).mean() < 1.0  # of a signal of more than 20
+
+
+def _middle(view: np.ndarray) -> np.ndarray:
+    top, left = (view.shape[0] - 128) // 2, (view.shape[1] - 128) // 2
+    return view[top : top + 128, left : left + 128]
+
+
+def test_the_drift_is_taken_off_where_no_slopes_are_known_too() -> None:
+    """A gel that does not fill the canonical image: what is not seen stays without change."""
+    corners = ((0.0, 0.0), (319.0, 0.0), (319.0, 239.0), (0.0, 239.0))
+    facts = CameraSensorFacts(
+        driver="camera", source="x", corners=corners, size=(20e-3, 15e-3), width=320, height=240
+    )  # fmt: skip
+    normalise = for_camera(facts, (1.0, 1.0), GRID)
+    render = Renderer(SensorModel(texture=0.0), (20e-3, 15e-3))
+    normalise.take_reference(frame(render(flat())))
+    plain = normalise(frame(render(dent())), 0.0)
+    drifted = normalise(frame(render(dent()) + _smooth_drift(240, 320)), 0.0)
+    assert (drifted.image[:3] == 128).all() and (drifted.image[-3:] == 128).all()
+    difference = np.abs(drifted.image.astype(int) - plain.image.astype(int))
+    assert difference.mean() < 0.8 and difference.max() < 5
+    assert (drifted.contact == plain.contact).mean() > 0.99
+
+
+def test_a_simulated_image_is_what_it_was_to_the_last_bit(sensor: HiddenSensor, bundle) -> None:
+    """Neither a simulation that knows its surface, nor its pictures alone, nor its frames behind a real normaliser."""
+    model = SensorModel()
+    render = Renderer(model, (20e-3, 20e-3))
+    changed = 0.95 * render(dent()).astype(float)  # a drift that would be told
+    for make in (for_simulated, for_pictures):
+        for surface in (surface_map(dent(), GRID, None), None):
+            normalise = make(model, (20e-3, 20e-3), GRID)
+            normalise.take_reference(frame(render(flat())))
+            seen = normalise(frame(changed, surface), 0.0)
+            np.testing.assert_array_equal(seen.image, _untreated(normalise, frame(changed)))
+    real = for_calibrated(bundle[0], GRID, bundle[1])
+    real.take_reference(frame(bundle[1]))
+    bright = frame(sensor.press(0.5e-3, 130, 100).image + 10.0, surface_map(dent(), GRID, None))
+    np.testing.assert_array_equal(real(bright, 0.0).image, _untreated(real, bright))
+    alone = TactileFrame(bright.image, time=0.0, index=0)
+    assert (real(alone, 0.0).image != _untreated(real, alone)).any()
+
+
+def _untreated(normalise: FrameNormaliser, seen: TactileFrame) -> np.ndarray:
+    assert normalise.reference is not None
+    change = _middle(normalise.reference.difference(normalise._rectify(seen.image)))
+    return np.clip(np.rint(128 + np.float32(128) * change), 0, 255).astype(np.uint8)
+
+
+def test_where_too_little_is_untouched_the_image_keeps_its_drift(normalise: FrameNormaliser, bundle) -> None:
+    checks = 40.0 * (-1) ** np.add.outer(np.arange(ROWS) // 20, np.arange(COLUMNS) // 20)[..., None]
+    normalise.take_reference(frame(bundle[1]))
+    pressed = frame(bundle[1] + checks + 10.0)
+    np.testing.assert_array_equal(normalise(pressed, 0.0).image, _untreated(normalise, pressed))
+
+
+def test_a_part_of_a_view_has_the_drift_of_the_whole() -> None:
+    planes = np.zeros((3, 120, 160), dtype=np.float32)
+    weights = np.random.default_rng(0).normal(0, 0.1, (6, 3)).astype(np.float32)
+    finder, drift = DriftFinder((120, 160)), Drift(weights, told=True)
+    finder.remove(planes, drift)
+    np.testing.assert_allclose(finder.part(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
+    np.testing.assert_allclose(
+        finder.part(drift, (11, 23), (60, 70)), -np.moveaxis(planes, 0, -1)[11:71, 23:93], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        finder.part(drift, (-4, -6), (120, 160))[4:, 6:], -np.moveaxis(planes, 0, -1)[:116, :154], atol=1e-6
+    )

@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from calibration.ballpress import BadPresses
-from calibration.frames import read_presses
+from calibration.frames import read_presses, rectified
+from calibration.view import view_of_corners
 from tests.calibration.presses import BALL, PITCH, HiddenSensor
 
 
@@ -29,6 +30,34 @@ def test_the_frame_without_contact_is_told_by_its_name(folder: Path) -> None:
     frames = read_presses(folder)
     assert [name for name, _ in frames.presses] == [f"press_{i}.png" for i in range(5)]
     assert not frames.estimated
+
+
+def test_more_frames_without_contact_have_its_name_and_a_number(folder: Path) -> None:
+    for number in (10, 2):
+        save(folder / f"background_{number}.png", np.full_like(read_presses(folder).reference, number))
+    frames = read_presses(folder)
+    assert [name for name, _ in frames.presses] == [f"press_{i}.png" for i in range(5)]
+    assert sorted(int(image.max()) for image in frames.untouched[1:]) == [2, 10]
+    np.testing.assert_array_equal(frames.untouched[0], frames.reference)
+    # presses are presses, though the reference that is named has their name
+    (folder / "Background.png").rename(folder / "press.png")
+    named = read_presses(folder, folder / "press.png")
+    assert len(named.presses) == 5 and len(named.untouched) == 3
+    np.testing.assert_array_equal(named.reference, frames.reference)
+
+
+def test_all_frames_are_rectified_and_must_fit_the_view(folder: Path) -> None:
+    view = view_of_corners(((20.0, 10.0), (240.0, 15.0), (235.0, 190.0), (15.0, 185.0)), (16e-3, 12e-3), (200, 260))
+    save(folder / "background_2.png", HiddenSensor(5).empty())
+    frames = read_presses(folder)
+    seen = rectified(frames, view)
+    shape = (view.geometry.height, view.geometry.width, 3)
+    assert {image.shape for image in (*seen.untouched, *(image for _, image in seen.presses))} == {shape}
+    np.testing.assert_array_equal(seen.untouched[0], seen.reference)
+    assert (seen.untouched[1] != seen.reference).any()
+    save(folder / "background_2.png", HiddenSensor(5).empty()[:100])
+    with pytest.raises(BadPresses, match="260 x 200"):
+        rectified(read_presses(folder), view)
 
 
 def test_or_is_named_or_is_the_median(folder: Path) -> None:
@@ -71,6 +100,7 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert calibration.geometry.pixel_pitch == pytest.approx(PITCH)
     assert (out / "residuals.png").stat().st_size > 10_000
     assert "press_3.png" in ran.output
+    assert calibration.noise is None and "noise not measured" in ran.output and "there is 1" in ran.output
     again = CliRunner().invoke(app, ["calibrate", "sensor", str(folder), *lengths, "--out", str(out)])
     assert again.exit_code == 2
     assert "overwritten" in again.output
@@ -80,6 +110,54 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert nothing.exit_code == 2
     assert "folder" in nothing.output
     assert "Traceback" not in nothing.output
+
+
+def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from calibration.bundle import read_bundle, sensor_model
+    from robot.cli import app
+    from tacsim.interface import SensorSpec
+    from tacsim.optics.noise import noise_source
+    from tacsim.optics.render import Renderer
+    from tacsim.sensor import SimSensor
+    from tests.tacsim.optics.surfaces import flat
+
+    again = HiddenSensor(2)  # the same untouched gel, whose light drifts
+    for number in (1, 2, 3):
+        image = again.photograph(np.zeros((200, 260, 2)), drift=2.0 * number)
+        save(folder / f"background_{number}.png", image)
+    words = ["calibrate", "sensor", str(folder), "--ball-radius", f"{BALL} m", "--pixel-pitch", f"{PITCH} m"]
+    ran = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")], env={"COLUMNS": "200"})
+    assert ran.exit_code == 0, ran.output
+    assert "camera's noise, from 4 pictures without contact: R, G, B 1.5" in ran.output
+    noise = read_bundle(tmp_path / "out")[0].noise
+    assert noise is not None and noise.deviation == pytest.approx((1.53, 1.53, 1.53), rel=0.03)
+    assert noise.neighbours == pytest.approx((0, 0), abs=0.03) and noise.colours == pytest.approx((0, 0, 0), abs=0.03)
+
+    # the twin delivers it: another in each frame and episode, the same in the same ones
+    class Still:
+        version = 0
+
+        def now(self) -> float:
+            return 0.0
+
+        def surface(self, frame: str) -> object:
+            return flat()
+
+    model, world = sensor_model(tmp_path / "out"), Still()
+    spec = SensorSpec((model.geometry.height, model.geometry.width), height=False, flow=False, arm=None)
+    render = Renderer(model, (40e-3, 40e-3))
+    sensor = SimSensor(world, world, "s", spec, render, lambda at: None, noise_source(model, "s"))  # type: ignore[arg-type, return-value]
+    seen = []
+    for episode in (5, 5, 6):
+        sensor.restart(episode)
+        for _ in range(3):
+            world.version += 1
+            seen.append(sensor.read(0.0).image)
+    np.testing.assert_array_equal(seen[:3], seen[3:6])
+    assert len({image.tobytes() for image in seen}) == 6
+    assert (seen[0].astype(float) - render(flat())).std() == pytest.approx(1.53, rel=0.05)
 
 
 def dotted(sensor: HiddenSensor, image: np.ndarray) -> np.ndarray:

@@ -128,3 +128,15 @@ def test_a_drag_that_snaps_back_is_followed_by_what_the_neighbours_do() -> None:
         found = tracker(REST + drag((far, 0.0), centre=(0.0, 0.0)))
         assert found.kept == 1.0
         np.testing.assert_allclose(found.displacement, drag((far, 0.0), centre=(0.0, 0.0)), atol=1e-9)
+
+
+def test_a_speck_where_a_dot_was_expected_is_not_taken_for_it() -> None:
+    """Dust on the lens stays where the dot was; the dot itself has gone on with its neighbours."""
+    moved = drag((0.5, 0.1))
+    gone = np.flatnonzero(np.linalg.norm(moved, axis=1) > 0.25 * PITCH)
+    assert len(gone) > 5
+    for dot in gone[::3]:
+        rng = np.random.default_rng(int(dot))
+        points, there = seen_points(moved, rng)
+        bad, found = wrong(DotTracker(REST, PITCH), rng.permutation([*points, REST[dot]]), there, moved)
+        assert (bad, found) == (0, len(REST))

@@ -23,7 +23,7 @@ def test_ramp_starts_and_ends_at_rest() -> None:
 def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
     start = Pose()
     end = Pose(np.array([0.3e-3, -0.2e-3, 1e-3]), Rotation.from_rotvec([0, 0, 0.2]).as_quat())
-    path = plan([start], [end], mach=0.05, dt=0.4, lever=10.0)
+    path = plan([start], [end], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     drive = path.drive(0, path.substeps).astype(float)
     rim = np.linalg.norm(drive[:, 0, 4], axis=1) + 10.0 * np.linalg.norm(drive[:, 0, 5], axis=1)
     assert rim.max() <= 0.05 * 1.001
@@ -33,14 +33,14 @@ def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
 
 
 def test_refining_cuts_the_same_path_finer() -> None:
-    path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0)
+    path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     coarse, fine = path.drive(5, 9), replace(path, refine=4).drive(5, 9)
     assert len(fine) == 16
     assert fine[3::4, 0, 3] == pytest.approx(coarse[:, 0, 3], abs=1e-6)
 
 
 def test_no_motion_needs_no_substeps() -> None:
-    assert plan([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0).substeps == 0
+    assert plan([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0, thickness=4.0).substeps == 0
 
 
 def test_contact_forces_balance_the_weight_of_the_body() -> None:
@@ -53,3 +53,11 @@ def test_contact_forces_balance_the_weight_of_the_body() -> None:
     falling = replace(hung, contact=np.zeros((2, 3)), backing=np.zeros((2, 3)))
     assert residual(falling, falling, balanced=True) == pytest.approx(0.4 / 0.1)
     assert residual(falling, falling, balanced=False) == 0.0
+
+
+def test_the_shortest_motion_lets_the_gel_follow() -> None:
+    """It takes twice as long as the gel's wave needs through it, however short its way."""
+    short = plan([Pose()], [Pose(np.array([0, 0, 1e-6]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    assert short.substeps == 20
+    far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    assert far.substeps == 94

@@ -84,7 +84,8 @@ def test_moving_the_sensor_is_moving_the_indenter() -> None:
 
 def test_a_slid_plate_reaches_coulomb_friction_and_stuck_contact_keeps_its_shear() -> None:
     """A plate wider than the gel: no edge ploughs, so the ratio of forces is the coefficient."""
-    w = world(Box(size=(30e-3, 30e-3, 4e-3)), friction=0.3)
+    # settled well, since the tolerance is a share of the normal force, of which shear is a tenth
+    w = world(Box(size=(30e-3, 30e-3, 4e-3)), friction=0.3, tolerance=2e-4)
     move(w, (0, 0, -0.3e-3))
     move(w, (0.05e-3, 0, 0))
     stuck = w.wrench("lower")

@@ -12,33 +12,42 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from calibration.ballpress import BadPresses
 from calibration.bundle import FILE, read_bundle
+from calibration.noise import measure_noise
+from calibration.view import view_of_corners
 from robot.cli import app
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
-from robot.pressing import REFERENCE, CannotPress, PressPlan, PressRecord, camera_facts, record_presses
+from robot.pressing import NOISE_FRAMES, REFERENCE, CannotPress, PressPlan, PressRecord, camera_facts, record_presses
 from tacsim.config import load_rig
 from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import read_image
+from tests.calibration.dotted import draw, lattice_points
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 SENSOR = HiddenSensor(3)
 EMPTY = SENSOR.empty()
-PRESSES = [press.image for press in SENSOR.presses(8)]
+UNTOUCHED = [REFERENCE, *(f"background_{k}.png" for k in range(1, NOISE_FRAMES))]
+MADE = SENSOR.presses(8)
+PRESSES = [press.image for press in MADE]
 
 
 class Person:
     """A camera whose clock is a tenth of a second a frame, and somebody who shows it `moves`, one a press asked for."""
 
-    def __init__(self, moves: list[np.ndarray | Callable[[int], np.ndarray]], *, lifts: bool = True) -> None:
+    def __init__(
+        self, moves: list[np.ndarray | Callable[[int], np.ndarray]], *, lifts: bool = True, empty: np.ndarray = EMPTY
+    ) -> None:
         self.said: list[str] = []
-        self._moves, self._lifts = iter(moves), lifts
-        self._shown: np.ndarray | Callable[[int], np.ndarray] = EMPTY
+        self._moves, self._lifts, self._empty = iter(moves), lifts, empty
+        self._shown: np.ndarray | Callable[[int], np.ndarray] = empty
         self._index = 0
         self._rng = np.random.default_rng(0)
 
@@ -56,7 +65,7 @@ class Person:
                 raise EndOfEpisode("nobody is there any more")
             self._shown = move
         elif words.startswith("Lift") and self._lifts:
-            self._shown = EMPTY
+            self._shown = self._empty
         elif words.startswith("Still moving"):
             self._shown = PRESSES[0]
 
@@ -78,7 +87,8 @@ class Person:
 def test_a_person_is_led_from_press_to_press() -> None:
     person = Person(PRESSES[:5])
     record, kept = person.led()
-    assert list(kept) == [REFERENCE, *(f"press_0{k}.png" for k in range(1, 6))]
+    assert list(kept) == [*UNTOUCHED, *(f"press_0{k}.png" for k in range(1, 6))]
+    assert measure_noise(record.untouched).deviation == pytest.approx([1.53] * 3, rel=0.03)
     assert person.refused() == record.refused == []
     for (name, image), shown in zip(record.presses, PRESSES, strict=False):
         assert kept[name] is image
@@ -119,11 +129,24 @@ def glaring() -> np.ndarray:
 def test_a_press_that_tells_nothing_is_refused_and_asked_for_again(move: np.ndarray, why: str) -> None:
     person = Person([PRESSES[0], move, PRESSES[1]])
     record, kept = person.led(2)
-    assert len(record.presses) == 2 and len(kept) == 3
+    assert len(record.presses) == 2 and len(kept) == len(UNTOUCHED) + 2
     assert np.abs(record.presses[1][1].astype(int) - PRESSES[1]).mean() < 2.5
     (said,) = person.refused()
     assert re.search(why, said)
     assert [words[:12] for words in person.said].count("Press 2 of 2") == 2
+
+
+def test_presses_on_a_gel_with_dots_are_judged_without_them() -> None:
+    dots = lattice_points(8, 10, 24.0) + [(COLUMNS - 1) / 2, (ROWS - 1) / 2]
+
+    def dotted(image: np.ndarray, by: float) -> np.ndarray:
+        return draw(dots + by, 4.0, (ROWS, COLUMNS), image.astype(float))
+
+    marked = Person([dotted(PRESSES[0], 2.0)], empty=dotted(EMPTY, 0.0))
+    record, _ = marked.led(1, markers=True)
+    assert record.refused == [] and len(record.presses) == 1
+    with pytest.raises(BadPresses, match="leave --markers out"):
+        Person([PRESSES[0]]).led(1, markers=True)
 
 
 def test_a_press_counts_only_once_it_rests() -> None:
@@ -146,7 +169,7 @@ def test_a_slow_creep_is_motion_too() -> None:
 
 def test_what_was_taken_stays_when_it_ends_early() -> None:
     record, kept = Person(PRESSES[:2]).led(5)
-    assert len(record.presses) == 2 and len(kept) == 3
+    assert len(record.presses) == 2 and len(kept) == len(UNTOUCHED) + 2
 
 
 def test_a_person_who_does_nothing_is_not_waited_for_for_ever() -> None:
@@ -186,18 +209,25 @@ START = (sys.executable, "-c", "from robot.cli import main; main()")
 
 
 @contextmanager
-def bench(folder: Path, number: int) -> Iterator[tuple[MockCamera, Path]]:
+def bench(folder: Path, number: int, empty: np.ndarray = EMPTY) -> Iterator[tuple[MockCamera, Path]]:
     """A camera that shows an untouched gel, and a rig file with it."""
-    size = {"width": COLUMNS, "height": ROWS}
+    size = {"width": empty.shape[1], "height": empty.shape[0]}
     with MockCamera(mock_host(number), fps=30.0, quality=100, stamped=False, **size) as camera:
-        camera.push(EMPTY)
+        camera.push(empty)
         path = folder / "bench.yaml"
         path.write_text(RIG.format(source=camera.url, **size))
         yield camera, path
 
 
-def lead(camera: MockCamera, words: list[str], answer: str | None, stop_after: int = 99) -> tuple[int, list[str]]:
-    """Runs the command and plays the person by what it says. answer: typed at its terminal; None: it has none."""
+def lead(
+    camera: MockCamera,
+    words: list[str],
+    answer: str | None,
+    stop_after: int = 99,
+    seen: Callable[[np.ndarray], np.ndarray] = lambda image: image,
+) -> tuple[int, list[str]]:
+    """Runs the command and plays the person by what it says. answer: typed at its terminal; None: it has none; seen:
+    how the camera shows the gel."""
     moves, lines, taken = iter(PRESSES), [], 0
     theirs, ours = (pty.openpty()[::-1]) if answer is not None else (subprocess.DEVNULL, -1)
     with subprocess.Popen(
@@ -210,13 +240,13 @@ def lead(camera: MockCamera, words: list[str], answer: str | None, stop_after: i
         for line in process.stderr:
             lines.append(line.strip())
             if re.search(r"Press \d+ of", line):
-                camera.push(next(moves))
+                camera.push(seen(next(moves)))
             elif line.startswith("Taken"):
                 taken += 1
                 if taken == stop_after:
                     process.send_signal(signal.SIGINT)
             elif line.startswith("Lift"):
-                camera.push(EMPTY)
+                camera.push(seen(EMPTY))
     if answer is not None:
         os.close(theirs)
         os.close(ours)
@@ -244,6 +274,52 @@ def test_the_command_makes_a_bundle_and_keeps_its_frames(answer: str | None, tmp
     assert done.exit_code == 0, done.output
     again, _ = read_bundle(tmp_path / "again")
     assert again.forward == live.forward and again.inverse == live.inverse
+    # this camera shows one picture all the time
+    assert live.noise is None and "camera's noise not measured: the pictures" in done.output
+
+
+@pytest.mark.timeout(300)
+def test_a_camera_that_looks_askew_is_led_through_its_view(tmp_path: Path) -> None:
+    """What the person is told, and the bundle, are of the metric picture; what is kept is the camera's."""
+    corners = ((30.0, 22.0), (295.0, 15.0), (285.0, 220.0), (25.0, 225.0))
+    edges = np.array([(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)], dtype=np.float32) - 0.5
+    askew = cv2.getPerspectiveTransform(edges, np.array(corners, dtype=np.float32))
+
+    def seen(image: np.ndarray) -> np.ndarray:
+        return np.asarray(cv2.warpPerspective(image, askew, (320, 240), borderMode=cv2.BORDER_REPLICATE))
+
+    view = view_of_corners(corners, (COLUMNS * PITCH, ROWS * PITCH), (240, 320))
+    (tmp_path / "view.yaml").write_text(yaml.safe_dump(view.model_dump(mode="json")))
+    out, count = tmp_path / "out", 5
+    options = ["--ball-radius", f"{BALL} m", "--view", str(tmp_path / "view.yaml")]
+    with bench(tmp_path, 68, seen(EMPTY)) as (camera, rig):
+        words = ["calibrate", "sensor", "--camera", f"{rig}/finger", *options, "--presses", str(count)]
+        code, lines = lead(camera, [*words, "--out", str(out)], None, seen=seen)
+    assert code == 0, lines
+    calibration, reference = read_bundle(out)
+    assert calibration.view == view and calibration.geometry == view.geometry
+    assert reference.shape == (view.geometry.height, view.geometry.width, 3)
+    assert read_image(out / "frames" / REFERENCE).shape == (240, 320, 3)
+    truth = [press.circle for press in MADE[:count]]
+    scale = PITCH / view.pixel_pitch  # pixels of the rectified picture are not those of the made-up gel
+    told = [re.match(r"Taken: contact at (\d+), (\d+) px, radius (\d+) px", line) for line in lines]
+    circles = [[float(number) for number in match.groups()] for match in told if match]
+    assert len(circles) == len(calibration.residuals) == count
+    for (x, y, radius), (true_x, true_y, true_radius), residual in zip(
+        circles, truth, calibration.residuals, strict=True
+    ):
+        assert (x, y) == pytest.approx(((true_x + 0.5) * scale - 0.5, (true_y + 0.5) * scale - 0.5), abs=2.0)
+        assert radius == pytest.approx(true_radius * scale, abs=2.5)
+        assert residual.circle[2] * view.pixel_pitch == pytest.approx(true_radius * PITCH, rel=0.08)
+    assert np.median([residual.angle for residual in calibration.residuals]) < 4.0
+    again = ["calibrate", "sensor", str(out / "frames"), *options, "--out", str(tmp_path / "again")]
+    done = CliRunner().invoke(app, again, env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    assert read_bundle(tmp_path / "again")[0].forward == calibration.forward
+    small = view_of_corners(((0.0, 0.0), (159.0, 0.0), (159.0, 119.0), (0.0, 119.0)), view.size, (120, 160))
+    (tmp_path / "view.yaml").write_text(yaml.safe_dump(small.model_dump(mode="json")))
+    refused = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "no")], env={"COLUMNS": "200"})
+    assert refused.exit_code == 2 and "the view was calibrated on 160 x 120 px" in " ".join(refused.stderr.split())
 
 
 @pytest.mark.timeout(300)
@@ -254,7 +330,7 @@ def test_ctrl_c_keeps_what_was_taken(tmp_path: Path) -> None:
         words += ["--pixel-pitch", f"{PITCH} m", "--out", str(out)]
         code, lines = lead(camera, words, None, stop_after=2)
     assert code == 130, lines
-    assert sorted(path.name for path in (out / "frames").iterdir()) == [REFERENCE, "press_01.png", "press_02.png"]
+    assert sorted(path.name for path in (out / "frames").iterdir()) == [*UNTOUCHED, "press_01.png", "press_02.png"]
     assert not (out / FILE).exists()
     assert any("2 presses are kept, nothing is calibrated" in line for line in lines)
     assert any(f"tacsim calibrate sensor {out / 'frames'}" in line for line in lines)

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import signal
+from collections.abc import Callable
+from contextlib import nullcontext
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +18,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from calibration.records import touch_file, write_record
+from calibration.records import read_touches, touch_file, write_record
 from robot.cli import app
+from robot.errors import DeviceError
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
-from robot.touching import CannotTouch, TouchPlan, alone, schedule
+from robot.touching import CannotTouch, TouchPlan, TouchRecord, alone, schedule
 from tacsim import pose as se3
-from tacsim.config import load_rig
+from tacsim.config import ConfigError, load_rig
 from tacsim.hardware import Placement
 from tacsim.interface import Pose
 from tacsim.optics.geometry import SensorModel
@@ -89,6 +96,68 @@ def test_a_file_of_touches_gives_the_lines_for_the_rig_file(tmp_path: Path) -> N
     assert again.exit_code == 2  # nothing is overwritten
 
 
+def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    """Cut anywhere, it is refused with the line: never fewer touches, never half a number."""
+    touches, _, _ = made_touches(np.random.default_rng(0), 8)
+    path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
+    whole, text = read_touches(path), path.read_text()
+    for back, wrote in zip(whole.measurements(), touches, strict=True):
+        assert max(se3.distance(back.tool, wrote.tool)) < 1e-12
+        assert (back.contact, back.depth) == (wrote.contact, wrote.depth)
+    assert len(text.splitlines()) == 3 + 8 and [each.name for each in tmp_path.iterdir()] == ["touches.yaml"]
+    for end in (
+        *range(0, len(text) - 1, 37),
+        *(at for at, sign in enumerate(text[:-1]) if sign == "\n"),
+        len(text) - 2,
+    ):
+        path.write_text(text[:end])
+        with pytest.raises(ConfigError, match=rf"{path}:\d+: "):
+            read_touches(path)
+    path.write_text(text.replace("count: 8\n", ""))  # by hand, nobody counts
+    assert read_touches(path).touches == whole.touches
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            lambda text: text[: text.rindex("- {")],
+            "touches.yaml:3: touches: holds 7 entries, `count` says 8: .* cut off",
+        ),
+        (lambda text: text[:-40], r"touches.yaml:\d+: not valid YAML"),
+        (
+            lambda text: text.replace("depth: 0.", "depth: -0.", 3),
+            r"touches.yaml:6: touches.2.depth: .* is out of range",
+        ),
+        (
+            lambda text: text.replace("contact: [", "contact: [.nan, ", 1),
+            "touches.yaml:4: touches.0.contact.0: .nan is",
+        ),
+        (lambda text: "x,y,z\n1,2,3\n", "touches.yaml:1: .* does not fit; allowed: a mapping with keys among"),
+        (
+            lambda text: text.replace("touches:", "poses:"),
+            "touches.yaml:3: poses: unknown key; .* did you mean|allowed",
+        ),
+        (lambda text: "", "touches.yaml:1: the file is empty"),
+        (lambda text: "\0\1PNG", r"touches.yaml:\d+: "),
+    ],
+    ids=["cut between touches", "cut in a touch", "numbers", "not finite", "CSV", "another record", "empty", "binary"],
+)
+def test_a_damaged_or_foreign_file_is_refused_with_the_line(
+    damage: Callable[[str], str], said: str, tmp_path: Path
+) -> None:
+    touches, _, _ = made_touches(np.random.default_rng(0), 8)
+    path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
+    path.write_text(damage(path.read_text()))
+    done = CliRunner().invoke(app, ["calibrate", "touch", str(path), "--out", str(tmp_path / "out")], env=NARROW)
+    assert done.exit_code == 2 and re.search(said, told(done.stderr)), done.output
+    assert not (tmp_path / "out").exists()
+
+
+def told(text: str) -> str:
+    return " ".join(text.replace("│", " ").split())
+
+
 def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
     touches, _, _ = made_touches(np.random.default_rng(0), 5)
     few = write_record(tmp_path / "few.yaml", touch_file(touches, BALL_RADIUS))
@@ -132,6 +201,7 @@ def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
 def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
+    """And again without the arm, from what was kept."""
     host = mock_host(41)
     nominal = Pose(np.array([0.0, 0.0, 60e-3]))
     true = posed(Rotation.from_rotvec(np.radians([2.0, -3.0, 4.0])), [0.8e-3, -1.1e-3, 60.9e-3])
@@ -153,6 +223,41 @@ def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
     np.testing.assert_allclose(off.position[:2], 0.0, atol=0.1e-3)
     assert abs(off.position[2]) < 0.15e-3  # the depth's own bias goes wholly along z
     assert np.degrees(se3.distance(Pose(), off)[1]) < 0.8 < 5.0 < np.degrees(se3.distance(true, nominal)[1])
-    kept = yaml.safe_load((tmp_path / "out" / "touches.yaml").read_text())
-    assert len(kept["touches"]) == len(report["used"]) >= 6
+    kept = tmp_path / "out" / "touches.yaml"
+    assert len(read_touches(kept).touches) == len(report["used"]) >= 6
+    assert f"without the arm: tacsim calibrate touch {kept}" in told(done.stderr)
+    words = ["calibrate", "touch", str(kept), "--out", str(tmp_path / "again")]
+    again = CliRunner().invoke(app, words, env=NARROW)
+    assert again.exit_code == 0, again.output
+    redone = json.loads((tmp_path / "again" / "touch.json").read_text())["tool_from_sensor"]
+    np.testing.assert_allclose(redone["position"], found["position"], atol=1e-9)
+    np.testing.assert_allclose(redone["rotation"], found["rotation"], atol=1e-9)
     assert post.deepest < 1.2e-3  # no touch went far beyond the 0.4 mm asked for
+
+
+@pytest.mark.parametrize("ends", ["stopped", "fails"])
+def test_what_was_touched_is_kept_whatever_ends_it(ends: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arm and its touches are made up; keeping and the end are the command's own."""
+    touches, _, _ = made_touches(np.random.default_rng(0), 5)
+
+    def some(*given: Any) -> TouchRecord:
+        stop, _, keep = given[5:]
+        for count in range(1, 6):
+            assert not stop()
+            keep(touches[:count])
+            assert len(read_touches(tmp_path / "out" / "touches.yaml").touches) == count  # each at once
+        if ends == "fails":
+            raise DeviceError("most touches failed")
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop()
+        return TouchRecord(touches, [])
+
+    monkeypatch.setattr("robot.touching.record_touches", some)
+    monkeypatch.setattr("robot.open.open_rig", lambda *_, **__: nullcontext())
+    words = ["calibrate", "touch", "--rig", "mock", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"]
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")], env=NARROW)
+    assert done.exit_code == (130 if ends == "stopped" else 1), done.output
+    said = told(done.stderr)
+    assert f"recorded: {tmp_path / 'out' / 'touches.yaml'}; to calibrate from it again" in said
+    assert ("5 touches are kept, nothing is calibrated" if ends == "stopped" else "most touches failed") in said
+    assert len(read_touches(tmp_path / "out" / "touches.yaml").touches) == 5

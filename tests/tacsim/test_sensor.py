@@ -247,3 +247,21 @@ def test_a_simulated_arm_that_feels_too_much_follows_nothing(spring_world: Any) 
     assert len(spring_world.moves) == moved
     with pytest.raises(LimitExceeded):
         lower.command(None)
+
+
+def test_noise_is_another_in_each_sensor_frame_and_episode_and_the_same_again(open_springs: Any) -> None:
+    plain = open_springs()
+    noise = "{deviation: [2, 2, 2]}"
+    rig = open_springs("squeeze", *(f"sensors.{name}.model.noise={noise}" for name in ("lower", "upper")))
+    plain.reset()
+    still = {name: frame.image.astype(float) for name, frame in plain.references.items()}
+    seen: dict[int, list[dict[str, np.ndarray]]] = {}
+    for episode in (3, 3, 4):
+        rig.reset(seed=episode)
+        seen.setdefault(episode, []).append({name: frame.image for name, frame in rig.references.items()})
+    for name in ("lower", "upper"):
+        np.testing.assert_array_equal(seen[3][0][name], seen[3][1][name])
+        assert (seen[3][0][name] != seen[4][0][name]).any()
+        assert (seen[3][0][name] - still[name]).std() == pytest.approx(2.0, rel=0.1)
+    lower, upper = ((seen[3][0][name] - still[name]).ravel() for name in ("lower", "upper"))
+    assert abs(np.corrcoef(lower, upper)[0, 1]) < 0.2

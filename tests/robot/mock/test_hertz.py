@@ -10,7 +10,7 @@ from robot.mock.twin import Twin, TwinError
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import Pose
-from tacsim.optics.geometry import CanonicalGrid, SensorModel
+from tacsim.optics.geometry import CameraNoise, CanonicalGrid, SensorModel
 from tacsim.optics.surface import surface_map
 
 START: dict[str, Pose] = {}  # of the sensors
@@ -87,3 +87,17 @@ def test_its_process_says_what_is_wrong() -> None:
         assert scenery.wrenches["upper"][2] < 0.0
         assert scenery.surfaces["upper"].height.max() == pytest.approx(0.3e-3, rel=0.05)
         assert scenery.truth is None
+
+
+def test_a_camera_with_noise_shows_another_picture_each_time_and_the_same_surface(bench: HertzBench) -> None:
+    scene = load_rig("mock").facts.scene
+    assert scene is not None
+    noisy = SensorModel(noise=CameraNoise(deviation=(2, 2, 2)))
+    made = HertzBench(scene, {"lower": SensorModel(), "upper": noisy}, CanonicalGrid())
+    bench.place(made.poses())
+    plain = bench.look("upper")[0].astype(float)
+    first, second = made.look("upper"), made.look("upper")
+    assert (first[0] - plain).std() == pytest.approx(2.0, rel=0.05)
+    assert np.corrcoef((first[0] - plain).ravel(), (second[0] - plain).ravel())[0, 1] < 0.1
+    np.testing.assert_array_equal(first[1].height, second[1].height)
+    np.testing.assert_array_equal(made.look("lower")[0], made.look("lower")[0])

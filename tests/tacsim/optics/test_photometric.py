@@ -2,9 +2,18 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tacsim.optics.geometry import Lighting, SensorModel
-from tacsim.optics.photometric import PhotometricLight, PhotometricModel, clipped, normal_terms, term_count
+from tacsim.optics.geometry import Lighting, SensorGeometry, SensorModel
+from tacsim.optics.grid import image_grid
+from tacsim.optics.photometric import (
+    PhotometricLight,
+    PhotometricModel,
+    clipped,
+    normal_terms,
+    places_in_image,
+    term_count,
+)
 from tacsim.optics.render import Renderer
+from tacsim.optics.surface import sample_surface
 from tests.tacsim.optics.surfaces import dent, flat
 
 GEL = (20e-3, 20e-3)
@@ -34,23 +43,24 @@ def test_terms_are_the_powers_of_the_normal() -> None:
 def test_change_is_the_polynomial_written_out() -> None:
     calibrated = model(2, 1)
     gradient = RNG.uniform(-0.4, 0.4, (20, 30, 2)).astype(np.float32)
-    change, beyond = PhotometricLight(calibrated, (20, 30)).change(gradient, slice(0, 20))
+    u, v = places_in_image(30, 20)
+    change, beyond = PhotometricLight(calibrated).change(gradient, u, v)
     row, column = 4, 17
     normal = [float(t) for t in normal_terms(gradient[row, column].astype(float), 2)]
-    u, v = (column + 0.5) / 30 - 0.5, (row + 0.5) / 20 - 0.5
-    terms = [place * term for place in (1.0, u, v) for term in normal]
+    at_u, at_v = (column + 0.5) / 30 - 0.5, (row + 0.5) / 20 - 0.5
+    terms = [place * term for place in (1.0, at_u, at_v) for term in normal]
     np.testing.assert_allclose(change[row, column], np.array(terms) @ np.array(calibrated.weights), atol=1e-5)
     assert beyond == 0
-    part, _ = PhotometricLight(calibrated, (20, 30)).change(gradient[8:12], slice(8, 12))
-    np.testing.assert_array_equal(part, change[8:12])
+    scaled, _ = PhotometricLight(calibrated, (0.5, 1.0, 2.0)).change(gradient[8:12], u[8:12], v[8:12])
+    np.testing.assert_allclose(scaled, change[8:12] * [0.5, 1.0, 2.0], atol=1e-6)
 
 
 def test_slopes_beyond_the_calibrated_are_clipped_and_counted() -> None:
     gradient = np.array([[[3.0, 4.0], [0.3, 0.4]]], dtype=np.float32)
     shorter, beyond = clipped(gradient, 1.0)
     np.testing.assert_allclose(shorter, [[[0.6, 0.8], [0.3, 0.4]]], rtol=1e-6)
-    assert beyond.tolist() == [[True, False]]
-    assert PhotometricLight(model(3, 0, steepest=1.0), (1, 2)).change(gradient, slice(0, 1))[1] == 1
+    assert beyond == 1
+    assert PhotometricLight(model(3, 0, steepest=1.0)).change(gradient, *places_in_image(2, 1))[1] == 1
 
 
 def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
@@ -65,6 +75,34 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
     phong = Renderer(SensorModel(texture=0.0), GEL)
     phong(dent())
     assert phong.beyond == 0.0
+
+
+@pytest.mark.parametrize("width", [640, 320, 100])
+def test_the_picture_is_the_polynomial_at_every_pixel(width: int) -> None:
+    """Colours are computed where the surface has its table, not pixel by pixel."""
+    geometry = SensorGeometry(width=width, height=3 * width // 4, pixel_pitch=20e-3 / width)
+    calibrated = model(5, 2)
+    sensor = SensorModel(geometry=geometry, photometric=calibrated, texture=0.0)
+    surface = dent(slide=(0.3e-3, -0.2e-3))
+    seen = Renderer(sensor, GEL)(surface)
+    slopes = sample_surface(surface, image_grid(geometry)).gradient
+    base = np.array([0.42, 0.44, 0.46])
+    change, _ = PhotometricLight(calibrated).change(slopes, *places_in_image(width, 3 * width // 4))
+    wanted = 255.0 * np.clip(base + base * change, 0.0, 1.0)
+    assert np.abs(255.0 * base - wanted).max() > 20.0
+    assert np.abs(seen - wanted).max() < 1.5
+    assert np.abs(seen - wanted).mean() < 0.3  # rounding alone gives 0.25
+
+
+def test_texture_shows_as_on_the_flat_gel() -> None:
+    sensor = SensorModel(photometric=model(3, 1))
+    still = Renderer(sensor, GEL)(flat()).astype(float)
+    smooth = sensor.model_copy(update={"texture": 0.0})
+    assert still.std(axis=(0, 1)).max() > 0.5
+    change = Renderer(smooth, GEL)(dent()).astype(float) - Renderer(smooth, GEL)(flat())
+    textured = Renderer(sensor, GEL)(dent()) - still
+    unclipped = (still + change > 1) & (still + change < 254)
+    np.testing.assert_allclose(textured[unclipped], change[unclipped], atol=1.0)
 
 
 def test_wrong_models_are_refused() -> None:

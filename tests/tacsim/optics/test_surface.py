@@ -25,7 +25,9 @@ def test_dent_right_and_below_is_positive_there_and_slopes_away() -> None:
 
 
 @pytest.mark.parametrize("slide", [(0.0, 0.0), (0.6e-3, -0.4e-3)])
-@pytest.mark.parametrize("grid", [IMAGE, canonical_cells(CanonicalGrid())], ids=["image", "canonical"])
+@pytest.mark.parametrize(
+    "grid", [IMAGE, IMAGE.refined(2), canonical_cells(CanonicalGrid())], ids=["image", "large", "canonical"]
+)
 def test_grid_agrees_with_newton_on_the_spline_itself(slide: tuple[float, float], grid: PixelGrid) -> None:
     surface = dent(slide=slide)
     sample = sample_surface(surface, grid)

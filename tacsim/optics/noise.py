@@ -1,0 +1,94 @@
+"""Noise of a sensor's camera: what changes from picture to picture though nothing moves.
+
+Real cameras' noise is no white noise: demosaicing, scaling and codecs spread it over neighbouring pixels and, through
+the brightness, over all colours. The model is a normal distribution: a deviation for each colour, correlations of the
+colours, and from pixel to pixel along a row or a column a correlation that falls as a power of the distance (a Markov
+process). It is the same at every brightness: in four recordings of three real sensors the line of EMVA 1288, variance =
+a + b * brightness, explained less than a twentieth of how the variance varies over the picture, or fell.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.optics.geometry import CameraNoise, SensorModel
+
+Float32 = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+FIELDS = 4  # that are drawn once for a sensor
+SHIFTS = 64  # places, each way, at which a frame may take its part of one
+HALVINGS = 20  # of the interval in which a field's scale is sought
+
+
+class NoiseSource:
+    """Lays a camera's noise on pictures of one sensor.
+
+    Noise is not drawn anew for each frame, which would cost more than the picture: FIELDS fields somewhat larger than
+    the image are drawn once, and a frame shows one of them, moved by up to SHIFTS pixels each way: FIELDS * SHIFTS^2
+    frames before one repeats, about. Which one follows from seed, sensor, episode and frame alone. Noise of single
+    frames and of pairs is that of the model; a mean over hundreds of frames is not as free of it as it should be.
+
+    Rounding is part of the noise, so that the fields are of whole grey levels. Below a deviation of about one that
+    makes them a little less correlated than the model says.
+    """
+
+    def __init__(self, noise: CameraNoise, shape: tuple[int, int], sensor: str = "") -> None:
+        """`shape`: rows, columns of the image; `sensor`: its name, so that two of one model differ."""
+        self._shape = shape
+        self._key = (noise.seed, zlib.crc32(sensor.encode()))
+        rng = np.random.default_rng(self._key)
+        size = (shape[0] + SHIFTS - 1, shape[1] + SHIFTS - 1)
+        self._fields = [_field(noise, size, rng) for _ in range(FIELDS)]
+
+    def __call__(self, image: Image, frame: int, episode: int = 0) -> Image:
+        """The picture (H, W, 3) as the camera delivers it; black and white are its limits. `frame`, `episode`: numbers
+        from 0. Raises ValueError for a picture of another size."""
+        import cv2
+
+        if image.shape != (*self._shape, 3):
+            raise ValueError(f"image is {image.shape}, the noise is for {(*self._shape, 3)}")
+        which, down, right = np.random.default_rng((*self._key, episode, frame)).integers((FIELDS, SHIFTS, SHIFTS))
+        rows, columns = self._shape
+        drawn = self._fields[which][down : down + rows, right : right + columns]
+        return np.asarray(cv2.add(image, drawn, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def noise_source(model: SensorModel, sensor: str) -> NoiseSource | None:
+    """Of the sensor of this name; None for a camera without noise."""
+    shape = (model.geometry.height, model.geometry.width)
+    return None if model.noise is None else NoiseSource(model.noise, shape, sensor)
+
+
+def _field(noise: CameraNoise, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.int8]:
+    """(rows, columns, 3) noise in whole grey levels."""
+    field = rng.standard_normal((*size, 3), dtype=np.float32)
+    along_x, along_y = noise.neighbours
+    _chain(field, along_y)
+    _chain(field.transpose(1, 0, 2), along_x)
+    values, vectors = np.linalg.eigh(noise.colour_matrix())
+    field @= (vectors * np.sqrt(np.maximum(values, 0.0))).T.astype(np.float32)
+    whole = np.zeros(field.shape, dtype=np.int8)
+    for channel, deviation in enumerate(noise.deviation):
+        if deviation > 0:
+            whole[..., channel] = _rounded(field[..., channel], deviation)
+    return whole
+
+
+def _chain(field: Float32, correlation: float) -> None:
+    """Correlates each row of independent normal numbers with the one before; their spread stays 1."""
+    fresh = np.float32(np.sqrt(1.0 - correlation**2))
+    for row in range(1, len(field)):
+        field[row] = np.float32(correlation) * field[row - 1] + fresh * field[row]
+
+
+def _rounded(field: Float32, deviation: float) -> Float32:
+    """The normal numbers, scaled so that `deviation` is their standard deviation after rounding."""
+    low, high = 0.0, deviation + 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if np.rint(np.float32(middle) * field).std() < deviation else (low, middle)
+    return np.asarray(np.clip(np.rint(np.float32(high) * field), -127, 127), dtype=np.float32)

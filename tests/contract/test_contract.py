@@ -216,14 +216,18 @@ def test_arms_are_told_of_the_moment_of_exposure(rig: Rig, observations: list[Ob
 
 
 def test_frame_numbers_have_no_gap(rig: Rig, live: bool) -> None:
-    """A live camera goes on between the steps."""
+    """A live camera goes on by itself: several frames between two steps, or, on a busy machine, none yet."""
     rig.reset()
     numbers = []
     for _ in range(STEPS):
         rig.step(Action())
         numbers.append([frame.index for frame in rig.frames.values()])
     steps = np.diff(numbers, axis=0)
-    assert np.all(steps >= 1) if live else np.all(steps == 1)
+    if live:
+        assert np.all(steps >= 0)
+        assert np.all(np.sum(steps, axis=0) > 0)
+    else:
+        assert np.all(steps == 1)
 
 
 def test_references_are_without_contact(rig: Rig) -> None:

@@ -159,7 +159,10 @@ def test_the_command_calibrates_the_lens_and_then_the_gel(tmp_path: Path) -> Non
         again = ["calibrate", "lens", str(out / "frames"), *BOARD, "--out", str(tmp_path / "again")]
         done = CliRunner().invoke(app, again, env={"COLUMNS": "200"})
         assert done.exit_code == 0, done.output
-        assert load(Lens, tmp_path / "again" / "lens.yaml") == lens
+        found = load(Lens, tmp_path / "again" / "lens.yaml")
+        # OpenCV adds up in threads: the last digits differ from run to run.
+        np.testing.assert_allclose([*found.focal, *found.centre], [*lens.focal, *lens.centre], rtol=1e-6)
+        np.testing.assert_allclose(found.distortion, lens.distortion, atol=1e-6)
         flat = photograph(DOTS, facing(DOTS, [0.1, -0.1, 0.0], 0.032))
         words += ["--views", "1", "--lens", str(out / "lens.yaml"), "--size", "18 mm, 14 mm"]
         camera.push(EMPTY)

@@ -3,8 +3,8 @@ conditions of a closed form. Units as in the physics: mm, N, MPa, wave speed 1."
 
 import numpy as np
 
+from tacsim.physics.element import SMALLEST_STRETCH
 from tacsim.physics.gel import (
-    SMALLEST_STRETCH,
     Corners,
     GelFacts,
     GelState,
@@ -16,7 +16,7 @@ from tacsim.physics.gel import (
     gel_advance,
     gel_forces,
 )
-from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work, vec3, vec4
+from tacsim.physics.lanes import NODES, PARTS, Counts, Facts, Partial, strip, vec3
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
@@ -31,21 +31,18 @@ from tacsim.physics.layout import (
     STEPS,
 )  # fmt: skip
 from tacsim.physics.material import convect, hencky_return, mat3, vec6
-from tacsim.physics.plasticine import (
-    BodyFacts,
-    BodyState,
-    Masses,
+from tacsim.physics.plasticine import BodyFacts, BodyState
+from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.transfers import (
     Points,
     Rates,
     Strains,
-    Sums,
-    Velocities,
+    Strips,
     clear_masses,
     grid_to_particles,
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.runtime import start, ti
 
 Steps = ti.types.ndarray(dtype=ti.i32, ndim=2)
@@ -56,7 +53,7 @@ Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 @ti.kernel
 def body_substeps(
     team: ti.i32, steps: Steps,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities, sums: Sums,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips, sums: Strips,
     facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
 ):  # fmt: skip
     """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
@@ -68,17 +65,20 @@ def body_substeps(
                 for share in range(shares(member, team)):
                     part = member + share * team
                     clear_masses(0, part, masses, counts)
-                    particles_to_grid(0, part, points, rates, strains, masses, facts, counts, partial)
+                    particles_to_grid(0, part, points, rates, strains, masses, sums, facts, counts, partial)
                 meet(sync, 0, team, 2 * it + 1)
-                plane, rows = counts[0, GRID + 1] * counts[0, GRID + 2], counts[0, GRID]
+                plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
                 for share in range((rows - member + team - 1) // team):
                     i = member + share * team
-                    for node in range(i * plane, (i + 1) * plane):
-                        q = node_sum(0, i, node, masses, counts)
-                        velocity = vec4(0.0)
-                        if q[3] > 0.0:
-                            velocity = vec4(keep_x * q[0] / q[3], keep_y * q[1] / q[3], keep_z * q[2] / q[3], 0.0)
-                        velocities[node] = velocity
+                    for at in range(i * plane, (i + 1) * plane):
+                        q = node_sum(0, i, at, masses, counts)
+                        moved = strip(0.0)
+                        for n in ti.static(range(NODES)):
+                            if q[4 * n + 3] > 0.0:
+                                moved[4 * n] = keep_x * q[4 * n] / q[4 * n + 3]
+                                moved[4 * n + 1] = keep_y * q[4 * n + 1] / q[4 * n + 3]
+                                moved[4 * n + 2] = keep_z * q[4 * n + 2] / q[4 * n + 3]
+                        velocities[at] = moved
                 meet(sync, 0, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
@@ -89,7 +89,7 @@ def body_substeps(
 def gel_substeps(
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    facts: Facts, counts: Counts, work: Work, partial: Partial,
+    facts: Facts, counts: Counts, partial: Partial,
     keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32,
 ):  # fmt: skip
     """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
@@ -97,9 +97,7 @@ def gel_substeps(
     for _ in range(counts[0, STEPS]):
         layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
         for part in range(PARTS):
-            gel_forces(
-                0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial, layers, nx, ny
-            )
+            gel_forces(0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny)
         for part in range(PARTS):
             gel_advance(0, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
         dt, keep = facts[0, STEP], vec3(keep_x, keep_y, keep_z)
@@ -169,8 +167,7 @@ class GelBlock(Block):
     def __init__(self, facts: GelFacts, dt: float, damping: float) -> None:
         super().__init__({**facts.facts(), GEL_DAMPING: damping}, dt)
         self.state = GelState(facts, 1, 1)
-        self._work = np.zeros((PARTS * SLOTS, LANES), np.float32)
-        self._arguments = (*self.state.arguments(), self.facts, self.counts, self._work, self.partial)
+        self._arguments = (*self.state.arguments(), self.facts, self.counts, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:
         """keep: as for a body; speed: of the top along z, if driven. Raises RuntimeError if an element inverts."""

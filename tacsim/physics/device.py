@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tacsim.physics.element import element_block
 from tacsim.physics.gel import (
     Corners,
     GelState,
@@ -19,22 +20,22 @@ from tacsim.physics.gel import (
     NodeLanes,
     Skin,
     Touch,
-    element_block,
     gel_advance,
     node_block,
 )
 from tacsim.physics.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
 from tacsim.physics.indenter import Pressure, Slip, Values, indent
 from tacsim.physics.lanes import (
+    LANES,
     PARTS,
-    SLOTS,
+    SUMS,
     Counts,
     Facts,
     Partial,
-    empty_four,
-    empty_lanes,
+    empty_strip,
     note_least,
     real,
+    strip,
     vec3,
     vec4,
 )
@@ -50,17 +51,8 @@ from tacsim.physics.layout import (
     SMALLEST_VOLUME,
     STEPS,
 )  # fmt: skip
-from tacsim.physics.plasticine import (
-    SUMS,
-    BodyState,
-    Masses,
-    Points,
-    Rates,
-    Strains,
-    Velocities,
-    gather,
-    particles_to_grid,
-)
+from tacsim.physics.plasticine import BodyState
+from tacsim.physics.transfers import Points, Rates, Strains, Strips, gather, scatter
 from tacsim.runtime import ti
 
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
@@ -90,15 +82,33 @@ def element(
     partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Forces of one element on its corners; gel: counted over all environments."""
-    work = [empty_lanes() for _ in range(SLOTS)]  # registers, where the CPU has memory
     blocks = (nx + 1) * (ny + 1)
     axis, row, margin = (layers + 1) * blocks, blocks + ny + 2, ny + 2
     u = margin + gel * 9 * axis + k * blocks + block
     to = margin + (gel * layers + k) * 24 * row + ny + 2 + block
-    jacobian = element_block(
-        env, u, axis, blocks, to, row, block, nodes, nodes, nodes, nodes, 1, ny + 1, corners, lattice, facts, work, 0, 0
+    ends, smallest = ti.Matrix.zero(ti.f32, 25, LANES), ti.Matrix.zero(ti.f32, 1, LANES) + 1e9
+    element_block(
+        env,
+        u,
+        axis,
+        blocks,
+        to,
+        row,
+        block,
+        nodes,
+        nodes,
+        nodes,
+        nodes,
+        1,
+        ny + 1,
+        corners,
+        lattice,
+        facts,
+        ends,
+        smallest,
+        0,
     )
-    note_least(partial, env, block % PARTS, SMALLEST_VOLUME, jacobian.min())
+    note_least(partial, env, block % PARTS, SMALLEST_VOLUME, smallest.min())
 
 
 @ti.func
@@ -154,7 +164,7 @@ def press_substep(
 def hybrid_substep(
     it: ti.i32, drive: Drive,
     nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips,
     memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
     layers: ti.i32, room: ti.i32, most: ti.i32,
 ):  # fmt: skip
@@ -177,7 +187,7 @@ def hybrid_substep(
                 ti.atomic_max(ceiling[env, g], height)
     for env, node in ti.ndrange(counts.shape[0], most):
         if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
-            masses[env * counts[env, CAPACITY] + node] = vec4(0.0)
+            masses[env * counts[env, CAPACITY] + node] = strip(0.0)
     for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, touch.shape[3]):
         if goes(env, it, counts):
             nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
@@ -192,7 +202,8 @@ def hybrid_substep(
                 )  # fmt: skip
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            particles_to_grid(env, p, points, rates, strains, masses, facts, counts, partial)
+            sums = [empty_strip() for _ in range(SUMS)]
+            scatter(env, p, points, rates, strains, masses, sums, 0, facts, counts, partial)
     for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
         if goes(env, it, counts):
             nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
@@ -206,7 +217,7 @@ def hybrid_substep(
                 partial[at // PARTS, at % PARTS, MOTION + d] = 0.0
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            sums = [empty_four() for _ in range(SUMS)]
+            sums = [empty_strip() for _ in range(SUMS)]
             gather(env, p, points, planes, rates, strains, velocities, sums, 0, facts, counts, partial)
 
 
@@ -270,7 +281,7 @@ def run_hybrid(
     arguments = (
         mirror.sent("drive", drive, ti.f32), *mirror.send_gels(gels), mirror.sent("points", points, vec4),
         mirror.sent("planes", planes, vec4), mirror.sent("rates", rates, vec4), mirror.sent("strains", strains, vec4),
-        mirror.room("masses", vec4, masses.shape[:-1]), mirror.room("velocities", vec4, velocities.shape[:-1]),
+        mirror.room("masses", strip, masses.shape[:-1]), mirror.room("velocities", strip, velocities.shape[:-1]),
         mirror.sent("memory", memory, vec4), mirror.sent("facts", facts, ti.f32),
         mirror.sent("counts", counts, ti.i32), mirror.sent("partial", partial, ti.f32),
         mirror.room("ceiling", ti.f32, (len(counts), 2)),

@@ -10,17 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tacsim.physics.element import element_block
 from tacsim.physics.lanes import (
     COPIES,
     LANES,
     ON_DEVICE,
     PARTS,
-    SLOTS,
-    anchor,
     first_of,
     keep_or,
     note_least,
     note_sum,
+    opaque,
     padded,
     real,
     vec4,
@@ -36,14 +36,11 @@ from tacsim.physics.layout import (
     SMALLEST_VOLUME,
     STEP,
 )
-from tacsim.physics.material import lanes_log1p
 from tacsim.runtime import ti
 from tacsim.scene import Gel, GelSurface, lame
 
 MM = 1e3  # millimetres in a metre
 MPA = 1e-6  # megapascals in a pascal
-HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
-SMALLEST_STRETCH = 0.05  # J below this counts as inverted
 
 Nodes = ti.types.ndarray(dtype=ti.f32, ndim=6)
 # Lanes have one axis: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
@@ -222,81 +219,6 @@ def gel_surface(facts: GelFacts, state: GelState, environment: int, gel: int) ->
 
 
 @ti.func
-def cross(a, b):
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-@ti.func
-def element_block(
-    env, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(),
-    sj: ti.template(), si: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(),
-    work: ti.template(), w: ti.template(), never,
-):  # fmt: skip
-    """Forces of LANES elements on their corners. Returns det F.
-
-    u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
-    where the forces go, `row` the way to the next corner or axis; sj, si: how much further on nodes across j and i
-    stand, 0 in views that are shifted in memory; w: of `work`, the first that is free. One-point quadrature and
-    hourglass stiffness (Flanagan & Belytschko 1981, modes of the cube).
-    """
-    h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
-    whole = lattice[block]
-    quarter = 0.25 / h
-    area = (0.25 * h * h) * whole
-    stiffness = (HOURGLASS * 2.0 * mu * h / 8.0) * whole
-    for d in ti.static(range(3)):
-        at = u + d * axis
-        a, b, c, e = n0[at], n0[at + layer], nj[at + sj], nj[at + sj + layer]
-        p, q, r, s = ni[at + si], ni[at + si + layer], nij[at + si + sj], nij[at + si + sj + layer]
-        # sums and differences along z, then y, then x
-        az, cz, pz, rz = b + a, e + c, q + p, s + r
-        aw, cw, pw, rw = b - a, e - c, q - p, s - r
-        left, right, left_y, right_y = cz + az, rz + pz, cz - az, rz - pz
-        left_z, right_z, left_yz, right_yz = cw + aw, rw + pw, cw - aw, rw - pw
-        anchor(work, w + d, quarter * (right - left) + (1.0 if d == 0 else 0.0), never)
-        anchor(work, w + 3 + d, quarter * (left_y + right_y) + (1.0 if d == 1 else 0.0), never)
-        anchor(work, w + 6 + d, quarter * (left_z + right_z) + (1.0 if d == 2 else 0.0), never)
-        anchor(work, w + 9 + d, stiffness * (right_y - left_y), never)  # s_x s_y
-        anchor(work, w + 12 + d, stiffness * (left_yz + right_yz), never)  # s_y s_z
-        anchor(work, w + 15 + d, stiffness * (right_z - left_z), never)  # s_x s_z
-        anchor(work, w + 18 + d, stiffness * (right_yz - left_yz), never)  # s_x s_y s_z
-    f = [[work[w + 3 * column + d] for d in range(3)] for column in range(3)]  # columns of F
-    x, y, z = cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])  # columns of the cofactor matrix
-    jacobian = f[0][0] * x[0] + f[0][1] * x[1] + f[0][2] * x[2]
-    safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
-    anchor(work, w + 21, safe, never)
-    # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
-    pressure = (lam * lanes_log1p(safe - 1.0) - mu) / safe
-    anchor(work, w + 22, pressure, never)
-    for d in ti.static(range(3)):
-        px = area * (mu * f[0][d] + pressure * x[d])
-        py = area * (mu * f[1][d] + pressure * y[d])
-        pz = area * (mu * f[2][d] + pressure * z[d])
-        # force on corner (s_x, s_y, s_z) = -(s_x p_x + s_y p_y + s_z p_z + s_x s_y h_1 + ...), by halves: first y and z
-        near, far = pz - work[w + 12 + d], pz + work[w + 12 + d]  # s_y = -1, 1
-        left, right = px - work[w + 9 + d], px + work[w + 9 + d]
-        skew_left = work[w + 15 + d] - work[w + 18 + d]
-        skew_right = work[w + 15 + d] + work[w + 18 + d]
-        anchor(work, w + 24 + 8 * d, py + near, never)
-        anchor(work, w + 25 + 8 * d, py - near, never)
-        anchor(work, w + 26 + 8 * d, far - py, never)
-        anchor(work, w + 27 + 8 * d, far + py, never)
-        anchor(work, w + 28 + 8 * d, left - skew_left, never)
-        anchor(work, w + 29 + 8 * d, left + skew_left, never)
-        anchor(work, w + 30 + 8 * d, right - skew_right, never)
-        anchor(work, w + 31 + 8 * d, right + skew_right, never)
-        for yz in ti.static(range(4)):  # 00, 01, 10, 11
-            whole_yz, odd = work[w + 24 + yz + 8 * d], work[w + 28 + yz + 8 * d]
-            r = ti.static(3 * yz) + d
-            if ti.static(yz == 3):
-                whole_yz = -whole_yz
-            low, high = to + r * row, to + (12 + r) * row
-            corners[low] = keep_or(never, corners[low], whole_yz + odd)
-            corners[high] = keep_or(never, corners[high], whole_yz - odd)
-    return ti.select(whole > 0.0, jacobian, 1.0)
-
-
-@ti.func
 def node_block(
     to, i, j, below, above, row, n0: ti.template(), c0: ti.template(), cj: ti.template(), ci: ti.template(),
     cij: ti.template(), sj: ti.template(), si: ti.template(), never,
@@ -305,16 +227,19 @@ def node_block(
 
     below, above: 1 or 0, whether there are any; row, sj, si: as for `element_block`.
     """
-    under = c0[i] + cj[i + 6 * row - sj] + ci[i + 12 * row - si] + cij[i + 18 * row - si - sj]
-    over = c0[j + 3 * row] + cj[j + 9 * row - sj] + ci[j + 15 * row - si] + cij[j + 21 * row - si - sj]
-    n0[to] = keep_or(never, n0[to], below * under + above * over)
+    under = c0[opaque(never, i)] + cj[opaque(never, i + 6 * row - sj)]
+    under += ci[opaque(never, i + 12 * row - si)] + cij[opaque(never, i + 18 * row - si - sj)]
+    over = c0[opaque(never, j + 3 * row)] + cj[opaque(never, j + 9 * row - sj)]
+    over += ci[opaque(never, j + 15 * row - si)] + cij[opaque(never, j + 21 * row - si - sj)]
+    at = opaque(never, to)
+    n0[at] = keep_or(never, n0[at], below * under + above * over)
 
 
 @ti.func
 def gel_forces(
     env, part, gels, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(), c0: ti.template(),
     cj: ti.template(), ci: ti.template(), cij: ti.template(), lattice: ti.template(), facts: ti.template(),
-    counts: ti.template(), work: ti.template(), partial: ti.template(), layers, nx, ny,
+    counts: ti.template(), partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Internal forces on this part's nodes of its gel. A layer of elements, then the nodes below it, and so on up."""
     never = counts[env, NEVER]
@@ -326,18 +251,16 @@ def gel_forces(
     row = (blocks + pieces - 1) // pieces + halo  # of corners
     axis = (layers + 1) * blocks
     u, f = (env * gels + g) * 9 * axis, ((env * gels + g) * 9 + 6) * axis
-    w = (env * PARTS + part) * SLOTS
-    smallest = real(1e9)
+    ends, smallest = ti.Matrix.zero(ti.f32, 25, LANES), ti.Matrix.zero(ti.f32, 1, LANES) + 1e9
     for k in range(layers + 1):
         here = (2 * (env * PARTS + part) + k % 2) * 24 * row
         before = (2 * (env * PARTS + part) + (k + 1) % 2) * 24 * row
         if k < layers:
             for block in range(ti.max(first - halo, 0), last):
-                jacobian = element_block(
+                element_block(
                     env, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj, ni,
-                    nij, 0, 0, c0, lattice, facts, work, w, never,
+                    nij, 0, 0, c0, lattice, facts, ends, smallest, never,
                 )  # fmt: skip
-                smallest = ti.min(smallest, jacobian)
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for block in range(first, last):
             i, j = here + block - first + halo, before + block - first + halo
@@ -357,7 +280,7 @@ def gel_advance(
     Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted. On a
     device a part is one column of nodes: of gel part // columns, number part % columns.
     """
-    dt, h = facts[env, STEP], facts[env, GEL_SPACING]
+    never, dt, h = counts[env, NEVER], facts[env, STEP], facts[env, GEL_SPACING]
     pieces = PARTS // gels
     row, count = ny + 1, (nx + 1) * (ny + 1)
     blocks = (count + LANES - 1) // LANES
@@ -387,12 +310,14 @@ def gel_advance(
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
-            share = lattice[blocks + block] * scale
+            share = lattice[opaque(never, blocks + block)] * scale
             for d in ti.static(range(3)):
                 at = u + d * axis + k * blocks + block
-                new = keep * n0[at + 3 * axis] + share * n0[at + 6 * axis]
-                n0[at + 3 * axis] = new
-                n0[at] = n0[at] + dt * new
+                x, v, f = opaque(never, at), opaque(never, at + 3 * axis), opaque(never, at + 6 * axis)
+                speed = keep * n0[v] + share * n0[f]
+                place = n0[x] + dt * speed
+                n0[v] = keep_or(never, n0[v], speed)
+                n0[x] = keep_or(never, n0[x], place)
     for n in range(first * LANES, ti.min(last * LANES, count)):
         i, j = n // row, n % row
         for quantity in ti.static(range(2)):

@@ -33,7 +33,7 @@ from tacsim.physics.gel import (
 from tacsim.physics.health import Health, copies, judged, require_room, retried
 from tacsim.physics.hybrid_kernels import substeps
 from tacsim.physics.inertia import Inertia, kernel_density, kernel_second, plan_in_time
-from tacsim.physics.lanes import LANES, ON_DEVICE, PARTS, SLOTS
+from tacsim.physics.lanes import ON_DEVICE, PARTS
 from tacsim.physics.layout import (
     BACKING,
     BODY_DAMPING,
@@ -95,7 +95,6 @@ class HybridState:
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._work = np.zeros((len(scenes) * PARTS * SLOTS, LANES), np.float32)
         self._mirror = Mirror()
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
@@ -109,7 +108,7 @@ class HybridState:
         else:
             run_team(
                 substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.facts,
-                self.counts, self._work, self.partial, active=list(drives),
+                self.counts, self.partial, active=list(drives),
             )  # fmt: skip
 
 

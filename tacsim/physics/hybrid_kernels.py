@@ -13,15 +13,16 @@ from tacsim.physics.gel import (
     gel_forces,
 )
 from tacsim.physics.lanes import (
+    NODES,
     ON_DEVICE,
     PARTS,
     Counts,
     Facts,
     Partial,
-    Work,
     note_sum,
     part_range,
     slot_of,
+    strip,
     vec3,
     vec4,
 )
@@ -43,19 +44,17 @@ from tacsim.physics.layout import (
     STEPS,
     STRIDE,
 )  # fmt: skip
-from tacsim.physics.plasticine import (
-    Masses,
+from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, shares
+from tacsim.physics.transfers import (
     Points,
     Rates,
     Strains,
-    Sums,
-    Velocities,
+    Strips,
     clear_masses,
     grid_to_particles,
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, shares
 from tacsim.runtime import ti
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
@@ -117,6 +116,7 @@ def grid_update(
     mean_across = mean - axis * (mean.dot(axis) / length2)
     nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
     base = env * counts[env, CAPACITY]
+    nz = nz // NODES  # strips
     i0, i1, j0, j1, k0, k1 = 0, 0, 0, ny, 0, nz
     if ti.static(ON_DEVICE):  # one node
         i0, j0, k0 = part // (ny * nz), part // nz % ny, part % nz
@@ -126,18 +126,21 @@ def grid_update(
     for i in range(i0, i1):
         for j in range(j0, j1):
             for k in range(k0, k1):
-                node = (i * ny + j) * nz + k
-                q = node_sum(env, i, node, masses, counts)
-                velocity = vec3(0.0)
-                if q[3] != 0.0:  # a mass that is not a number must show
-                    velocity = vec3(q[0], q[1], q[2]) / q[3] + boost + dt * weight
-                    x = origin + cell * vec3(i, j, k)
-                    t = alone + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
-                    reference = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
-                    if driven:
-                        reference = axis * (reference.dot(axis) / length2) + mean_across
-                    velocity -= damping * dt * (velocity - reference)
-                velocities[base + node] = vec4(velocity[0], velocity[1], velocity[2], 0.0)
+                at = (i * ny + j) * nz + k
+                q = node_sum(env, i, at, masses, counts)
+                moved = strip(0.0)
+                for n in ti.static(range(NODES)):
+                    if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
+                        velocity = vec3(q[4 * n], q[4 * n + 1], q[4 * n + 2]) / q[4 * n + 3] + boost + dt * weight
+                        x = origin + cell * vec3(i, j, k * NODES + n)
+                        t = alone + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
+                        reference = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
+                        if driven:
+                            reference = axis * (reference.dot(axis) / length2) + mean_across
+                        velocity -= damping * dt * (velocity - reference)
+                        for d in ti.static(range(3)):
+                            moved[4 * n + d] = velocity[d]
+                velocities[base + at] = moved
 
 
 @ti.func
@@ -193,9 +196,9 @@ def substeps(
     team: ti.i32, drive: Drive,
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Masses, velocities: Velocities,
-    sums: Sums, memory: ContactMemory,
-    facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips, sums: Strips,
+    memory: ContactMemory,
+    facts: Facts, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
@@ -217,9 +220,9 @@ def substeps(
                             contact_ceiling(skin, env, g), layers, nx, ny,
                         )  # fmt: skip
                     clear_masses(env, part, masses, counts)
-                    particles_to_grid(env, part, points, rates, strains, masses, facts, counts, partial)
+                    particles_to_grid(env, part, points, rates, strains, masses, sums, facts, counts, partial)
                     gel_forces(
-                        env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
+                        env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,
                         layers, nx, ny,
                     )  # fmt: skip
                 meet(sync, turn, team, 2 * it + 1)

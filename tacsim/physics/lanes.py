@@ -13,19 +13,26 @@ thread of its own; there is one copy, and what is scattered is added atomically.
 kernel is compiled.
 """
 
+import math
+
+import numpy as np
+
 from tacsim.runtime import DEVICE, ti
 
 ON_DEVICE = DEVICE != "cpu"
 LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
 PARTS = 4  # of an environment's work on the CPU; of its sums everywhere
+CACHE_LINE = 16  # floats
 COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
+
+NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
 
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
 real = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
+strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
 
-Work = ti.types.ndarray(dtype=real, ndim=1)  # SLOTS for each environment and part: where anchors are dropped
-SLOTS = 64
+SUMS = 40  # strips for each environment and part: where the body's transfers drop theirs
 Facts = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, facts)
 Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, counts)
 Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, numbers)
@@ -36,6 +43,14 @@ def padded(n: int) -> int:
     return -(-n // LANES) * LANES
 
 
+def aligned_zeros(*shape: int) -> np.ndarray:
+    """float32 zeros that begin at a cache line, so that no vector register's worth of them lies across two."""
+    count = math.prod(shape)
+    memory = np.zeros(count + CACHE_LINE, np.float32)
+    start = -memory.ctypes.data // 4 % CACHE_LINE
+    return memory[start : start + count].reshape(shape)
+
+
 @ti.func
 def keep_or(never, old, new):
     """new; `old` in words only (never is 0, which the compiler can't know): a value stored over the one just read."""
@@ -43,6 +58,12 @@ def keep_or(never, old, new):
         return new
     else:
         return ti.bit_cast(ti.bit_cast(new, ti.i32) | (ti.bit_cast(old, ti.i32) & never), ti.f32)
+
+
+@ti.func
+def opaque(never, index):
+    """index. The compiler takes a sum of several indices apart, and lanes behind it are no neighbours any more."""
+    return index | never
 
 
 @ti.func
@@ -139,12 +160,6 @@ def note_most(partial: ti.template(), env, slot, number, value):
 
 
 @ti.func
-def empty_lanes():
-    empty = real(0.0)
-    return empty  # noqa: RET504 - only a variable can be written to
-
-
-@ti.func
-def empty_four():
-    empty = vec4(0.0)
+def empty_strip():
+    empty = strip(0.0)
     return empty  # noqa: RET504 - only a variable can be written to

@@ -34,7 +34,7 @@ GRID = 3  # node counts x, y, z
 SLAB = 6  # first node plane and the one after the last of part 0, 1, ...
 KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
-CAPACITY = 16  # grid nodes that an environment has room for, in each copy
+CAPACITY = 16  # strips of grid nodes that an environment has room for, in each copy
 SHAPE_NODES = 17  # of an indenter's distance grid x, y, z
 COUNTS = 20
 

@@ -12,6 +12,7 @@ vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
 ROOT = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the flow
+NEAR_LOG1P, NEAR_LOG, NEAR_EXP = 0.4, 0.5, 0.2  # arguments up to which the series below are exact enough
 
 
 @ti.func
@@ -64,13 +65,18 @@ def frobenius(s):
 
 
 @ti.func
+def log1p_series(z):
+    """ln(1 + x) = 2 artanh(z) with z = x / (2 + x), by its series: accurate in f32 for |x| up to 0.4, however small."""
+    q = z * z
+    return 2.0 * z * (1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q * (1.0 / 9.0 + q / 11.0)))))
+
+
+@ti.func
 def log1p(x):
-    """ln(1 + x), accurate in f32 for small x: 2 artanh(x / (2 + x)) by its series."""
+    """ln(1 + x), accurate in f32 for small x."""
     y = 0.0
-    if ti.abs(x) < 0.4:
-        z = x / (2.0 + x)
-        q = z * z
-        y = 2.0 * z * (1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q * (1.0 / 9.0 + q / 11.0)))))
+    if ti.abs(x) < NEAR_LOG1P:
+        y = log1p_series(x / (2.0 + x))
     else:
         y = ti.log(1.0 + x)
     return y
@@ -80,11 +86,8 @@ def log1p(x):
 def lanes_log1p(x):
     """The same for lanes, without a branch: far from 0 by the fourth root."""
     t = ti.sqrt(ti.sqrt(1.0 + x)) - 1.0
-    far = ti.abs(x) > 0.4
-    z = ti.select(far, t / (2.0 + t), x / (2.0 + x))
-    q = z * z
-    series = 1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q * (1.0 / 9.0 + q * (1.0 / 11.0)))))
-    return ti.select(far, 8.0, 2.0) * z * series
+    far = ti.abs(x) > NEAR_LOG1P
+    return ti.select(far, 4.0, 1.0) * log1p_series(ti.select(far, t / (2.0 + t), x / (2.0 + x)))
 
 
 @ti.func
@@ -120,32 +123,98 @@ def logarithm(a):
     """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
     scale = 1.0
     root = a
-    if frobenius(a) > 0.5:
+    if frobenius(a) > NEAR_LOG:
         for _ in range(3):
-            if frobenius(root) > 0.5:
+            if frobenius(root) > NEAR_LOG:
                 root = square_root(root)
                 scale *= 2.0
     return scale * log_pade(root)
 
 
 @ti.func
-def exponential_minus_identity(x, norm):
-    """exp(x) - I for tr x = 0, by its Taylor series to 4th order, error below |x|^5 / 120; norm: |x|.
+def exponential_series(x):
+    """exp(x) - I for tr x = 0 by its Taylor series to 4th order, error below |x|^5 / 120."""
+    i2, i3 = minors(x), determinant(x)  # x^3 = -i2 x + i3, since tr x = 0
+    return plus_identity((1.0 - i2 / 6.0 + i3 / 24.0) * x + (0.5 - i2 / 24.0) * product(x, x), i3 / 6.0)
 
-    Large strain (norm > 0.2: stiff yield, or long hardening) is halved first: exp(x) = exp(x / 2^n)^(2^n), n <= 4.
+
+@ti.func
+def exponential_minus_identity(x, norm):
+    """exp(x) - I for tr x = 0; norm: |x|.
+
+    Large strain (stiff yield, or long hardening) is halved first: exp(x) = exp(x / 2^n)^(2^n), n <= 4.
     """
     halvings = 0
     small = norm
     for _ in range(4):
-        if small > 0.2:
+        if small > NEAR_EXP:
             small *= 0.5
             halvings += 1
-    y = (small / norm) * x
-    i2, i3 = minors(y), determinant(y)  # y^3 = -i2 y + i3, since tr y = 0
-    y = plus_identity((1.0 - i2 / 6.0 + i3 / 24.0) * y + (0.5 - i2 / 24.0) * product(y, y), i3 / 6.0)
+    y = exponential_series((small / norm) * x)
     for _ in range(halvings):
         y = 2.0 * y + product(y, y)
     return y
+
+
+@ti.func
+def volume_preserving(e, shrink):
+    """b_e / J^(2/3) - I, from shrink = J^(-2/3)."""
+    return plus_identity(e * shrink, shrink - 1.0)
+
+
+@ti.func
+def after_flow(growth, shrink):
+    """e of growth + I, of which only the part that preserves volume counts, at the volume J = shrink^(-3/2)."""
+    excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
+    volume = (1.0 - excess / 3.0) / shrink
+    return plus_identity(growth * volume, volume - 1.0)
+
+
+@ti.func
+def return_near(e, flow, mu, bulk, limit, hardening):
+    """`hencky_return` for elastic strain up to some 0.2, without a branch, so that lanes can do it side by side.
+
+    Returns also 1 where the strain is larger (and all else is wrong), else 0.
+    """
+    x = e[0] + e[1] + e[2] + minors(e) + determinant(e)  # det(I + e) - 1
+    log_j = 0.5 * log1p_series(x / (2.0 + x))
+    y = -2.0 / 3.0 * log_j
+    shrink = 1.0 + y * (1.0 + y * (0.5 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y / 120.0))))  # exp(y)
+    shape = volume_preserving(e, shrink)
+    strain = 0.5 * log_pade(shape)
+    strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
+    norm = frobenius(strain)
+    now = limit + hardening * flow
+    yields = norm > now
+    gamma = ti.max(0.0, norm - now) / (1.0 + ROOT * hardening)
+    strain *= ti.select(yields, (norm - gamma) / norm, 1.0)
+    returned = after_flow(exponential_series(2.0 * strain), shrink)
+    elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
+    far = (
+        ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0)
+        | ti.select(frobenius(shape) > NEAR_LOG, 1, 0)
+        | ti.select(2.0 * (norm - gamma) > NEAR_EXP, 1, 0)
+    )
+    return elastic, flow + ROOT * gamma, plus_identity(2.0 * mu * strain, bulk * log_j), far
+
+
+@ti.func
+def return_far(e, flow, mu, bulk, limit, hardening):
+    """`hencky_return` for any strain."""
+    log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
+    shrink = ti.exp(-2.0 / 3.0 * log_j)
+    strain = 0.5 * logarithm(volume_preserving(e, shrink))
+    strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
+    norm = frobenius(strain)
+    elastic = e
+    now = limit + hardening * flow
+    new_flow = flow
+    if norm > now:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
+        gamma = (norm - now) / (1.0 + ROOT * hardening)
+        new_flow = flow + ROOT * gamma
+        strain *= (norm - gamma) / norm
+        elastic = after_flow(exponential_minus_identity(2.0 * strain, 2.0 * (norm - gamma)), shrink)
+    return elastic, new_flow, plus_identity(2.0 * mu * strain, bulk * log_j)
 
 
 @ti.func
@@ -157,23 +226,10 @@ def hencky_return(e, flow, mu, bulk, limit, hardening):
     box 3.1). Returns the elastic e after the return, the new flow, and the Kirchhoff stress
     tau = 2 mu dev(eps) + K ln(J) I.
     """
-    log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
-    shrink = ti.exp(-2.0 / 3.0 * log_j)
-    strain = 0.5 * logarithm(plus_identity(e * shrink, shrink - 1.0))  # of the volume-preserving part
-    strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    norm = frobenius(strain)
-    elastic = e
-    now = limit + hardening * flow
-    new_flow = flow
-    if norm > now:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
-        gamma = (norm - now) / (1.0 + ROOT * hardening)
-        new_flow = flow + ROOT * gamma
-        strain *= (norm - gamma) / norm
-        growth = exponential_minus_identity(2.0 * strain, 2.0 * (norm - gamma))
-        excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
-        volume = (1.0 - excess / 3.0) / shrink
-        elastic = plus_identity(growth * volume, volume - 1.0)
-    return elastic, new_flow, plus_identity(2.0 * mu * strain, bulk * log_j)
+    elastic, new_flow, tau, far = return_near(e, flow, mu, bulk, limit, hardening)
+    if far != 0:
+        elastic, new_flow, tau = return_far(e, flow, mu, bulk, limit, hardening)
+    return elastic, new_flow, tau
 
 
 @ti.func

@@ -52,7 +52,7 @@ from tacsim.physics.indenter import (
     indent,
 )
 from tacsim.physics.inertia import Inertia, kernel_second, plan_in_time
-from tacsim.physics.lanes import LANES, ON_DEVICE, PARTS, SLOTS, Counts, Facts, Partial, Work
+from tacsim.physics.lanes import ON_DEVICE, PARTS, Counts, Facts, Partial
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
@@ -91,7 +91,7 @@ def press_substeps(
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values,
-    facts: Facts, counts: Counts, work: Work, partial: Partial, sync: Sync,
+    facts: Facts, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
     for task in range(sync.shape[0] * team * CHUNK):
@@ -105,7 +105,7 @@ def press_substeps(
                     clear_touch(env, part, 1, touch)
                     indent(env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
                     gel_forces(
-                        env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial,
+                        env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,
                         layers, nx, ny,
                     )  # fmt: skip
                 meet(sync, turn, team, 2 * it + 1)
@@ -146,7 +146,6 @@ class PressState:
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._work = np.zeros((len(scenes) * PARTS * SLOTS, LANES), np.float32)
         self._mirror = Mirror()
         self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])
 
@@ -170,7 +169,7 @@ class PressState:
         else:
             run_team(
                 press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
-                self.counts, self._work, self.partial, active=list(drives),
+                self.counts, self.partial, active=list(drives),
             )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from robot.bench.roughness import print_roughness
 from tacsim.interface import Pose
 from tacsim.physics.body_surface import surface_points, tangent_planes
 from tacsim.physics.hybrid import CLEARANCE, HybridWorld
-from tacsim.physics.plasticine import Points, moved_plane
+from tacsim.physics.transfers import Points, moved_plane
 from tacsim.runtime import start, ti
 from tacsim.sampling import body_points
 from tacsim.scene import Body, BodyMaterial, Box, Mesh, Scene, Sphere

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacsim.physics import reference
+from tacsim.physics.element import HOURGLASS
 from tacsim.physics.gel import (
-    HOURGLASS,
     Corners,
     GelState,
     Lattice,
@@ -18,7 +18,7 @@ from tacsim.physics.gel import (
     gel_facts,
     gel_forces,
 )
-from tacsim.physics.lanes import LANES, PARTS, SLOTS, Counts, Facts, Partial, Work
+from tacsim.physics.lanes import PARTS, Counts, Facts, Partial
 from tacsim.physics.layout import BACKING, COUNTS, FACTS, GEL_DAMPING, NUMBERS, SMALLEST_VOLUME, STEP
 from tacsim.runtime import start, ti
 from tacsim.scene import Gel, GelMaterial
@@ -31,14 +31,14 @@ def substep(
     gels: ti.i32, advance: ti.i32,
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    facts: Facts, counts: Counts, work: Work, partial: Partial,
+    facts: Facts, counts: Counts, partial: Partial,
 ):  # fmt: skip
     ti.loop_config(serialize=True)
     for env in range(nodes.shape[0]):
         layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
         for part in range(PARTS):
             gel_forces(
-                env, part, gels, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, work, partial, layers, nx, ny
+                env, part, gels, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny
             )
         for part in range(PARTS * advance):
             gel_advance(env, part, gels, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
@@ -57,10 +57,9 @@ def launch(state: GelState, advance: bool, element: float = 1e-3) -> np.ndarray:
     for index, value in {**facts.facts(), STEP: DT, GEL_DAMPING: DAMPING}.items():
         numbers[:, index] = value
     counts = np.zeros((environments, COUNTS), np.int32)
-    work = np.zeros((environments * PARTS * SLOTS, LANES), np.float32)
     partial = np.full((environments, PARTS, NUMBERS), 1e9, np.float32)
     state.refresh()
-    substep(gels, int(advance), *state.arguments(), numbers, counts, work, partial)
+    substep(gels, int(advance), *state.arguments(), numbers, counts, partial)
     return partial
 
 

@@ -24,6 +24,7 @@ from tacsim.physics.lanes import (
     note_more,
     note_most,
     note_sum,
+    opaque,
     part_range,
     slot_of,
     strip,
@@ -218,7 +219,11 @@ def scatter(
                     qi = w * (sums[drop + APART * 3 * s] + float(i) * sums[drop + APART * (3 * s + 1)])
                     yi = w * sums[drop + APART * (3 * s + 2)]
                     for j in ti.static(range(3)):
-                        add_to(masses, first + i * plane + j * row + s, grid[W_Y + j, lane] * (qi + float(j) * yi))
+                        add_to(
+                            masses,
+                            opaque(never, first + i * plane + j * row + s),
+                            grid[W_Y + j, lane] * (qi + float(j) * yi),
+                        )
     note_more(partial, env, slot_of(part), OFF_GRID, float(lost))
 
 
@@ -228,7 +233,7 @@ def node_sum(env, i, at, masses: ti.template(), counts: ti.template()):
     q = strip(0.0)
     for part in ti.static(range(COPIES)):
         if i >= counts[env, SLAB + 2 * part] and i < counts[env, SLAB + 2 * part + 1]:
-            q += masses[(env * COPIES + part) * counts[env, CAPACITY] + at]
+            q += masses[opaque(counts[env, NEVER], (env * COPIES + part) * counts[env, CAPACITY] + at)]
     return q
 
 
@@ -298,12 +303,14 @@ def gather(
                 here = ti.static(APART * 9 * s)
                 for i in ti.static(range(3)):
                     line = strips[0, lane] + i * plane
-                    v0, v1, v2 = velocities[line + s], velocities[line + row + s], velocities[line + 2 * row + s]
+                    v0, v1 = velocities[opaque(never, line + s)], velocities[opaque(never, line + row + s)]
+                    v2 = velocities[opaque(never, line + 2 * row + s)]
                     sum_y = grid[W_Y, lane] * v0 + grid[W_Y + 1, lane] * v1 + grid[W_Y + 2, lane] * v2
                     anchor(sums, drop + (here + APART * i), sum_y, never)
                 for i in ti.static(range(3)):
                     line = strips[0, lane] + i * plane
-                    v1, v2 = velocities[line + row + s], velocities[line + 2 * row + s]
+                    v1 = velocities[opaque(never, line + row + s)]
+                    v2 = velocities[opaque(never, line + 2 * row + s)]
                     anchor(
                         sums, drop + (here + APART * (3 + i)), grid[D_Y, lane] * v1 + grid[D_Y + 1, lane] * v2, never
                     )

@@ -89,7 +89,8 @@ def contact_ceiling(skin: ti.template(), env, g):
     highest = 0.0
     for i in range(1, skin.shape[3] - 1):
         for j in range(1, skin.shape[4] - 1):
-            highest = ti.max(highest, skin[env, g, 0, i, j][2])
+            height = skin[env, g, 0, i, j][2]
+            highest = ti.select(height > highest, height, highest)
     return highest
 
 

@@ -165,9 +165,12 @@ def touch_gel(
     for p in range(first, last):
         at = points[origin_p + p]
         arm = vec3(at[0], at[1], at[2]) - origin
-        radius = support_radius(planes[origin_p + p], spacing)
+        away = outward.dot(arm) - highest  # most of the body is far away: one dot product decides
+        radius = spacing  # at most
+        if away < 2.5 * spacing:
+            radius = support_radius(planes[origin_p + p], spacing)
         # one radius to touch, half a spacing for what the contact's memory still bridges
-        if outward.dot(arm) < highest + radius + 0.5 * spacing:  # most of the body is far away: one dot product decides
+        if away < radius + 0.5 * spacing:
             local = back @ arm
             moving = rates[origin_p + p, 0]
             relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
@@ -182,7 +185,7 @@ def touch_gel(
                 moment -= local.cross(force)
                 if housed:
                     on_housing -= force
-        else:
+        elif away < 2.5 * spacing:  # nothing passes this margin in one substep, so what is beyond has forgotten
             memory[env, g, p] = vec4(0.0)
     slot = slot_of(part)
     for d in ti.static(range(3)):
@@ -210,6 +213,7 @@ def substeps(
             env = sync[turn, WHO]
             layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
             for it in range(counts[env, STEPS]):
+                highest = ti.Vector([contact_ceiling(skin, env, 0), contact_ceiling(skin, env, 1)])
                 for share in range(shares(member, team)):
                     part = member + share * team
                     partial[env, part, OVERLAP] = 0.0
@@ -217,7 +221,7 @@ def substeps(
                     for g in range(2):
                         touch_gel(
                             env, part, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
-                            contact_ceiling(skin, env, g), layers, nx, ny,
+                            highest[g], layers, nx, ny,
                         )  # fmt: skip
                     clear_masses(env, part, masses, counts)
                     particles_to_grid(env, part, points, rates, strains, masses, sums, facts, counts, partial)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tacsim.physics.element import element_block
+from tacsim.physics.element import ROWS, SMALLEST, element_block
 from tacsim.physics.gel import (
     Corners,
     GelState,
@@ -33,6 +33,7 @@ from tacsim.physics.lanes import (
     Facts,
     Partial,
     empty_strip,
+    least_lane,
     note_least,
     real,
     strip,
@@ -86,29 +87,12 @@ def element(
     axis, row, margin = (layers + 1) * blocks, blocks + ny + 2, ny + 2
     u = margin + gel * 9 * axis + k * blocks + block
     to = margin + (gel * layers + k) * 24 * row + ny + 2 + block
-    ends, smallest = ti.Matrix.zero(ti.f32, 25, LANES), ti.Matrix.zero(ti.f32, 1, LANES) + 1e9
+    rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
+    rows[SMALLEST, 0] = 1e9
     element_block(
-        env,
-        u,
-        axis,
-        blocks,
-        to,
-        row,
-        block,
-        nodes,
-        nodes,
-        nodes,
-        nodes,
-        1,
-        ny + 1,
-        corners,
-        lattice,
-        facts,
-        ends,
-        smallest,
-        0,
+        env, u, axis, blocks, to, row, block, nodes, nodes, nodes, nodes, 1, ny + 1, corners, lattice, facts, rows, 0
     )
-    note_least(partial, env, block % PARTS, SMALLEST_VOLUME, smallest.min())
+    note_least(partial, env, block % PARTS, SMALLEST_VOLUME, least_lane(rows, SMALLEST))
 
 
 @ti.func
@@ -160,18 +144,17 @@ def press_substep(
             column(env, 0, 1, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
 
 
-@ti.kernel
-def hybrid_substep(
-    it: ti.i32, drive: Drive,
-    nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips,
-    memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
-    layers: ti.i32, room: ti.i32, most: ti.i32,
-):  # fmt: skip
-    """One substep of every environment's two gels and body; see `tacsim.physics.hybrid_kernels.substeps`.
+# One kernel may have local arrays in one of its loops only: Taichi 1.7 mixes up the constants of several (IR broken:
+# MatrixPtrStmt cannot have operand ConstStmt). So the substep of a body is three.
 
-    room: particles of the largest body; most: nodes of the largest grid.
-    """
+
+@ti.kernel
+def elements_of_hybrid(
+    it: ti.i32, nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice, masses: Strips,
+    facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most: ti.i32,
+):  # fmt: skip
+    """First third of a substep of every environment's two gels and body (`tacsim.physics.hybrid_kernels.substeps`):
+    what is summed starts from zero; elements pull at their corners. most: nodes of the largest grid."""
     for at in range(counts.shape[0] * PARTS):
         if goes(at // PARTS, it, counts):
             clear_sums(at // PARTS, at % PARTS, partial)
@@ -192,6 +175,20 @@ def hybrid_substep(
         if goes(env, it, counts):
             nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
             element(env, env * 2 + g, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
+
+
+@ti.kernel
+def scatter_of_hybrid(
+    it: ti.i32, drive: Drive,
+    nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips,
+    memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
+    layers: ti.i32, room: ti.i32, most: ti.i32,
+):  # fmt: skip
+    """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
+
+    room: particles of the largest body.
+    """
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
             nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
@@ -215,6 +212,14 @@ def hybrid_substep(
         if goes(at // PARTS, it, counts):
             for d in range(3):
                 partial[at // PARTS, at % PARTS, MOTION + d] = 0.0
+
+
+@ti.kernel
+def gather_of_hybrid(
+    it: ti.i32, points: Points, planes: Points, rates: Rates, strains: Strains, velocities: Strips,
+    facts: Facts, counts: Counts, partial: Partial, room: ti.i32,
+):  # fmt: skip
+    """Last third: the grid back to the particles."""
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
             sums = [empty_strip() for _ in range(SUMS)]
@@ -278,17 +283,29 @@ def run_hybrid(
 ) -> None:  # fmt: skip
     """One launch; the arrays are those of `HybridState`."""
     points, planes, rates, strains, masses, velocities, _ = body.arguments()
-    arguments = (
-        mirror.sent("drive", drive, ti.f32), *mirror.send_gels(gels), mirror.sent("points", points, vec4),
-        mirror.sent("planes", planes, vec4), mirror.sent("rates", rates, vec4), mirror.sent("strains", strains, vec4),
-        mirror.room("masses", strip, masses.shape[:-1]), mirror.room("velocities", strip, velocities.shape[:-1]),
-        mirror.sent("memory", memory, vec4), mirror.sent("facts", facts, ti.f32),
-        mirror.sent("counts", counts, ti.i32), mirror.sent("partial", partial, ti.f32),
-        mirror.room("ceiling", ti.f32, (len(counts), 2)),
+    there = mirror.sent("drive", drive, ti.f32)
+    nodes, skin, touch, corners, lattice = mirror.send_gels(gels)
+    particles = (
+        mirror.sent("points", points, vec4), mirror.sent("planes", planes, vec4), mirror.sent("rates", rates, vec4),
+        mirror.sent("strains", strains, vec4),
     )  # fmt: skip
-    layers, most = gels.nodes.shape[4] - 1, int(counts[:, GRID : GRID + 3].prod(axis=1).max())
+    mass = mirror.room("masses", strip, masses.shape[:-1])
+    velocity = mirror.room("velocities", strip, velocities.shape[:-1])
+    kept = mirror.sent("memory", memory, vec4)
+    numbers = (
+        mirror.sent("facts", facts, ti.f32), mirror.sent("counts", counts, ti.i32),
+        mirror.sent("partial", partial, ti.f32),
+    )  # fmt: skip
+    ceiling = mirror.room("ceiling", ti.f32, (len(counts), 2))
+    layers, room = gels.nodes.shape[4] - 1, body.points.shape[1]
+    most = int(counts[:, GRID : GRID + 3].prod(axis=1).max())
     for it in range(drive.shape[1]):
-        hybrid_substep(it, *arguments, layers, body.points.shape[1], most)
+        elements_of_hybrid(it, nodes, skin, touch, corners, lattice, mass, *numbers, ceiling, layers, most)
+        scatter_of_hybrid(
+            it, there, nodes, skin, touch, corners, lattice, *particles, mass, velocity, kept, *numbers, ceiling,
+            layers, room, most,
+        )  # fmt: skip
+        gather_of_hybrid(it, *particles, velocity, *numbers, room)
     mirror.bring(
         nodes=gels.memory()[0], points=points, planes=planes, rates=rates, strains=strains, memory=memory,
         partial=partial,

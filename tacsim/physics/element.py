@@ -9,6 +9,11 @@ from tacsim.runtime import ti
 HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
 SMALLEST_STRETCH = 0.05  # J below this counts as inverted
 
+# Rows of an element block's own array: displacements of eight corners, axis by axis, then the forces on them;
+WHOLE = 24  # 1 if the element is inside the gel, else 0
+SMALLEST = 25  # det F so far
+ROWS = 26
+
 
 @ti.func
 def fill(rows: ti.template(), row: ti.template(), values):
@@ -21,9 +26,9 @@ def fill(rows: ti.template(), row: ti.template(), values):
 def element_block(
     env, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(),
     sj: ti.template(), si: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(),
-    ends: ti.template(), smallest: ti.template(), never,
+    rows: ti.template(), never,
 ):  # fmt: skip
-    """Forces of LANES elements on their corners; notes the smallest det F of each lane.
+    """Forces of LANES elements on their corners; notes the smallest det F of each lane in row SMALLEST.
 
     u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
     where the forces go, `row` the way to the next corner or axis; sj, si: how much further on nodes across j and i
@@ -33,24 +38,24 @@ def element_block(
     quarter = 0.25 / h
     for d in ti.static(range(3)):
         low, high = u + d * axis, u + d * axis + layer
-        fill(ends, 8 * d, n0[opaque(never, low)])
-        fill(ends, 8 * d + 1, n0[opaque(never, high)])
-        fill(ends, 8 * d + 2, nj[opaque(never, low + sj)])
-        fill(ends, 8 * d + 3, nj[opaque(never, high + sj)])
-        fill(ends, 8 * d + 4, ni[opaque(never, low + si)])
-        fill(ends, 8 * d + 5, ni[opaque(never, high + si)])
-        fill(ends, 8 * d + 6, nij[opaque(never, low + si + sj)])
-        fill(ends, 8 * d + 7, nij[opaque(never, high + si + sj)])
-    fill(ends, 24, lattice[opaque(never, block)])
+        fill(rows, 8 * d, n0[opaque(never, low)])
+        fill(rows, 8 * d + 1, n0[opaque(never, high)])
+        fill(rows, 8 * d + 2, nj[opaque(never, low + sj)])
+        fill(rows, 8 * d + 3, nj[opaque(never, high + sj)])
+        fill(rows, 8 * d + 4, ni[opaque(never, low + si)])
+        fill(rows, 8 * d + 5, ni[opaque(never, high + si)])
+        fill(rows, 8 * d + 6, nij[opaque(never, low + si + sj)])
+        fill(rows, 8 * d + 7, nij[opaque(never, high + si + sj)])
+    fill(rows, WHOLE, lattice[opaque(never, block)])
     for lane in range(LANES):
-        whole = ends[24, lane]
+        whole = rows[WHOLE, lane]
         area, stiffness = (0.25 * h * h) * whole, (HOURGLASS * 2.0 * mu * h / 8.0) * whole
         # columns of F; hourglass forces of the modes s_x s_y, s_y s_z, s_x s_z, s_x s_y s_z
         fx, fy, fz = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0, 0.0, 1.0)
         hxy, hyz, hxz, hxyz = vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0)
         for d in ti.static(range(3)):
-            a, b, c, e = ends[8 * d, lane], ends[8 * d + 1, lane], ends[8 * d + 2, lane], ends[8 * d + 3, lane]
-            p, q, r, s = ends[8 * d + 4, lane], ends[8 * d + 5, lane], ends[8 * d + 6, lane], ends[8 * d + 7, lane]
+            a, b, c, e = rows[8 * d, lane], rows[8 * d + 1, lane], rows[8 * d + 2, lane], rows[8 * d + 3, lane]
+            p, q, r, s = rows[8 * d + 4, lane], rows[8 * d + 5, lane], rows[8 * d + 6, lane], rows[8 * d + 7, lane]
             # sums and differences along z, then y, then x
             az, cz, pz, rz = b + a, e + c, q + p, s + r
             aw, cw, pw, rw = b - a, e - c, q - p, s - r
@@ -68,7 +73,7 @@ def element_block(
         safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
         # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
         pressure = (lam * lanes_log1p(safe - 1.0) - mu) / safe
-        smallest[0, lane] = ti.min(smallest[0, lane], ti.select(whole > 0.0, jacobian, 1.0))
+        rows[SMALLEST, lane] = ti.min(rows[SMALLEST, lane], ti.select(whole > 0.0, jacobian, 1.0))
         for d in ti.static(range(3)):
             px = area * (mu * fx[d] + pressure * x[d])
             py = area * (mu * fy[d] + pressure * y[d])
@@ -80,8 +85,8 @@ def element_block(
             yz = [py + near, py - near, far - py, -far - py]  # 00, 01, 10, 11
             odd = [left - skew_left, left + skew_left, right - skew_right, right + skew_right]
             for k in ti.static(range(4)):
-                ends[3 * k + d, lane] = yz[k] + odd[k]
-                ends[12 + 3 * k + d, lane] = yz[k] - odd[k]
+                rows[3 * k + d, lane] = yz[k] + odd[k]
+                rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
     for r in ti.static(range(24)):
         at = opaque(never, to + r * row)
-        corners[at] = keep_or(never, corners[at], real([ends[r, lane] for lane in range(LANES)]))
+        corners[at] = keep_or(never, corners[at], real([rows[r, lane] for lane in range(LANES)]))

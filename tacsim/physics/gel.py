@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.physics.element import element_block
+from tacsim.physics.element import ROWS, SMALLEST, element_block
 from tacsim.physics.lanes import (
     COPIES,
     LANES,
@@ -18,6 +18,7 @@ from tacsim.physics.lanes import (
     PARTS,
     first_of,
     keep_or,
+    least_lane,
     note_least,
     note_sum,
     opaque,
@@ -251,7 +252,9 @@ def gel_forces(
     row = (blocks + pieces - 1) // pieces + halo  # of corners
     axis = (layers + 1) * blocks
     u, f = (env * gels + g) * 9 * axis, ((env * gels + g) * 9 + 6) * axis
-    ends, smallest = ti.Matrix.zero(ti.f32, 25, LANES), ti.Matrix.zero(ti.f32, 1, LANES) + 1e9
+    rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
+    for lane in range(LANES):
+        rows[SMALLEST, lane] = 1e9
     for k in range(layers + 1):
         here = (2 * (env * PARTS + part) + k % 2) * 24 * row
         before = (2 * (env * PARTS + part) + (k + 1) % 2) * 24 * row
@@ -259,7 +262,7 @@ def gel_forces(
             for block in range(ti.max(first - halo, 0), last):
                 element_block(
                     env, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj, ni,
-                    nij, 0, 0, c0, lattice, facts, ends, smallest, never,
+                    nij, 0, 0, c0, lattice, facts, rows, never,
                 )  # fmt: skip
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for block in range(first, last):
@@ -267,7 +270,7 @@ def gel_forces(
             for d in ti.static(range(3)):
                 to = f + d * axis + k * blocks + block
                 node_block(to, i + d * row, j + d * row, below, above, row, n0, c0, cj, ci, cij, 0, 0, never)
-    note_least(partial, env, part, SMALLEST_VOLUME, smallest.min())
+    note_least(partial, env, part, SMALLEST_VOLUME, least_lane(rows, SMALLEST))
 
 
 @ti.func

@@ -73,6 +73,15 @@ def anchor(work: ti.template(), slot: ti.template(), value, never):
 
 
 @ti.func
+def least_lane(rows: ti.template(), row: ti.template()):
+    """Smallest number of a row of lanes."""
+    least = rows[row, 0]
+    for lane in ti.static(range(1, LANES)):
+        least = ti.min(least, rows[row, lane])
+    return least
+
+
+@ti.func
 def first_of(count, part, parts):
     """Where share `part` of `count` things begins; it ends where the next begins."""
     return count * part // parts

@@ -20,6 +20,7 @@ from tacsim.physics.lanes import (
     anchor,
     copy_of,
     keep_or,
+    least_lane,
     note_least,
     note_more,
     note_most,
@@ -275,10 +276,11 @@ def gather(
     total, fastest = vec4(0.0), vec4(0.0)
     old = ti.Matrix.zero(ti.f32, 12, LANES)  # e, x, plane
     new = ti.Matrix.zero(ti.f32, 9, LANES)  # e, plane
-    rate = ti.Matrix.zero(ti.f32, 9, LANES)  # C
-    smallest = ti.Matrix.zero(ti.f32, 1, LANES) + 1e9
+    rate = ti.Matrix.zero(ti.f32, 10, LANES)  # C; smallest volume after a step so far
     grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
-    strips = ti.Matrix.zero(ti.i32, 1, LANES)
+    whole = ti.Matrix.zero(ti.i32, 2, LANES)  # first strip, off the grid
+    for lane in range(LANES):
+        rate[9, lane] = 1e9
     for block in range((last_p - first_p + LANES - 1) // LANES):
         start = first_p + block * LANES
         for lane in range(LANES):
@@ -293,8 +295,8 @@ def gather(
             as_it_comes(sums, drop, a[0])
         for lane in range(LANES):
             x = vec3(old[6, lane], old[7, lane], old[8, lane])
-            first, _ = stencil(x, origin, scale, low, high, ny, nz, grid, lane)
-            strips[0, lane] = base + first
+            first, off = stencil(x, origin, scale, low, high, ny, nz, grid, lane)
+            whole[0, lane], whole[1, lane] = base + first, off
         for lane in range(ti.min(LANES, last_p - start)):
             p = start + lane
             # Sums over y, then x, then z, for the derivatives with the node's number as a factor; dropped in `sums` on
@@ -302,13 +304,13 @@ def gather(
             for s in ti.static(range(LINE)):
                 here = ti.static(APART * 9 * s)
                 for i in ti.static(range(3)):
-                    line = strips[0, lane] + i * plane
+                    line = whole[0, lane] + i * plane
                     v0, v1 = velocities[opaque(never, line + s)], velocities[opaque(never, line + row + s)]
                     v2 = velocities[opaque(never, line + 2 * row + s)]
                     sum_y = grid[W_Y, lane] * v0 + grid[W_Y + 1, lane] * v1 + grid[W_Y + 2, lane] * v2
                     anchor(sums, drop + (here + APART * i), sum_y, never)
                 for i in ti.static(range(3)):
-                    line = strips[0, lane] + i * plane
+                    line = whole[0, lane] + i * plane
                     v1 = velocities[opaque(never, line + row + s)]
                     v2 = velocities[opaque(never, line + 2 * row + s)]
                     anchor(
@@ -353,7 +355,7 @@ def gather(
             e = convect(vec6([old[d, lane] for d in range(6)]), step)
             plane_ = moved_plane(vec4(old[9, lane], old[10, lane], old[11, lane], 0.0), x, y, z, dt)
             volume = (mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) + step).determinant()
-            smallest[0, lane] = ti.min(smallest[0, lane], volume)
+            rate[9, lane] = ti.min(rate[9, lane], volume)
             for d in ti.static(range(6)):
                 new[d, lane] = e[d]
             for d in ti.static(range(3)):
@@ -363,10 +365,7 @@ def gather(
             strains[2 * p] = vec4(new[0, lane], new[1, lane], new[2, lane], new[3, lane])
             strains[2 * p + 1] = vec4(new[4, lane], new[5, lane], strains[2 * p + 1][2], 0.0)
             planes[p] = vec4(new[6, lane], new[7, lane], new[8, lane], 0.0)
-    least = smallest[0, 0]
-    for lane in ti.static(range(LANES)):
-        least = ti.min(least, smallest[0, lane])
-    note_least(partial, env, slot, SMALLEST_STEP_VOLUME, least)
+    note_least(partial, env, slot, SMALLEST_STEP_VOLUME, least_lane(rate, 9))
     note_most(partial, env, slot, FASTEST, ti.max(fastest[0], fastest[1], fastest[2]))
     for d in ti.static(range(3)):
         note_sum(partial, env, slot, MOTION + d, total[d])

@@ -65,10 +65,9 @@ class Path:
         step = self.step
         for index, (a, b) in enumerate(zip(self.start, self.end, strict=True)):
             position = (a.position + s[:, None] * (b.position - a.position)) * MM
-            turn_from = Rotation.from_quat(a.quaternion)
-            vector = (Rotation.from_quat(b.quaternion) * turn_from.inv()).as_rotvec()
-            # most motions turn nothing
-            turned = Rotation.from_rotvec(s[1:, None] * vector) * turn_from if vector.any() else turn_from
+            vector, turned = _turn(a, b), Rotation.from_quat(a.quaternion)
+            if vector.any():
+                turned = Rotation.from_rotvec(s[1:, None] * vector) * turned
             out[:, index, :3] = turned.as_matrix()
             out[:, index, 3] = position[1:]
             out[:, index, 4] = np.diff(position, axis=0) / step
@@ -82,12 +81,22 @@ class Path:
             if self.substeps
             else "the hold after the motion"
         )
-        ends = self.drive(last - 1, last)[-1].astype(np.float64)
-        poses = {
-            name: Pose(end[3] / MM, Rotation.from_matrix(end[:3]).as_quat())
-            for name, end in zip(names, ends, strict=True)
-        }
+        s = float(ramp(np.clip(last / max(self.substeps, 1), 0.0, 1.0)))
+        poses = {}
+        for name, a, b in zip(names, self.start, self.end, strict=True):
+            vector, quaternion = _turn(a, b), a.quaternion
+            if vector.any():
+                quaternion = (Rotation.from_rotvec(s * vector) * Rotation.from_quat(quaternion)).as_quat()
+            poses[name] = Pose(a.position + s * (b.position - a.position), quaternion)
         return Place(f"in {part}", poses)
+
+
+def _turn(a: Pose, b: Pose) -> NDArray[np.float64]:
+    """Rotation vector from a to b, world axes. Most motions turn nothing, and that is seen at once."""
+    if np.array_equal(a.quaternion, b.quaternion):
+        return np.zeros(3)
+    turn = Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()
+    return np.asarray(turn.as_rotvec(), np.float64)
 
 
 def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:

@@ -139,9 +139,9 @@ def indent(
             at += vec3(middle[0], middle[1], middle[2])
             far, _ = signed_distance(env, kind, size, back @ (at - centre), values, nodes, grid_origin, grid_spacing)
             if far > FAR_CELL * h:
-                if (
-                    far < (FAR_CELL + 1) * h
-                ):  # nothing passes this margin in one substep, so what is beyond has forgotten
+                # Nothing passes this margin in one substep, so what is beyond has forgotten. A mesh's distances end
+                # nearer, and jump there.
+                if far < (FAR_CELL + 1) * h or kind == GRID:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                         slip[env, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
                         pressure[env, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0

@@ -74,6 +74,16 @@ def test_release_takes_all_force_away_and_leaves_the_body_flat() -> None:
     assert w.truth().height < 4.8e-3  # the elastic strain at yield (6 %) springs back, the rest is plastic
 
 
+def test_contact_forgets_what_was_touched_once_it_is_far() -> None:
+    """Memory left behind would pull at the gel in the next touch."""
+    w = world()
+    squeeze(w, 1e-3)
+    w.move(shift(w, "upper", (0.3e-3, 0, 0)))
+    assert w.snapshot()["contact"][1].any()
+    w.move(shift(w, "upper", (0, 0, 6e-3)))
+    assert not w.snapshot()["contact"][1].any()
+
+
 def test_an_off_centre_body_shows_where_it_is_in_both_frames() -> None:
     """Sensors at (-2, +1) mm: the body is at (+2, -1) in the lower, at (+2, +1) in the half-turned upper frame."""
     w = world(settling={"tolerance": 2e-2})

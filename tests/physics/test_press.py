@@ -1,12 +1,14 @@
 """A rigid indenter on one gel: force, friction, frames."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tacsim.interface import Pose
 from tacsim.physics.layer import layer_contact
 from tacsim.physics.press import PressWorld
-from tacsim.scene import Box, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
+from tacsim.scene import Box, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
 
 
 def world(geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, **scene: object) -> PressWorld:
@@ -118,8 +120,6 @@ def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
 
     path = f"{tmp_path}/ball.stl"
     trimesh.creation.icosphere(4, radius=4.0).export(path)
-    from tacsim.scene import Mesh
-
     a, b = world(Sphere(radius=4e-3)), world(Mesh(path=path))
     for w in (a, b):
         move(w, (0, 0, -0.6e-3))
@@ -158,3 +158,22 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     assert set(w.snapshot()) == {
         "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses", "true_inertia",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["closed form", "mesh"])
+def test_contact_forgets_what_it_no_longer_touches(kind: str, tmp_path: Path) -> None:
+    """Memory left behind would pull at the gel in the next touch. A mesh's distances end close to its surface."""
+    box: Shape = Box(size=(6e-3, 6e-3, 4e-3))
+    if kind == "mesh":
+        import trimesh
+
+        trimesh.creation.box((6.0, 6.0, 4.0)).export(tmp_path / "box.stl")
+        box = Mesh(path=str(tmp_path / "box.stl"))
+    w = world(box, tolerance=1e-2, preset="draft")
+    move(w, (0, 0, -0.5e-3))
+    move(w, (2.3e-3, 0, 0))
+    touched = w.snapshot()
+    assert touched["slip"].any() and touched["pressure"].any()
+    move(w, (0, 0, 6e-3))
+    far = w.snapshot()
+    assert not far["slip"].any() and not far["pressure"].any()

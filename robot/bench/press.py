@@ -61,9 +61,9 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
-USUAL = 0.02  # the controller's default peak Mach number: a tenth of the shear wave's speed
+USUAL = 0.03  # the controller's default peak Mach number: a seventh of the shear wave's speed
 # Half of it; this group's own; and half of the shear wave's speed, where contact sticks and slips by inertia.
-OTHERS = (0.01, 0.05, 0.1)
+OTHERS = (0.015, 0.05, 0.1)
 
 
 def profile(world: PressWorld) -> Float64:

@@ -146,7 +146,7 @@ TARGETS: tuple[Target, ...] = (
     Target("... error smaller than at Tacchi's settings", "x", 10, 20, ratio(_peer("error"), _press("error")), True),
     Target(
         "press at two speeds (the default and half of it), difference", "µm at most", 5, 1,
-        pick("error", "quasi_static", "two speeds, Mach 0.02 and 0.01"),
+        pick("error", "quasi_static", "two speeds, Mach 0.03 and 0.015"),
     ),
     Target("3 mm squeeze, not settled, standard", "s", 5, 1.5, _squeeze("seconds", "not settled", _STANDARD)),
     Target("3 mm squeeze, not settled, draft", "s", 0.5, 0.15, _squeeze("seconds", "not settled", _DRAFT)),

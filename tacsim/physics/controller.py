@@ -1,7 +1,9 @@
 """The quasi-static controller: ramped motion of driven frames, then a hold until the measured residual is small.
 
 Materials are rate-independent, so only the path counts. What writes false plastic strain into the body is the jerk at
-start and stop, not the speed; hence every motion starts and ends with zero velocity and zero acceleration.
+start and stop, not the speed; hence every motion starts and ends with zero velocity and zero acceleration. What the
+start writes, the rest of the way mostly forgets; what the stop writes stays. Hence a motion sets off in the time that
+the gel's wave needs and slows down over all the rest (docs/decisions/0002-quasi-static-controller.md).
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from tacsim.physics.world import MoveStats
 from tacsim.scene import Settling
 
 MM = 1e3
-PEAK = 1.875  # peak slope of the quintic ramp over its mean
+PEAK = 1.875  # peak slope of the ramp over its mean
 RAMP = 2.0  # shortest motion, in times of the pressure wave through the gel
 PIECE = 20  # substeps of one launch on the way
 LOOK = 1.0  # time of the hold between two looks at the forces, in the same times
@@ -29,9 +31,18 @@ LOOKS = 2  # earlier looks that a look is compared with: one alone may meet the 
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
-def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quintic 0 -> 1 with zero first and second derivative at both ends (minimum jerk, Flash & Hogan 1985)."""
-    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
+    """0 -> 1 with zero first and second derivative at both ends; the velocity rises until t = `rise`, then falls.
+
+    Each side is half of the quintic of minimum jerk (Flash & Hogan 1985), stretched in time: rise = 0.5 is that quintic.
+    """
+
+    def way(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Integral of the velocity x^2 (2 - x)^2."""
+        return x**3 * (4.0 / 3.0 - x + x * x / 5.0)
+
+    up, down = np.minimum(t / rise, 1.0), np.minimum((1.0 - t) / (1.0 - rise), 1.0)
+    return np.where(t < rise, PEAK * rise * way(up), 1.0 - PEAK * (1.0 - rise) * way(down))
 
 
 @dataclass(frozen=True)
@@ -39,7 +50,7 @@ class Path:
     """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
 
     Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. look: substeps of the hold
-    at its end between two looks at the forces.
+    at its end between two looks at the forces. rise: share of the time in which the velocity rises, of `ramp`.
     """
 
     start: Sequence[Pose]
@@ -48,6 +59,7 @@ class Path:
     dt: float
     refine: int = 1
     look: int = 20
+    rise: float = 0.5
 
     @property
     def step(self) -> float:
@@ -60,7 +72,7 @@ class Path:
         Rows: the rotation matrix, position [mm], velocity, angular velocity; all in world.
         """
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
-        s = ramp(np.clip(knots, 0.0, 1.0))
+        s = ramp(np.clip(knots, 0.0, 1.0), self.rise)
         out = np.empty((len(s) - 1, len(self.start), 6, 3))
         step = self.step
         for index, (a, b) in enumerate(zip(self.start, self.end, strict=True)):
@@ -81,7 +93,7 @@ class Path:
             if self.substeps
             else "the hold after the motion"
         )
-        s = float(ramp(np.clip(last / max(self.substeps, 1), 0.0, 1.0)))
+        s = float(ramp(np.clip(last / max(self.substeps, 1), 0.0, 1.0), self.rise))
         poses = {}
         for name, a, b in zip(names, self.start, self.end, strict=True):
             vector, quaternion = _turn(a, b), a.quaternion
@@ -110,10 +122,13 @@ def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> flo
 
 def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float) -> Path:
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than RAMP gel thicknesses [mm], since a
-    shorter jolt mostly makes the gel ring."""
+    shorter jolt mostly makes the gel ring, and reaches its full speed within half of that."""
+    look = math.ceil(LOOK * thickness / dt)
     length = longest_way(start, end, lever)
-    lasting = max(PEAK * length / mach, RAMP * thickness) if length > 0 else 0.0
-    return Path(start, end, math.ceil(lasting / dt), dt, look=math.ceil(LOOK * thickness / dt))
+    if length == 0:
+        return Path(start, end, 0, dt, look=look)
+    lasting = max(PEAK * length / mach, RAMP * thickness)
+    return Path(start, end, math.ceil(lasting / dt), dt, look=look, rise=RAMP * thickness / 2 / lasting)
 
 
 def force_floor(modulus: float, thickness: float) -> float:

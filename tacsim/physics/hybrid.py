@@ -58,6 +58,7 @@ from tacsim.physics.plasticine import (
     BodyFacts,
     BodyState,
     body_facts,
+    bounds,
 )
 from tacsim.physics.team import run_team
 from tacsim.physics.world import MoveStats, put_back, taken
@@ -69,10 +70,9 @@ from tacsim.shapes import extent, volume
 
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
 COURANT = 0.5
-ZETA_GEL = 1.0  # zeta in alpha = zeta c / thickness
-ZETA_BODY = 0.4  # zeta in rate = zeta c / gel thickness, against the driven affine motion
-# The same while nothing is driven: it stiffens nothing then, and ringing leaves less plastic strain.
-ZETA_HELD = 0.8
+# Damping on the way falsifies the path, since the gels give way and the body spreads; damping of the hold does not.
+ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0  # zeta in alpha = zeta c / thickness, while anything is driven and while held
+ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
 
@@ -177,7 +177,9 @@ class HybridWorld:
             # the step limit.
             LIGHTNESS: max(1.0, height / self._body.spacing),
         }  # fmt: skip
-        held = {BODY_DAMPING: ZETA_HELD / self._gel.thickness}
+        held = {
+            GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
+        }  # fmt: skip
         return Inertia({**self._masses(self._gel.density, self._body.density, step), **damping}, step, held=held)
 
     def _true_inertia(self) -> Inertia:
@@ -311,7 +313,8 @@ class HybridWorld:
         margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
         where = path.place(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
-        require_room(x.min(axis=0) - margin, x.max(axis=0) + margin, self._body.cell, where)
+        low, high = bounds(x)
+        require_room(low - margin, high + margin, self._body.cell, where)
         state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
         good = copies(self._arrays())
         state.facts[index, STEP] = path.step

@@ -38,7 +38,7 @@ from tacsim.physics.gel import (
     one_lattice,
 )
 from tacsim.physics.health import Health, copies, judged, retried
-from tacsim.physics.hybrid import ZETA_GEL, side_by_side
+from tacsim.physics.hybrid import ZETA_GEL_HELD, side_by_side
 from tacsim.physics.hybrid_kernels import Drive
 from tacsim.physics.indenter import (
     BOX,
@@ -194,7 +194,8 @@ class PressWorld:
         self._state, self._index = PressState([scene]) if state is None else state, index
         self._gel = self._state.gel[index]
         step = COURANT * self._gel.spacing
-        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL / self._gel.thickness}, step)
+        # An elastic gel forgets its way, so it is damped on it as in the hold.
+        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness}, step)
         self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         facts = {

@@ -10,14 +10,22 @@ from tacsim.interface import Pose
 from tacsim.physics.controller import PEAK, Reading, plan, ramp, residual
 
 
-def test_ramp_starts_and_ends_at_rest() -> None:
-    t = np.linspace(0, 1, 2001)
-    s = ramp(t)
+@pytest.mark.parametrize("rise", [0.5, 0.1])
+def test_ramp_starts_and_ends_at_rest(rise: float) -> None:
+    t = np.linspace(0, 1, 20001)
+    s = ramp(t, rise)
     speed = np.gradient(s, t)
-    assert (s[0], s[-1]) == (0, 1)
-    assert speed[0] == pytest.approx(0, abs=1e-5) and speed[-1] == pytest.approx(0, abs=1e-5)
-    assert speed.max() == pytest.approx(PEAK, rel=1e-4)
-    assert (np.diff(s) >= 0).all()
+    assert s[0] == 0 and s[-1] == pytest.approx(1, abs=1e-12)
+    assert speed[[0, -1]] == pytest.approx(0, abs=1e-5)
+    assert np.gradient(speed, t)[[0, -1]] == pytest.approx(0, abs=0.05)
+    assert np.abs(np.gradient(speed, t)).max() > 3  # of which that is nothing
+    assert speed.max() == pytest.approx(PEAK, rel=1e-4) and t[speed.argmax()] == pytest.approx(rise, abs=1e-4)
+    assert (np.diff(s) >= -1e-15).all()
+
+
+def test_a_ramp_that_rises_as_long_as_it_falls_is_that_of_minimum_jerk() -> None:
+    t = np.linspace(0, 1, 101)
+    assert ramp(t) == pytest.approx(t**3 * (10 - 15 * t + 6 * t * t), abs=1e-14)
 
 
 def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
@@ -61,3 +69,4 @@ def test_the_shortest_motion_lets_the_gel_follow() -> None:
     assert short.substeps == 20
     far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     assert far.substeps == 94
+    assert short.rise == 0.5 and far.rise * far.substeps * far.dt == pytest.approx(4.0, rel=0.01)

@@ -89,9 +89,9 @@ def markdown(report: Report) -> str:
     parts = [
         "# Benchmarks",
         "Written by `tacsim bench --from FILE --docs docs`; do not edit. Every row is time, error and memory of one "
-        "run, each case in a process of its own, kernels compiled before the clock starts. Seconds are the median of "
-        "wall time ± interquartile range (none with fewer than three repetitions), CPU s the processor time of all "
-        "threads.",
+        "run, kernels compiled before the clock starts; another method and every long case has a process of its own, "
+        "our other cases of a group share one. Seconds are the median of wall time ± interquartile range (none with "
+        "fewer than three repetitions), CPU s the processor time of all threads.",
         setting(report),
         f"![Time against error, by method](images/{PICTURE})",
         "## Figures",

@@ -59,7 +59,7 @@ def bench(
 ) -> None:
     """Measure how fast, how exact and how large: every row is time, error and peak memory of one run.
 
-    Each case runs in a process of its own; compiling is not timed. Exit code 1 if a case failed.
+    Compiling is not timed. Exit code 1 if a case failed.
 
     Group `real` needs --data; `all` leaves it out without. Group `robot` measures what is promised of arms and cameras,
     on mock hardware; it wants an idle machine, so `all` leaves it out.

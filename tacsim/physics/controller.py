@@ -34,7 +34,7 @@ FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than
 def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
     """0 -> 1 with zero first and second derivative at both ends; the velocity rises until t = `rise`, then falls.
 
-    Each side is half of the quintic of minimum jerk (Flash & Hogan 1985), stretched in time: rise = 0.5 is that quintic.
+    Each side is half of the quintic of minimum jerk (Flash & Hogan 1985), stretched in time; rise = 0.5 is that itself.
     """
 
     def way(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
 ROOT = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the flow
+ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
 NEAR_LOG1P, NEAR_LOG, NEAR_EXP = 0.4, 0.5, 0.2  # arguments up to which the series below are exact enough
 
 
@@ -171,8 +172,9 @@ def after_flow(growth, shrink):
 
 
 @ti.func
-def return_near(e, flow, mu, bulk, limit, hardening):
-    """`hencky_return` for elastic strain up to some 0.2, without a branch, so that lanes can do it side by side.
+def strain_near(e):
+    """log J, dev(eps) and J^(-2/3) of b_e = I + e, for elastic strain up to some 0.2, without a branch: lanes can do it
+    side by side.
 
     Returns also 1 where the strain is larger (and all else is wrong), else 0.
     """
@@ -183,6 +185,24 @@ def return_near(e, flow, mu, bulk, limit, hardening):
     shape = volume_preserving(e, shrink)
     strain = 0.5 * log_pade(shape)
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
+    far = ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0) | ti.select(frobenius(shape) > NEAR_LOG, 1, 0)
+    return log_j, strain, shrink, far
+
+
+@ti.func
+def stress_near(e, mu, bulk):
+    """Kirchhoff stress of a body that never yields, as by `hencky_return`; and 1 beyond `strain_near`, else 0."""
+    log_j, strain, _, far = strain_near(e)
+    return plus_identity(2.0 * mu * strain, bulk * log_j), far
+
+
+@ti.func
+def return_near(e, flow, mu, bulk, limit, hardening):
+    """`hencky_return` for elastic strain up to some 0.2, without a branch: see `strain_near`.
+
+    Returns also 1 where the strain is larger (and all else is wrong), else 0.
+    """
+    log_j, strain, shrink, far = strain_near(e)
     norm = frobenius(strain)
     now = limit + hardening * flow
     yields = norm > now
@@ -190,11 +210,7 @@ def return_near(e, flow, mu, bulk, limit, hardening):
     strain *= ti.select(yields, (norm - gamma) / norm, 1.0)
     returned = after_flow(exponential_series(2.0 * strain), shrink)
     elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
-    far = (
-        ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0)
-        | ti.select(frobenius(shape) > NEAR_LOG, 1, 0)
-        | ti.select(2.0 * (norm - gamma) > NEAR_EXP, 1, 0)
-    )
+    far = far | ti.select(2.0 * (norm - gamma) > NEAR_EXP, 1, 0)
     return elastic, flow + ROOT * gamma, plus_identity(2.0 * mu * strain, bulk * log_j), far
 
 

@@ -26,9 +26,8 @@ from tacsim.physics.layout import (
     SLAB,
     STRIDE,
 )
+from tacsim.physics.material import ELASTIC
 from tacsim.scene import BodyMaterial, lame
-
-ELASTIC = 1e9  # strain limit that is never reached
 
 
 @dataclass(frozen=True)

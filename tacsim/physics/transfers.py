@@ -53,7 +53,7 @@ from tacsim.physics.layout import (
     STEP,
     STRIDE,
 )
-from tacsim.physics.material import convect, mat3, return_far, return_near, vec6
+from tacsim.physics.material import ELASTIC, convect, mat3, return_far, return_near, stress_near, vec6
 from tacsim.runtime import ti
 
 # One axis each, environments one after the other: kernels find their way with one number that they have worked out
@@ -180,13 +180,23 @@ def scatter(
         for lane in range(LANES):
             x = vec3(old[7, lane], old[8, lane], old[9, lane])
             first, off = stencil(x, origin, scale, low, high, ny, nz, grid, lane)
-            e = vec6([old[d, lane] for d in range(6)])
-            elastic, flow, tau, far = return_near(e, old[6, lane], mu, bulk, limit, hardening)
-            for d in ti.static(range(6)):
-                new[d, lane] = elastic[d]
-                new[7 + d, lane] = tau[d]
-            new[6, lane] = flow
-            whole[0, lane], whole[1, lane], whole[2, lane] = ti.select(off == 0, base + first, dump), off, far
+            whole[0, lane], whole[1, lane] = ti.select(off == 0, base + first, dump), off
+        if limit < ELASTIC:
+            for lane in range(LANES):
+                e = vec6([old[d, lane] for d in range(6)])
+                elastic, flow, tau, far = return_near(e, old[6, lane], mu, bulk, limit, hardening)
+                for d in ti.static(range(6)):
+                    new[d, lane] = elastic[d]
+                    new[7 + d, lane] = tau[d]
+                new[6, lane], whole[2, lane] = flow, far
+        else:  # a body that never yields: no return mapping
+            for lane in range(LANES):
+                e = vec6([old[d, lane] for d in range(6)])
+                tau, far = stress_near(e, mu, bulk)
+                for d in ti.static(range(6)):
+                    new[d, lane] = e[d]
+                    new[7 + d, lane] = tau[d]
+                new[6, lane], whole[2, lane] = old[6, lane], far
         for lane in range(ti.min(LANES, last_p - start)):
             p = start + lane
             lost += whole[1, lane]

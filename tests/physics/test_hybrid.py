@@ -65,6 +65,20 @@ def test_squeezing_is_symmetric(squeezed: HybridWorld) -> None:
     assert np.abs(truth.position[:2]).max() < 1e-6
 
 
+def test_a_body_without_yield_answers_like_one_that_never_reaches_it() -> None:
+    """The first runs no return mapping, the second does."""
+    states, forces = [], []
+    for material in (BodyMaterial(), BodyMaterial(yield_stress=1e12)):
+        w = world(CUBE.model_copy(update={"material": material}))
+        squeeze(w, 1.0e-3)
+        states.append(w.snapshot())
+        forces.append(w.wrench("lower")[2])
+    assert forces[0] == pytest.approx(forces[1], rel=1e-4)
+    assert states[0]["strain"] == pytest.approx(states[1]["strain"], abs=1e-4)
+    assert np.abs(states[0]["strain"]).max() > 0.1
+    assert not states[0]["flow"].any() and not states[1]["flow"].any()
+
+
 def test_release_takes_all_force_away_and_leaves_the_body_flat() -> None:
     w = world()
     squeeze(w, 1.4e-3)

@@ -82,9 +82,11 @@ def press(
     sensor = load_sensor("ideal")
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
         from robot import press as presses
+        from tacsim.physics.dump import dumps_in
 
         motion = presses.Press(depth, slide, twist)
-        pressed = presses.press(scene, sensor, motion)
+        with dumps_in(folder / "diverged"):
+            pressed = presses.press(scene, sensor, motion)
     facts = presses.facts_of(scene, motion, pressed, sensor)
     with writing(make(folder)):
         presses.write(folder, pressed, facts)

@@ -166,6 +166,13 @@ def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:
     assert deep[:, 1].mean() == pytest.approx(159.5 + 0.5 / 0.0625, abs=3)  # +x is to the right, where the box went
 
 
+def test_a_press_that_diverges_leaves_what_debug_reads(tmp_path: Path) -> None:
+    result = tacsim("press", "box", "--size", "5 mm, 5 mm, 5 mm", "--depth", "3.9 mm", "--preset=draft", "--out=p")
+    assert result.exit_code == 1
+    assert "tacsim debug p/diverged/00" in " ".join(result.output.split())
+    assert (tmp_path / "p" / "diverged" / "00" / "state.npz").is_file()
+
+
 def test_run_makes_exactly_its_steps_and_replay_shows_them_again(tmp_path: Path) -> None:
     result = tacsim("run", "--steps", "3", "--seed", "5", "--out", "r", *TINY)
     assert result.exit_code == 0, result.output

@@ -79,10 +79,13 @@ def _check_sizes(dump: Dump) -> None:
 
 
 def replay(dump: Dump, world: World) -> Replay:
-    """Runs the motion again, with all its retries; leaves `world` in the state before it, or in the new one."""
+    """Runs the motion again, with all its retries; leaves `world` in the state before it, or in the new one.
+
+    Raises LoadNotReached (tacsim.physics.load) if it gets further this time, and a load it holds is out of reach.
+    """
     with no_dumps():
         try:
-            return Replay(None, world.move(dump.targets, duration=dump.facts.duration), False)
+            return Replay(None, world.move(dump.targets, dump.facts.loads, dump.facts.duration), False)
         except SimulationDiverged as failure:
             same = (failure.cause, failure.where) == (dump.facts.cause, dump.facts.where)
             for moment, state in (("good", failure.good), ("failed", failure.failed)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import logging
 import warnings
@@ -33,18 +34,30 @@ _REPAIR = (
 )
 
 
-def load_mesh(path: str | Path, scale: float) -> Trimesh:
+def fingerprint(path: str | Path) -> str:
+    """SHA-256 of an STL file's bytes as they are now, by which to remember what was made of them.
+
+    Raises FileNotFoundError; ValueError for what is no file, is not named .stl, is empty or larger than 64 MiB.
+    """
+    return hashlib.sha256(_read(Path(path))).hexdigest()
+
+
+def load_mesh(path: str | Path, scale: float, expected: str | None = None) -> Trimesh:
     """The closed mesh of an STL file (binary or text), vertices times `scale` [m per file unit].
 
     Triangles that face inwards all together are turned round. Surfaces that cut through themselves are not detected.
 
     Raises FileNotFoundError; ValueError for a file that is no STL, is larger than 64 MiB or 500,000 triangles, is
-    truncated, or whose mesh is empty, not closed, degenerate, not finite or of absurd size.
+    truncated, whose fingerprint is not the one `expected`, or whose mesh is empty, not closed, degenerate, not finite
+    or of absurd size.
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"{path}: scale must be a positive number [m per file unit], got {scale}")
-    mesh = _decode(_read(path), path)
+    data = _read(path)
+    if expected is not None and hashlib.sha256(data).hexdigest() != expected:
+        raise ValueError(f"{path}: the file was changed while it was read; try again")
+    mesh = _decode(data, path)
     _check(mesh, scale, path)
     mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
     if mesh.volume < 0:

@@ -5,13 +5,22 @@ Everything here is in the shape's own frame: axes as in the scene, origin at the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tacsim.mesh import (
+    away_from_surface,
+    fingerprint,
+    load_mesh,
+    make_surface,
+    signed_distance,
+    signed_distance_on_grid,
+)
 from tacsim.scene import Box, Cylinder, Mesh, Shape, Sphere
 
 if TYPE_CHECKING:
@@ -23,6 +32,7 @@ MAX_PARTICLES = 5_000_000
 MAX_NODES = 20_000_000
 MAX_MISFIT = 0.1  # how far the lattice of particles may miss the size or the volume of a shape, relative
 BAND = 2  # grid spacings round a mesh in which the distance is exact
+REMEMBERED = 8  # distance grids of meshes in one process, the latest used; most have 1 to 10 MB
 
 
 def extent(geometry: Shape) -> FloatArray:
@@ -35,7 +45,7 @@ def extent(geometry: Shape) -> FloatArray:
         case Cylinder():
             return np.array([2 * geometry.radius, 2 * geometry.radius, geometry.height])
         case Mesh():
-            return np.array(_centred(geometry).extents, dtype=np.float64)
+            return np.array(_mesh_extent(geometry, fingerprint(geometry.path)))
 
 
 def volume(geometry: Shape) -> float:
@@ -127,8 +137,6 @@ def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
             radial = np.hypot(at[:, 0], at[:, 1]) - geometry.radius
             return _outside_and_inside(np.stack([radial, np.abs(at[:, 2]) - geometry.height / 2], axis=1))
         case Mesh():
-            from tacsim.mesh import make_surface, signed_distance
-
             return signed_distance(make_surface(_centred(geometry)), at)
 
 
@@ -140,8 +148,6 @@ def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
     """
     at = np.asarray(points, dtype=np.float64)
     if isinstance(geometry, Mesh):
-        from tacsim.mesh import away_from_surface, make_surface
-
         return away_from_surface(make_surface(_centred(geometry)), at)
     step = 1e-6 * float(extent(geometry).max())
     sides = [distance(geometry, at + d) - distance(geometry, at - d) for d in step * np.eye(3)]
@@ -184,12 +190,18 @@ def distance_grid(geometry: Shape, spacing: float, box: tuple[ArrayLike, ArrayLi
     sign is right and the value never too small, see :func:`tacsim.mesh.signed_distance_on_grid`. Interpolation adds
     up to 3/8 spacing^2 / R at a surface of radius R, and a fraction of the spacing at sharp edges.
 
-    Raises ValueError on a bad spacing or box, or more than 20,000,000 nodes.
+    The grid of a mesh takes a second or more, so the process remembers the latest: asked again for the same nodes round
+    the same bytes of the same file, it gives the same object, whose arrays are read-only.
+
+    Raises ValueError on a bad spacing or box, or more than 20,000,000 nodes; and what :func:`tacsim.mesh.load_mesh`
+    raises.
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise ValueError(f"grid spacing must be a positive length [m], got {spacing}")
-    half = extent(geometry) / 2 + 2 * spacing
-    lower, upper = (-half, half) if box is None else (np.array(corner, dtype=np.float64) for corner in box)
+    if box is None:
+        half = extent(geometry) / 2 + 2 * spacing
+        box = (-half, half)
+    lower, upper = (np.array(corner, dtype=np.float64) for corner in box)
     if lower.shape != (3,) or upper.shape != (3,) or not (np.isfinite([lower, upper]).all() and (upper > lower).all()):
         raise ValueError(f"box must be (lower, upper) corners of 3 finite numbers [m], lower < upper; got {box}")
     nodes = np.ceil((upper - lower) / spacing - 1e-9) + 1
@@ -198,13 +210,20 @@ def distance_grid(geometry: Shape, spacing: float, box: tuple[ArrayLike, ArrayLi
             f"a distance grid of {_name(geometry)} at {_mm(spacing)} would have {nodes.prod():,.0f} nodes, the limit "
             f"is {MAX_NODES:,}; use a larger spacing, or a box round the tip that can touch"
         )
-    x, y, z = (start + spacing * np.arange(int(n)) for start, n in zip(lower, nodes, strict=True))
+    counts = nodes.astype(int)
     if isinstance(geometry, Mesh):
-        values = _mesh_on_grid(geometry, (x, y, z), band=BAND * spacing)
-    else:
-        points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
-        values = distance(geometry, points.reshape(-1, 3)).reshape(points.shape[:3])
+        return _mesh_grid(geometry, fingerprint(geometry.path), tuple(lower), tuple(counts), spacing)
+    points = np.stack(np.meshgrid(*_axes(lower, counts, spacing), indexing="ij"), axis=-1)
+    values = distance(geometry, points.reshape(-1, 3)).reshape(points.shape[:3])
     return DistanceGrid(values=values.astype(np.float32), origin=lower, spacing=spacing)
+
+
+def _axes(lower: Iterable[float], counts: Iterable[int], spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates [m] of the nodes of a grid: `counts` (3,) of them from the corner `lower` (3,) [m] on."""
+    x, y, z = (
+        np.float64(start) + spacing * np.arange(n, dtype=np.float64) for start, n in zip(lower, counts, strict=True)
+    )
+    return x, y, z
 
 
 def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -229,18 +248,35 @@ def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArra
     return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
 
 
-def _centred(geometry: Mesh) -> Trimesh:
-    from tacsim.mesh import load_mesh
-
-    mesh = load_mesh(geometry.path, geometry.scale)
+def _centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
+    """`expected`: fingerprint of the file, where what is made of it will be remembered by it."""
+    mesh = load_mesh(geometry.path, geometry.scale, expected)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     return mesh
 
 
-def _mesh_on_grid(geometry: Mesh, axes: tuple[FloatArray, FloatArray, FloatArray], band: float) -> FloatArray:
-    from tacsim.mesh import make_surface, signed_distance_on_grid
+def _mesh_on_grid(
+    geometry: Mesh, axes: tuple[FloatArray, FloatArray, FloatArray], band: float, expected: str | None = None
+) -> FloatArray:
+    return signed_distance_on_grid(make_surface(_centred(geometry, expected)), axes, band)
 
-    return signed_distance_on_grid(make_surface(_centred(geometry)), axes, band)
+
+@lru_cache(maxsize=64)
+def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
+    """Size of the bounding box (3,) [m]. content: fingerprint of the file."""
+    return tuple(float(side) for side in _centred(geometry, content).extents)
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _mesh_grid(
+    geometry: Mesh, content: str, lower: tuple[float, ...], counts: tuple[int, ...], spacing: float
+) -> DistanceGrid:
+    """`counts` (3,) nodes from the corner `lower` (3,) [m] on; read-only, for it is shared. content: see above."""
+    values = _mesh_on_grid(geometry, _axes(lower, counts, spacing), BAND * spacing, content).astype(np.float32)
+    origin = np.array(lower)
+    for array in (values, origin):
+        array.setflags(write=False)
+    return DistanceGrid(values, origin, spacing)
 
 
 def _name(geometry: Shape) -> str:

@@ -1,6 +1,6 @@
 """Dumps of diverged motions: what is needed to look into one, and to run it again.
 
-A dump is a folder: `dump.json` (scene, poses, targets, cause, versions) and `state.npz`, whose arrays are named
+A dump is a folder: `dump.json` (scene, poses, targets, loads, cause, versions) and `state.npz`, whose arrays are named
 `before.*` (before the motion), `good.*` and `failed.*` (at the start and end of the launch that went wrong). A body or
 indenter from an STL file brings that file along. Nothing in a dump is executed; what is read is checked for its size.
 """
@@ -62,6 +62,7 @@ class DumpFacts(Facts):
     scene: Scene
     poses: dict[str, Numbers7]  # before the motion
     targets: dict[str, Numbers7]  # asked for
+    loads: dict[str, float] = {}  # held by sensors [N]; dumps of older versions say nothing of them
     duration: float | None = None  # of a dynamic motion [s]
     failed_poses: dict[str, Numbers7]  # at the end of the launch that went wrong; empty if there was none
     health: dict[str, str]  # what the kernels saw in the last launch
@@ -120,12 +121,13 @@ def write(
     targets: Poses,
     before: State,
     failure: SimulationDiverged,
+    loads: Mapping[str, float],
     duration: float | None = None,
 ) -> Path:
     """Writes a dump into a new folder below `folder` and returns it.
 
-    poses: of the driven frames before the motion; before: the state then. Raises OSError, DumpError when there are
-    MOST_DUMPS already.
+    poses: of the driven frames before the motion; before: the state then; loads: held by sensors [N]; duration: of a
+    dynamic motion [s]. Raises OSError, DumpError when there are MOST_DUMPS already.
     """
     place = _new(folder)
     scene, mesh = _with_mesh(scene, MESH)
@@ -141,6 +143,7 @@ def write(
         scene=scene,
         poses={name: _numbers(pose) for name, pose in poses.items()},
         targets={name: _numbers(pose) for name, pose in targets.items()},
+        loads=dict(loads),
         duration=duration,
         failed_poses={name: _numbers(pose) for name, pose in failure.poses.items()},
         health={} if failure.health is None else {k: f"{v:.9g}" for k, v in asdict(failure.health).items()},

@@ -171,11 +171,12 @@ def retried(
     world: Driven,
     targets: Mapping[str, Pose],
     motion: Callable[[int], Generator[Wanted, Seen, MoveStats]],
+    loads: Mapping[str, float] | None = None,
     duration: float | None = None,
 ) -> Generator[Wanted, Seen, MoveStats]:
     """The motion `motion(refine)`, which drives `world` to `targets` with 1/refine of its step; refine = 1, 2, 4.
 
-    duration: of a dynamic motion [s], for the dump.
+    loads: held by sensors [N]; duration: of a dynamic motion [s]; both for the dump, which is replayed with them.
 
     Whoever runs it throws in the SimulationDiverged of a launch; the world then rolls back by itself and yields the
     first launch of the next try. After every failure, an interruption included, the world is as it was before. Raises
@@ -200,7 +201,7 @@ def retried(
                 world.restore(before)
                 raise
     failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, world.scene.gel.size)
-    _dump(world, targets, duration, before, failure)
+    _dump(world, targets, loads or {}, duration, before, failure)
     raise failure
 
 
@@ -225,7 +226,12 @@ def _poses(world: Driven) -> dict[str, Pose]:
 
 
 def _dump(
-    world: Driven, targets: Mapping[str, Pose], duration: float | None, before: State, failure: SimulationDiverged
+    world: Driven,
+    targets: Mapping[str, Pose],
+    loads: Mapping[str, float],
+    duration: float | None,
+    before: State,
+    failure: SimulationDiverged,
 ) -> None:
     """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
     folder = os.environ.get("TACSIM_DUMPS")
@@ -234,7 +240,7 @@ def _dump(
     from tacsim.physics import dump
 
     try:
-        failure.dump = dump.write(Path(folder), world.scene, _poses(world), targets, before, failure, duration)
+        failure.dump = dump.write(Path(folder), world.scene, _poses(world), targets, before, failure, loads, duration)
     except (OSError, ValueError) as error:
         failure.no_dump = f"no dump could be written to {folder}: {error}"
 

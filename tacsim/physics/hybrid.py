@@ -288,7 +288,7 @@ class HybridWorld:
             path = replace(self.plan(a, b), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = yield from retried(self, targets, tried, duration)
+        stats = yield from retried(self, targets, tried, loads, duration)
         self._poses = end
         return stats
 

@@ -204,7 +204,7 @@ class SeedWorld:
             path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = yield from retried(self, targets, tried)
+        stats = yield from retried(self, targets, tried, loads)
         self._poses = end
         return stats
 

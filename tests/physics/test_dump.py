@@ -94,6 +94,12 @@ def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
         }, moment
 
 
+def test_a_dump_written_before_loads_were_has_none(copied: Path) -> None:
+    assert read(copied).facts.loads == {}
+    edit(copied, lambda d: d.pop("loads"))
+    assert read(copied).facts.loads == {}
+
+
 def test_an_stl_file_comes_along(tmp_path: Path) -> None:
     import trimesh
 

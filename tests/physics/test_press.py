@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tacsim import shapes
 from tacsim.interface import Pose
 from tacsim.physics.layer import layer_contact
 from tacsim.physics.press import PressWorld
@@ -125,6 +126,37 @@ def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
         move(w, (0, 0, -0.6e-3))
     assert b.wrench("lower")[2] == pytest.approx(a.wrench("lower")[2], rel=0.03)
     assert np.abs(a.surface("lower").displacement - b.surface("lower").displacement).max() < 10e-6
+
+
+def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So it is ready in milliseconds, and a rewritten file is still seen."""
+    import trimesh
+
+    def write(radius: float) -> Mesh:
+        trimesh.creation.icosphere(2, radius=radius).export(tmp_path / "ball.stl")
+        return Mesh(path=str(tmp_path / "ball.stl"))
+
+    computed: list[str] = []
+
+    def count(name: str) -> None:
+        real = getattr(shapes, name)
+        monkeypatch.setattr(shapes, name, lambda *given: (computed.append(name), real(*given))[1])
+
+    count("load_mesh")
+    count("signed_distance_on_grid")
+    first = world(write(3.0))
+    assert computed.count("signed_distance_on_grid") == 1
+    computed.clear()
+    second = world(write(3.0))
+    assert computed == []
+    for w in (first, second):
+        move(w, (0, 0, -0.4e-3))
+    assert first.wrench("lower")[2] < -0.01 and first.wrench("lower").tobytes() == second.wrench("lower").tobytes()
+    third = world(write(2.0))
+    assert computed.count("signed_distance_on_grid") == 1
+    assert third.pose("indenter").position[2] == pytest.approx(2.1e-3, rel=0.01)
 
 
 @pytest.mark.cpu

@@ -62,6 +62,20 @@ def test_a_dump_is_shown_drawn_and_replayed(physics: str, tmp_path: Path, monkey
     assert tacsim("debug", place, "--no-replay").exit_code == 0
 
 
+@pytest.mark.parametrize("physics", SCENES)
+def test_a_motion_at_constant_load_is_replayed_with_its_load(
+    physics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = make_world(SCENES[physics])
+    loads = {world.sensors[-1]: 0.3}
+    monkeypatch.setattr(health, "FASTEST", 1e-4)
+    with dumps_in(tmp_path), pytest.raises(SimulationDiverged):
+        world.move({}, loads)
+    dump = read(tmp_path / "00")
+    assert dump.facts.loads == loads and dump.targets == {}
+    assert debug.replay(dump, debug.open_world(dump)).identical
+
+
 def test_the_table_tells_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dump = read(diverge(SCENES["hybrid"], tmp_path, monkeypatch))
     dump.states["failed"]["velocity"][:3] = np.nan

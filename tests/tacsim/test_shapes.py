@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import pytest
 import trimesh
 
 from tacsim import shapes
+from tacsim.mesh import Axes, Surface, fingerprint, load_mesh, signed_distance_on_grid
 from tacsim.scene import Box, Cylinder, Mesh, Shape, Sphere
 from tacsim.shapes import distance, distance_grid, extent, particles, sample, volume
 
@@ -248,6 +250,58 @@ def test_a_fine_stl_is_gridded_within_seconds(tmp_path: Path) -> None:
     assert tip.values.shape == (81, 81, 23)
     value, _ = sample(tip, [[0.0, 0.0, -4.1 * MM], [0.0, 0.0, -3.5 * MM]])
     assert value == pytest.approx([0.1 * MM, -0.5 * MM], abs=2e-5)
+
+
+@pytest.fixture
+def gridded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Nodes of each mesh grid that was computed."""
+    nodes = []
+
+    def counted(surface: Surface, axes: Axes, band: float) -> np.ndarray:
+        values = signed_distance_on_grid(surface, axes, band)
+        nodes.append(values.size)
+        return values
+
+    monkeypatch.setattr(shapes, "signed_distance_on_grid", counted)
+    return nodes
+
+
+def test_a_mesh_is_gridded_once_and_its_grid_is_read_only(tmp_path: Path, gridded: list[int]) -> None:
+    geometry, low, high = stl(tmp_path, wedge()), (-4 * MM, -4 * MM, -2 * MM), (4 * MM, 4 * MM, 2 * MM)
+    grid = distance_grid(geometry, 0.5 * MM, (low, high))
+    assert distance_grid(Mesh(path=geometry.path), 0.5 * MM, (list(low), np.array(high))) is grid
+    assert gridded == [17 * 17 * 9]
+    for array in (grid.values, grid.origin):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    others = [
+        distance_grid(geometry, 0.4 * MM, (low, high)),
+        distance_grid(geometry, 0.5 * MM, (low, (5 * MM, *high[1:]))),
+        distance_grid(geometry, 0.5 * MM, ((-5 * MM, *low[1:]), high)),
+        distance_grid(geometry.model_copy(update={"scale": 0.9 * MM}), 0.5 * MM, (low, high)),
+    ]
+    assert len(gridded) == 5 and len({id(each) for each in (grid, *others)}) == 5
+
+
+def test_a_rewritten_file_gives_a_new_grid(tmp_path: Path, gridded: list[int]) -> None:
+    """Even with the size and the times of the old one."""
+    geometry = stl(tmp_path, trimesh.creation.icosphere(2, 3.0))
+    path, grid = Path(geometry.path), distance_grid(geometry, 0.5 * MM)
+    old = path.stat()
+    stl(tmp_path, trimesh.creation.icosphere(2, 2.0))
+    os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (old.st_size, old.st_mtime_ns)
+    assert extent(geometry) == pytest.approx(4 * MM, rel=0.05)
+    assert distance_grid(geometry, 0.5 * MM).values.min() == pytest.approx(-2 * MM, rel=0.05)
+    assert grid.values.min() == pytest.approx(-3 * MM, rel=0.05) and len(gridded) == 2
+
+
+def test_a_file_changed_between_two_looks_is_not_taken_for_the_old_one(tmp_path: Path) -> None:
+    geometry = stl(tmp_path, wedge())
+    before = fingerprint(geometry.path)
+    stl(tmp_path, ell())
+    with pytest.raises(ValueError, match=r"part\.stl: the file was changed while it was read"):
+        load_mesh(geometry.path, geometry.scale, before)
 
 
 def test_bad_grids_are_refused(tmp_path: Path) -> None:

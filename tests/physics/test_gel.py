@@ -48,10 +48,10 @@ GEL = Gel(size=(6e-3, 5e-3, 4e-3), material=GelMaterial(poisson_ratio=0.48))
 DT, DAMPING = 0.3, 0.2
 
 
-def launch(state: GelState, advance: bool, element: float = 1e-3) -> np.ndarray:
+def launch(state: GelState, advance: bool, element: float = 1e-3, gel: Gel = GEL) -> np.ndarray:
     """One substep, or its forces alone; (environments, PARTS, numbers) that it noted."""
     start()
-    facts = gel_facts(GEL, element)
+    facts = gel_facts(gel, element)
     environments, gels = state.u.shape[:2]
     numbers = np.zeros((environments, FACTS), np.float32)
     for index, value in {**facts.facts(), STEP: DT, GEL_DAMPING: DAMPING}.items():
@@ -144,6 +144,49 @@ def test_confined_compression(stretch: float) -> None:
     stress = facts.mu * (stretch - 1 / stretch) + facts.lam * np.log(stretch) / stretch
     assert -f[:, :, -1, 2].sum() == pytest.approx(stress * area, rel=1e-5)
     assert f[:, :, 0, 2].sum() == pytest.approx(stress * area, rel=1e-5)
+
+
+WAVES = np.array([[0.4, 0.3, -0.35], [-0.3, 0.45, 0.25], [0.35, -0.25, 0.4]])  # [1/mm], of u_x, u_y, u_z
+PHASES, HEIGHT = np.array([0.3, 1.1, -0.7]), 0.25  # [mm]
+
+
+def waves(x: np.ndarray) -> np.ndarray:
+    return HEIGHT * np.sin(x @ WAVES.T + PHASES)
+
+
+def divergence_of_stress(x: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Div P at x (..., 3), where the gel is displaced by `waves`; by differences of fourth order of the exact P."""
+
+    def stress(x: np.ndarray) -> np.ndarray:
+        slope = HEIGHT * np.cos(x @ WAVES.T + PHASES)
+        return reference.neo_hookean(np.eye(3) + slope[..., None] * WAVES, mu, lam)
+
+    step, total = 1e-3, np.zeros_like(x)
+    for axis, way in enumerate(step * np.eye(3)):
+        near, far = stress(x + way) - stress(x - way), stress(x + 2 * way) - stress(x - 2 * way)
+        total += ((8 * near - far) / (12 * step))[..., axis]
+    return total
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.48])
+def test_forces_in_a_smooth_field_converge_at_second_order(nu: float) -> None:
+    """Nodal force over nodal volume is the divergence of the first Piola stress, at finite strain; hourglass stiffness
+    vanishes at the same order: it weighs most where the Poisson ratio is 0."""
+    gel, errors = Gel(size=(8e-3, 8e-3, 6e-3), material=GelMaterial(poisson_ratio=nu)), []
+    for element in (1e-3, 0.5e-3, 0.25e-3):
+        facts = gel_facts(gel, element)
+        x = np.stack(np.meshgrid(*[np.arange(n + 1.0) for n in facts.elements], indexing="ij"), -1) * facts.spacing
+        state = GelState(facts, 1, 1)
+        state.u[0, 0] = waves(x)
+        launch(state, False, element, gel)
+        every = round(1e-3 / element)  # the nodes that all three have
+        inside = (slice(every, -every, every),) * 3
+        truth = divergence_of_stress(x[inside], facts.mu, facts.lam)
+        error = state.f[0, 0][inside] / facts.spacing**3 - truth
+        errors.append(np.sqrt((error**2).mean() / (truth**2).mean()))
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert orders == pytest.approx(2.0, abs=0.1)
+    assert errors[-1] < 0.01
 
 
 def test_hourglass_modes_are_resisted_and_linear_fields_are_not() -> None:

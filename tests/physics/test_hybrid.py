@@ -4,6 +4,7 @@ import contextlib
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
 from tacsim.physics import hybrid
@@ -143,6 +144,47 @@ def test_a_twist_is_felt_by_both_sensors() -> None:
     )  # about world z, after the half-turn
     assert w.wrench("lower")[5] > 1e-5  # dragged along, world +z = its own +z
     assert w.wrench("upper")[5] == pytest.approx(w.wrench("lower")[5], rel=0.1)  # its z points down: same sign
+
+
+def tilt(w: HybridWorld, level: Pose, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """The upper sensor turned about world y, its origin where it was; both wrenches in world axes, about its origin."""
+    turn = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_quat(level.quaternion)
+    stats = w.move({"upper": Pose(level.position, turn.as_quat())})
+    assert stats.settled and stats.guard_hits == 0 and stats.overlap < 5e-6, stats
+    wrenches = []
+    for name in ("lower", "upper"):
+        pose, wrench = w.pose(name), w.wrench(name)
+        force, moment = Rotation.from_quat(pose.quaternion).apply(wrench.reshape(2, 3))
+        wrenches.append(np.concatenate([force, moment + np.cross(pose.position, force)]))
+    return wrenches[0], wrenches[1]
+
+
+def test_a_tilted_sensor_presses_on_the_side_to_which_it_leans() -> None:
+    w = world()
+    squeeze(w, 1e-3)
+    level, before = w.pose("upper"), w.snapshot()
+    pressed = -w.wrench("lower")[2]
+    scale = pressed * np.repeat([1.0, 3e-3], 3)  # half an edge of the cube as lever
+    lower, upper = tilt(w, level, 5.0)
+    assert np.abs((lower + upper) / scale).max() < 2e-3
+    # turned about +y, the sensor comes down at +x: pressure moves there, in both frames (x is the same, z is not)
+    for name, least in (("lower", 0.05e-3), ("upper", 0.3e-3)):
+        wrench = w.wrench(name)
+        assert -wrench[4] / wrench[2] > least, name
+        assert np.abs(wrench[[1, 3, 5]] / scale[[1, 3, 5]]).max() < 1e-3  # the plane y = 0 is a mirror
+    assert lower[0] < -0.05 * pressed  # and pushes the body away from there
+    lower, upper = tilt(w, level, 0.0)
+    assert -w.wrench("lower")[2] == pytest.approx(pressed, rel=0.1)  # clay has yielded a little
+    assert np.abs((lower + upper) / scale).max() < 2e-3
+    assert np.abs([lower[:2], upper[:2]]).max() < 0.02 * pressed
+    w.restore(before)
+    tilt(w, level, 5.0)
+    there = [w.wrench(name) for name in w.sensors]
+    w.restore(before)
+    tilt(w, level, -5.0)
+    mirror = np.array([-1, 1, 1, 1, -1, -1])
+    for name, wrench in zip(w.sensors, there, strict=True):
+        assert np.abs((w.wrench(name) - mirror * wrench) / scale).max() < 1e-3, name
 
 
 @pytest.mark.cpu

@@ -48,6 +48,31 @@ def test_a_gel_shakes_at_its_quarter_wave() -> None:
     assert abs(world.surface("lower").displacement[24, 24, 0]) < 2e-6
 
 
+def test_the_period_of_a_gel_converges_at_second_order_in_element_and_step() -> None:
+    """The quarter wave again, of a gel without a Poisson ratio: nothing from the rims reaches its middle in the first
+    three quarters of the period. u = a cos(w t + phase), whose phase, half a substep, the second quarter cancels."""
+    material = GelMaterial(poisson_ratio=0.0)
+    gel = Gel(size=(40e-3, 4e-3, 4e-3), material=material)
+    quarter, height, errors = 4e-3 / np.sqrt(material.youngs_modulus / 2 / material.density), 10e-6, []
+    for element in (1e-3, 0.5e-3, 0.25e-3):
+        world = PressWorld(Scene(body=None, indenter=Indenter(), gel=gel, element_size=element))
+        state = dict(world.snapshot())
+        shape = np.zeros_like(state["gel_displacement"])
+        shape[..., 0] = height * 1e3 * np.sin(np.linspace(0, np.pi / 2, shape.shape[-2]))
+        state["gel_displacement"] = shape
+        world.restore(state)
+        ends = []
+        for _ in range(3):
+            world.move({}, duration=quarter)
+            surface = world.surface("lower").displacement
+            ends.append(float(surface[surface.shape[0] // 2, surface.shape[1] // 2, 0]))
+        late = np.arcsin(ends[0] / height) + np.arcsin(ends[2] / height)  # in half a period, as an angle
+        errors.append(abs(late) / np.pi)
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert orders == pytest.approx(2.0, abs=0.1)
+    assert errors[0] < 0.01
+
+
 def test_a_body_bounces_off_a_gel_with_the_momentum_that_the_gel_felt() -> None:
     """Thrown at the lower gel, an elastic cube comes back; what it gained is the impulse of the contact force, and in
     the air it loses none of it."""

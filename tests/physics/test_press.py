@@ -33,12 +33,12 @@ def move(w: PressWorld, by: tuple[float, float, float], turn: float = 0.0) -> No
     assert stats.settled, stats
 
 
-def layer_force(radius: float, depth: float) -> float:
+def layer_force(radius: float, depth: float, nu: float = 0.45) -> float:
     n, side = 192, 30e-3
     x = (np.arange(n) - n / 2) * side / n
     r2 = x[:, None] ** 2 + x**2
     gap = np.where(r2 < radius**2, radius - np.sqrt(np.maximum(radius**2 - r2, 0)), 1.0)
-    return layer_contact(gap, depth, side / n, 4e-3, 0.145e6, 0.45).force
+    return layer_contact(gap, depth, side / n, 4e-3, 0.145e6, nu).force
 
 
 def test_sphere_force_against_the_elastic_layer() -> None:
@@ -51,6 +51,13 @@ def test_sphere_force_against_the_elastic_layer() -> None:
         errors.append(abs(-w.wrench("lower")[2] / truth - 1))
     assert errors[1] < 0.06
     assert errors[1] < errors[0]
+
+
+def test_a_nearly_incompressible_gel_does_not_lock() -> None:
+    """Full integration at a Poisson ratio of 0.49 would make it far too stiff."""
+    w = world(Sphere(radius=4e-3), 0.0, preset="standard", gel=Gel(material=GelMaterial(poisson_ratio=0.49)))
+    move(w, (0, 0, -0.3e-3 - 0.1e-3))
+    assert -w.wrench("lower")[2] == pytest.approx(layer_force(4e-3, 0.3e-3, 0.49), rel=0.05)
 
 
 def test_nothing_overlaps_at_rest_and_backing_balances_contact() -> None:

@@ -41,6 +41,8 @@ TEXTS = {
                       "a.yaml:1: friction.uper: unknown key; allowed: lower, upper; did you mean 'upper'?"),
     "range": ("friction:\n  upper: 1\n  lower: 9", "a.yaml:3: friction.lower: 9 is out of range; allowed: a number >= 0 and <= 5"),
     "range of a quantity": ("element_size: -3 mm", f"a.yaml:1: element_size: -3 mm is out of range; allowed: a {LENGTH}, or null"),
+    "a yield of nothing": ("body:\n  material:\n    yield_stress: 0 kPa",
+                           "a.yaml:3: body.material.yield_stress: 0 kPa is out of range; allowed: a pressure > 0 Pa, bare in Pa or with a unit (Pa, kPa, MPa, GPa), or null"),
     "range in a list": ("gel:\n  size:\n    - 1\n    - 0 mm\n    - 1", f"a.yaml:4: gel.size.1: 0 mm is out of range; allowed: a {LENGTH}"),
     "type": ("settling: {mach: fast}", "a.yaml:1: settling.mach: 'fast' does not fit; allowed: a number > 0 and <= 0.3"),
     "a quoted number": ("settling: {mach: '0.1'}", "a.yaml:1: settling.mach: '0.1' does not fit; allowed: a number > 0 and <= 0.3"),

@@ -57,6 +57,14 @@ def test_only_a_body_that_yields_can_harden() -> None:
         BodyMaterial(yield_stress=30e3, hardening_modulus=-1.0)
 
 
+@pytest.mark.parametrize("name", ["yield_stress", "yield_strain"])
+def test_a_body_that_yields_at_nothing_is_refused(name: str) -> None:
+    """It would be a liquid. A file's author reads what is allowed: tests/tacsim/test_config_errors.py."""
+    for value in (0.0, -1e-3):
+        with pytest.raises(ValidationError, match=rf"{name}\n.*greater than 0"):
+            BodyMaterial.model_validate({name: value})
+
+
 def test_the_hardening_modulus_is_read_with_its_unit() -> None:
     values = {"body": {"material": {"yield_stress": "30 kPa", "hardening_modulus": "0.2 MPa"}}}
     body = Scene.model_validate(values).body

@@ -209,6 +209,27 @@ def shear(world: World) -> Iterator[Targets]:
     yield by(world, "upper", x=0.2e-3)
 
 
+def drag(world: World) -> Iterator[Targets]:
+    """The upper sensor sideways, while the body yields, until it slides."""
+    for _ in range(3):
+        yield by(world, "upper", x=1.0e-3)
+
+
+def impact(world: World) -> Iterator[Targets]:
+    """In real time, by the true densities, at a peak speed of 0.28 of the gel's pressure wave; then at rest.
+
+    A rigid indenter at half of that: it throws the surface ahead of it, beyond the limit of half the wave's speed.
+    """
+    way, duration = 1.5e-3, 0.28e-3
+    if world.truth() is None:
+        yield from push(0.0)(world)
+        world.move(by(world, "indenter", z=-way), duration=2 * duration)
+    else:
+        yield from squeeze_by(0.0)(world)
+        world.move(together(world, 2 * way), duration=duration)
+    yield {}
+
+
 def over_the_rim(world: World) -> Iterator[Targets]:
     yield {**by(world, "lower", x=4e-3), **by(world, "upper", x=4e-3)}
     yield from squeeze_by(1.2e-3)(world)
@@ -256,6 +277,7 @@ def with_nan(times: int) -> dict[str, Any]:
     return {"hybrid.copies": times, "press.copies": times, "seed.attempt": times}
 
 
+SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
 TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
 SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=600)
 BALL = indented(Sphere(radius=4e-3))
@@ -288,6 +310,10 @@ CASES: dict[str, Case] = {
     # motions
     "Mach 0.3": Case(cube(settling=Settling(mach=0.3)), squeeze_by(2.0e-3, 1)),
     "Mach 0.3, press": Case(indented(Sphere(radius=4e-3), settling=Settling(mach=0.3)), push(1.5e-3), PRESS),
+    "impact, elastic": Case(cube(material=BodyMaterial()), impact, ("hybrid",)),
+    "impact, plastic": Case(cube(), impact, ("hybrid",)),
+    "impact, press": Case(BALL, impact, PRESS),
+    "yield and slide": Case(cube(), then(squeeze_by(1.2e-3), drag)),
     "sensor through the body": Case(cube(), through),
     "indenter through the gel": Case(BALL, push(5e-3), PRESS),
     "body over the rim": Case(cube(), over_the_rim),
@@ -307,6 +333,8 @@ CASES: dict[str, Case] = {
     "loaded rest, long": Case(SMALL, then(squeeze_by(0.6e-3), shear, rest(400), mark, rest(100_000)), ("hybrid",)),
     # numbers and steps
     "step limit kept": Case(cube(settling=SLOWER), squeeze_by(1.0e-3)),
+    "short steps": Case(cube(settling=SLOWER), squeeze_by(1.0e-3), patch=SHORT),
+    "short steps, press": Case(BALL, push(0.8e-3, 3), PRESS, SHORT),
     "step limit violated": Case(cube(settling=SLOWER), squeeze_by(1.0e-3), patch=TOO_LONG),
     "step limit kept, press": Case(BALL, push(0.8e-3, 3), PRESS),
     "step limit violated, press": Case(BALL, push(0.8e-3, 3), PRESS, TOO_LONG),

@@ -61,8 +61,8 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
-USUAL = 0.03  # the controller's default peak Mach number: a seventh of the shear wave's speed
-# Half of it; this group's own; and half of the shear wave's speed, where contact sticks and slips by inertia.
+USUAL = 0.03  # the controller's default peak Mach number: a tenth of the shear wave's speed at nu 0.45
+# Half of it; this group's own; and a third of the shear wave's speed, where contact sticks and slips by inertia.
 OTHERS = (0.015, 0.05, 0.1)
 
 

@@ -1,9 +1,9 @@
 """The quasi-static controller: ramped motion of driven frames, then a hold until the measured residual is small.
 
-Materials are rate-independent, so only the path counts. What writes false plastic strain into the body is the jerk at
-start and stop, not the speed; hence every motion starts and ends with zero velocity and zero acceleration. What the
-start writes, the rest of the way mostly forgets; what the stop writes stays. Hence a motion sets off in the time that
-the gel's wave needs and slows down over all the rest (docs/decisions/0002-quasi-static-controller.md).
+Materials are rate-independent, so only the path counts. What falsifies it is the inertia and damping of a motion: they
+write plastic strain into the body. What the start writes, the rest of the way mostly undoes; what the stop writes
+stays. Hence every motion starts and ends with zero velocity and zero acceleration, sets off in the time that the gel's
+wave needs, and slows down over all the rest (docs/decisions/0002-quasi-static-controller.md).
 """
 
 from __future__ import annotations

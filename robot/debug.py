@@ -83,9 +83,10 @@ def replay(dump: Dump, world: World) -> Replay:
 
     Raises LoadNotReached (tacsim.physics.load) if it gets further this time, and a load it holds is out of reach.
     """
+    order = dump.order
     with no_dumps():
         try:
-            return Replay(None, world.move(dump.targets, dump.facts.loads, dump.facts.duration), False)
+            return Replay(None, world.move(order.targets, order.loads, order.duration, flow=order.flow), False)
         except SimulationDiverged as failure:
             same = (failure.cause, failure.where) == (dump.facts.cause, dump.facts.where)
             for moment, state in (("good", failure.good), ("failed", failure.failed)):

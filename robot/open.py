@@ -142,12 +142,15 @@ def _open_sim(facts: RigFacts) -> Rig:
     scene = facts.scene
     if scene is None:
         raise CannotOpen(f"rig '{facts.name}' simulates, but has no scene; give scene, or a task (which has one)")
-    if facts.dynamic and scene.physics == "seed":
-        raise CannotOpen(f"rig '{facts.name}': dynamic needs true inertia, which physics 'seed' has not; use 'hybrid'")
+    if facts.motion != "settled" and scene.physics == "seed":
+        raise CannotOpen(
+            f"rig '{facts.name}': physics 'seed' settles every motion, so it can't go by motion '{facts.motion}'; use "
+            "physics 'hybrid', or motion 'settled'"
+        )
     frames = _driven_frames(facts, scene)
     models = {name: sensor for name, sensor in facts.sensors.items() if isinstance(sensor, SimSensorFacts)}
     world = make_world(scene)
-    clock = SimClock(world, facts.period, facts.dynamic)
+    clock = SimClock(world, facts.period, facts.motion)
     sensors = {name: _sim_sensor(world, clock, name, sensor, facts) for name, sensor in models.items()}
     arms: dict[str, Arm] = {}
     for name, arm in facts.arms.items():

@@ -88,6 +88,9 @@ class RepositionFacts(Facts):
 TaskFacts = Annotated[SqueezeFacts | RepositionFacts, Field(discriminator="kind")]
 
 
+SimMotion = Literal["settled", "flowing", "dynamic"]
+
+
 class RigFacts(Facts):
     """One rig file."""
 
@@ -99,8 +102,7 @@ class RigFacts(Facts):
     arms: dict[Name, ArmFacts] = {}
     sensors: dict[Name, SensorFacts] = Field(min_length=1)
     canonical: CanonicalGrid = CanonicalGrid()
-    # Simulated: each period is lived through in real time by true inertia (slow); the reset stays quasi-static.
-    dynamic: bool = False
+    motion: SimMotion = "settled"  # simulated: what a control period is; the reset is settled in any case
     # Mock rigs: a control period ends when the arms rest and the twin has drawn the picture for just that pose.
     lock_step: bool = True
     # Mock rigs: what arms feel and cameras see is simulated; or it is a ball's contact in closed form, in real time but

@@ -16,6 +16,7 @@ from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap,
 from tacsim.limits import LimitExceeded, admit, overload, shorten
 from tacsim.optics.noise import NoiseSource
 from tacsim.physics.world import MoveStats, World
+from tacsim.rigfile import SimMotion
 from tacsim.scene import GelSurface
 
 CLEARANCE = 0.05e-3  # gap that the first, fast part of an approach leaves [m]
@@ -32,15 +33,16 @@ class NoTouch(RuntimeError):
 class SimClock:
     """Simulated time. `tick` drives all arms to what they were commanded and advances time by one period.
 
-    `dynamic`: each period is lived through in its own time, by true inertia (tacsim.physics.inertia); otherwise it ends
-    in the state of rest.
+    `motion`: "settled": each period ends in the state of rest; "flowing": frames pass what they were commanded to at
+    speed, and rest is waited for once nothing is commanded any more; "dynamic": each period is lived through in its own
+    time, by true inertia (tacsim.physics.inertia).
     `version` counts the states of the world, so that a picture is rendered once a state.
     """
 
-    def __init__(self, world: World, period: float, dynamic: bool = False) -> None:
+    def __init__(self, world: World, period: float, motion: SimMotion = "settled") -> None:
         self._world = world
         self._period = period
-        self._dynamic = dynamic
+        self._motion = motion
         self._targets: dict[str, Pose] = {}
         self._limited: dict[str, bool] = {}  # by frame, of the last period
         self._time = 0.0
@@ -72,10 +74,10 @@ class SimClock:
         """Raises SimulationDiverged. A world at rest that is commanded to stay is left as it is."""
         targets, self._targets = self._targets, {}
         before = {frame: self._world.pose(frame) for frame in targets}
-        if self._dynamic:
+        if self._motion == "dynamic":
             self.stats = self._world.move(targets, duration=self._period)
         elif targets or (self.stats is not None and not self.stats.settled):
-            self.stats = self._world.move(targets)
+            self.stats = self._world.move(targets, flow=self._motion == "flowing")
         elif self.stats is not None:
             self.stats = replace(self.stats, substeps=0, hold=0)
         self.velocities = {

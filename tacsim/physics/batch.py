@@ -15,7 +15,7 @@ from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.hybrid import HybridState, HybridWorld
 from tacsim.physics.load import LoadNotReached
 from tacsim.physics.press import PressState, PressWorld
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, Order
 from tacsim.scene import Scene
 
 Result = MoveStats | SimulationDiverged | LoadNotReached | None
@@ -44,8 +44,12 @@ class Batch:
         self,
         targets: Sequence[Mapping[str, Pose] | None],
         loads: Sequence[Mapping[str, float] | None] | None = None,
+        duration: float | None = None,
+        *,
+        flow: bool = False,
     ) -> list[Result]:
         """`World.move` of every environment at once; None in `targets`: this one rests, and nothing of it changes.
+        `duration` and `flow` are those of all motions.
 
         What became of each, in its place: a motion that fails is not raised but returned, with that world as it was
         before. One that has to try again does so while the others go on.
@@ -62,7 +66,7 @@ class Batch:
         motions: dict[int, Motion] = {}
         for index, (world, target, load) in enumerate(zip(self.worlds, targets, loads, strict=True)):
             if target is not None:
-                motions[index] = world.motion(target, load)
+                motions[index] = world.motion(Order(target, load or {}, duration, flow))
             elif load:
                 raise ValueError(f"environment {index} rests, so it cannot hold a load; give it targets, {{}} to stay")
         return self._run(motions)

@@ -26,8 +26,10 @@ MM = 1e3
 PEAK = 1.875  # peak slope of the ramp over its mean
 RAMP = 2.0  # shortest motion, in times of the pressure wave through the gel
 PIECE = 20  # substeps of one launch on the way
+FLOW = 1.25  # shortest step that flows, in the same times; longer by as much as its speed changes
 LOOK = 1.0  # time of the hold between two looks at the forces, in the same times
 LOOKS = 2  # earlier looks that a look is compared with: one alone may meet the same phase of what rings
+ROUNDING = 1e-6  # of a number of substeps
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
@@ -51,6 +53,9 @@ class Path:
 
     Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. look: substeps of the hold
     at its end between two looks at the forces. rise: share of the time in which the velocity rises, of `ramp`.
+
+    rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm]: instead of a ramp
+    from rest to rest the path is then the cubic that has them.
     """
 
     start: Sequence[Pose]
@@ -60,6 +65,7 @@ class Path:
     refine: int = 1
     look: int = 20
     rise: float = 0.5
+    rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property
     def step(self) -> float:
@@ -72,19 +78,29 @@ class Path:
         Rows: the rotation matrix, position [mm], velocity, angular velocity; all in world.
         """
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
-        s = ramp(np.clip(knots, 0.0, 1.0), self.rise)
-        out = np.empty((len(s) - 1, len(self.start), 6, 3))
-        step = self.step
-        for index, (a, b) in enumerate(zip(self.start, self.end, strict=True)):
-            position = (a.position + s[:, None] * (b.position - a.position)) * MM
-            vector, turned = _turn(a, b), Rotation.from_quat(a.quaternion)
-            if vector.any():
-                turned = Rotation.from_rotvec(s[1:, None] * vector) * turned
+        out = np.empty((len(knots) - 1, len(self.start), 6, 3))
+        for index, a in enumerate(self.start):
+            way = self._way(index, knots)
+            turned, spin = Rotation.from_quat(a.quaternion), np.zeros(3)
+            if way[:, 3:].any():
+                turned = Rotation.from_rotvec(way[:, 3:]) * turned
+                turned, spin = turned[1:], (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
             out[:, index, :3] = turned.as_matrix()
-            out[:, index, 3] = position[1:]
-            out[:, index, 4] = np.diff(position, axis=0) / step
-            out[:, index, 5] = np.diff(s)[:, None] * vector / step
+            out[:, index, 3] = a.position * MM + way[1:, :3]
+            out[:, index, 4] = np.diff(way[:, :3], axis=0) / self.step
+            out[:, index, 5] = spin
         return np.ascontiguousarray(out, np.float32)
+
+    def _way(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 6) way of a frame from its start [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
+        t = np.clip(knots, 0.0, 1.0)[:, None]
+        whole = way_between(self.start[index], self.end[index])
+        if self.rates is None:
+            ramped: NDArray[np.float64] = ramp(t, self.rise) * whole
+            return ramped
+        before, after = (self.substeps * self.dt * rates[index] for rates in self.rates)
+        cubic: NDArray[np.float64] = t * t * (3 - 2 * t) * whole + t * (1 - t) * ((1 - t) * before - t * after)
+        return cubic
 
     def place(self, names: Iterable[str], first: int, last: int) -> Place:
         """Where the frames called `names` are on substeps first..last."""
@@ -93,31 +109,33 @@ class Path:
             if self.substeps
             else "the hold after the motion"
         )
-        s = float(ramp(np.clip(last / max(self.substeps, 1), 0.0, 1.0), self.rise))
-        poses = {}
-        for name, a, b in zip(names, self.start, self.end, strict=True):
-            vector, quaternion = _turn(a, b), a.quaternion
-            if vector.any():
-                quaternion = (Rotation.from_rotvec(s * vector) * Rotation.from_quat(quaternion)).as_quat()
-            poses[name] = Pose(a.position + s * (b.position - a.position), quaternion)
+        at, poses = np.array([last / max(self.substeps, 1)]), {}
+        for index, (name, a) in enumerate(zip(names, self.start, strict=True)):
+            way, quaternion = self._way(index, at)[0], a.quaternion
+            if way[3:].any():
+                quaternion = (Rotation.from_rotvec(way[3:]) * Rotation.from_quat(quaternion)).as_quat()
+            poses[name] = Pose(a.position + way[:3] / MM, quaternion)
         return Place(f"in {part}", poses)
 
 
-def _turn(a: Pose, b: Pose) -> NDArray[np.float64]:
-    """Rotation vector from a to b, world axes. Most motions turn nothing, and that is seen at once."""
-    if np.array_equal(a.quaternion, b.quaternion):
-        return np.zeros(3)
-    turn = Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()
-    return np.asarray(turn.as_rotvec(), np.float64)
+def way_between(a: Pose, b: Pose) -> NDArray[np.float64]:
+    """(6,) from a to b: position [mm], rotation vector [rad], world axes."""
+    way = np.zeros(6)
+    way[:3] = (b.position - a.position) * MM
+    if not np.array_equal(a.quaternion, b.quaternion):  # most motions turn nothing, and that is seen at once
+        way[3:] = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).as_rotvec()
+    return way
+
+
+def longest(ways: NDArray[np.float64], lever: float) -> float:
+    """Of ways or rates (frames, 6), linear and angular, that of the fastest point; `lever` [mm]: to the gel's rim."""
+    linear, angular = (np.linalg.norm(part, axis=1) for part in np.split(ways, 2, axis=1))
+    return float((linear + lever * angular).max())
 
 
 def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
     """The way of the fastest point [mm]; `lever` [mm] turns rotation into a way at the gel's rim."""
-    length = 0.0
-    for a, b in zip(start, end, strict=True):
-        turn = float((Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).magnitude())
-        length = max(length, float(np.linalg.norm(b.position - a.position)) * MM + turn * lever)
-    return length
+    return longest(np.array([way_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
 
 
 def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float) -> Path:
@@ -129,6 +147,23 @@ def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lev
         return Path(start, end, 0, dt, look=look)
     lasting = max(PEAK * length / mach, RAMP * thickness)
     return Path(start, end, math.ceil(lasting / dt), dt, look=look, rise=RAMP * thickness / 2 / lasting)
+
+
+def plan_on(
+    start: Sequence[Pose], end: Sequence[Pose], rates: NDArray[np.float64], mach: float, dt: float, lever: float,
+    thickness: float,
+) -> Path:  # fmt: skip
+    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at the mean speed of
+    the step as if it were the same all the way; at most Mach `mach`. Where speeds change it lasts longer, up to twice
+    as long from rest. Without a way and at rest it has no substeps."""
+    ways = np.array([way_between(a, b) for a, b in zip(start, end, strict=True)])
+    look = math.ceil(LOOK * thickness / dt)
+    if not (ways.any() or rates.any()):
+        return Path(start, end, 0, dt, look=look)
+    lasting = dt * math.ceil(max(longest(ways, lever) / mach, FLOW * thickness) / dt - ROUNDING)
+    onward = ways / lasting
+    lasting *= 1.0 + longest(onward - rates, lever) / mach
+    return Path(start, end, math.ceil(lasting / dt - ROUNDING), dt, look=look, rates=(rates, onward))
 
 
 def force_floor(modulus: float, thickness: float) -> float:
@@ -180,6 +215,11 @@ class Launch:
     def held(self) -> bool:
         """Nothing is driven any more."""
         return self.path.substeps == 0
+
+    @property
+    def flowing(self) -> bool:
+        """Of a motion that flows into the next."""
+        return self.path.rates is not None
 
 
 @dataclass(frozen=True)
@@ -260,7 +300,7 @@ def advance_all(
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Goes along `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
     seen = yield from _driven(path)
-    rest = replace(path, start=path.end, substeps=0)
+    rest = replace(path, start=path.end, substeps=0, rates=None)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
         count = min(path.look, settling.max_substeps - held)
@@ -278,6 +318,22 @@ def move_in_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     seen = yield from _driven(path)
     worst = residual(seen[-1], seen[-2], balanced) if len(seen) > 1 else math.inf
     return _stats(seen, path.substeps, 0, worst, settling)
+
+
+def move_on(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path`, whose end is no rest; the residual is the imbalance of forces there."""
+    if not path.substeps:
+        return (yield from move_and_settle(path, settling, balanced=balanced))
+    seen = yield from _driven(path)
+    stats = _stats(seen, path.substeps, 0, residual(seen[-1], seen[-1], balanced), settling)
+    return replace(stats, settled=False)
+
+
+def come_to_rest(path: Path, motion: Motion) -> Motion:
+    """Goes along `path`, then does `motion`."""
+    yield from _driven(path)
+    stats = yield from motion
+    return replace(stats, substeps=path.substeps + stats.substeps)
 
 
 def _driven(path: Path) -> Generator[Launch, Reading, list[Reading]]:

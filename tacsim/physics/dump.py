@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from tacsim.interface import Pose
+from tacsim.physics.world import Order
 from tacsim.quantity import Facts
 from tacsim.scene import Mesh, Scene, Shape
 
@@ -64,6 +65,7 @@ class DumpFacts(Facts):
     targets: dict[str, Numbers7]  # asked for
     loads: dict[str, float] = {}  # held by sensors [N]; dumps of older versions say nothing of them
     duration: float | None = None  # of a dynamic motion [s]
+    flow: bool = False  # it flows into the next
     failed_poses: dict[str, Numbers7]  # at the end of the launch that went wrong; empty if there was none
     health: dict[str, str]  # what the kernels saw in the last launch
     versions: dict[str, str]
@@ -77,8 +79,10 @@ class Dump:
     states: Mapping[str, State]
 
     @property
-    def targets(self) -> dict[str, Pose]:
-        return _poses(self.facts.targets)
+    def order(self) -> Order:
+        """What the motion was asked for."""
+        facts = self.facts
+        return Order(_poses(facts.targets), facts.loads, facts.duration, facts.flow)
 
     def poses(self, moment: str) -> dict[str, Pose]:
         """Of the driven frames; at "good" those of the end of its launch, a few substeps later."""
@@ -118,16 +122,14 @@ def write(
     folder: Path,
     scene: Scene,
     poses: Poses,
-    targets: Poses,
+    order: Order,
     before: State,
     failure: SimulationDiverged,
-    loads: Mapping[str, float],
-    duration: float | None = None,
 ) -> Path:
     """Writes a dump into a new folder below `folder` and returns it.
 
-    poses: of the driven frames before the motion; before: the state then; loads: held by sensors [N]; duration: of a
-    dynamic motion [s]. Raises OSError, DumpError when there are MOST_DUMPS already.
+    poses: of the driven frames before the motion; before: the state then. Raises OSError, DumpError when there are
+    MOST_DUMPS already.
     """
     place = _new(folder)
     scene, mesh = _with_mesh(scene, MESH)
@@ -142,9 +144,10 @@ def write(
         refine=failure.refine,
         scene=scene,
         poses={name: _numbers(pose) for name, pose in poses.items()},
-        targets={name: _numbers(pose) for name, pose in targets.items()},
-        loads=dict(loads),
-        duration=duration,
+        targets={name: _numbers(pose) for name, pose in order.targets.items()},
+        loads=dict(order.loads),
+        duration=order.duration,
+        flow=order.flow,
         failed_poses={name: _numbers(pose) for name, pose in failure.poses.items()},
         health={} if failure.health is None else {k: f"{v:.9g}" for k, v in asdict(failure.health).items()},
         versions=_versions(),
@@ -219,7 +222,12 @@ def read(folder: Path) -> Dump:
     scene, mesh = _with_mesh(facts.scene, str(folder / MESH))
     if mesh is not None and str(mesh) != MESH:
         raise DumpError(f"{described}: a dump may name no STL file but its own {MESH}, not {mesh}")
-    return Dump(facts.model_copy(update={"scene": scene}), _read_arrays(folder / "state.npz"))
+    dump = Dump(facts.model_copy(update={"scene": scene}), _read_arrays(folder / "state.npz"))
+    try:
+        _ = dump.order
+    except ValueError as error:
+        raise DumpError(f"{described}: {error}") from None
+    return dump
 
 
 def _read_arrays(path: Path) -> dict[str, dict[str, NDArray[Any]]]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Pose
 from tacsim.physics import diagnosis, layout
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, Order
 from tacsim.scene import Scene
 
 SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element, elastic volume ratio of a particle; below, it counts as inverted
@@ -168,15 +168,10 @@ Seen = TypeVar("Seen")
 
 
 def retried(
-    world: Driven,
-    targets: Mapping[str, Pose],
-    motion: Callable[[int], Generator[Wanted, Seen, MoveStats]],
-    loads: Mapping[str, float] | None = None,
-    duration: float | None = None,
+    world: Driven, order: Order, motion: Callable[[int], Generator[Wanted, Seen, MoveStats]]
 ) -> Generator[Wanted, Seen, MoveStats]:
-    """The motion `motion(refine)`, which drives `world` to `targets` with 1/refine of its step; refine = 1, 2, 4.
-
-    loads: held by sensors [N]; duration: of a dynamic motion [s]; both for the dump, which is replayed with them.
+    """The motion `motion(refine)`, which does with `world` what is asked for, with 1/refine of its step; refine = 1, 2,
+    4.
 
     Whoever runs it throws in the SimulationDiverged of a launch; the world then rolls back by itself and yields the
     first launch of the next try. After every failure, an interruption included, the world is as it was before. Raises
@@ -192,7 +187,7 @@ def retried(
         for retry in range(RETRIES + 1):
             try:
                 stats = yield from motion(2**retry)
-                _require_upright(world, targets)
+                _require_upright(world, order.targets)
                 return replace(stats, retries=retry)
             except SimulationDiverged as diverged:
                 failure, failure.refine = diverged, 2**retry
@@ -201,7 +196,7 @@ def retried(
                 world.restore(before)
                 raise
     failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, world.scene.gel.size)
-    _dump(world, targets, loads or {}, duration, before, failure)
+    _dump(world, order, before, failure)
     raise failure
 
 
@@ -225,14 +220,7 @@ def _poses(world: Driven) -> dict[str, Pose]:
     return {name: world.pose(name) for name in frames}
 
 
-def _dump(
-    world: Driven,
-    targets: Mapping[str, Pose],
-    loads: Mapping[str, float],
-    duration: float | None,
-    before: State,
-    failure: SimulationDiverged,
-) -> None:
+def _dump(world: Driven, order: Order, before: State, failure: SimulationDiverged) -> None:
     """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
     folder = os.environ.get("TACSIM_DUMPS")
     if not folder:
@@ -240,7 +228,7 @@ def _dump(
     from tacsim.physics import dump
 
     try:
-        failure.dump = dump.write(Path(folder), world.scene, _poses(world), targets, before, failure, loads, duration)
+        failure.dump = dump.write(Path(folder), world.scene, _poses(world), order, before, failure)
     except (OSError, ValueError) as error:
         failure.no_dump = f"no dump could be written to {folder}: {error}"
 

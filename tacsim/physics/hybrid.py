@@ -2,42 +2,24 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.body_surface import surface_points, tangent_planes
-from tacsim.physics.controller import (
-    Launch,
-    Motion,
-    Path,
-    Prepared,
-    Reading,
-    force_floor,
-    merged,
-    move_and_settle,
-    move_in_time,
-    plan,
-    run,
-)
+from tacsim.physics.controller import Launch, Prepared, Reading, force_floor
 from tacsim.physics.device import Mirror, run_hybrid
-from tacsim.physics.gel import (
-    MM,
-    MPA,
-    GelState,
-    gel_facts,
-    gel_surface,
-    one_lattice,
-)
-from tacsim.physics.health import Health, copies, judged, require_room, retried
+from tacsim.physics.driven import DrivenWorld
+from tacsim.physics.gel import MM, MPA, GelState, gel_facts, one_lattice
+from tacsim.physics.health import Health, copies, judged, require_room
 from tacsim.physics.hybrid_kernels import substeps
-from tacsim.physics.inertia import Inertia, kernel_density, kernel_second, plan_in_time
+from tacsim.physics.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.lanes import ON_DEVICE, PARTS
 from tacsim.physics.layout import (
     BACKING,
     BODY_DAMPING,
     BODY_MASS,
+    CENTRE,
     COUNTS,
     FACTS,
     FORCE,
@@ -49,11 +31,11 @@ from tacsim.physics.layout import (
     HOUSING,
     LIGHTNESS,
     NUMBERS,
+    SPREAD,
     STEP,
     STEPS,
     STIFFNESS,
 )  # fmt: skip
-from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.plasticine import (
     BodyFacts,
     BodyState,
@@ -61,11 +43,10 @@ from tacsim.physics.plasticine import (
     bounds,
 )
 from tacsim.physics.team import run_team
-from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.pose import HALF_TURN_X
 from tacsim.runtime import start
 from tacsim.sampling import body_points
-from tacsim.scene import GelSurface, Scene
+from tacsim.scene import Scene
 from tacsim.shapes import extent, volume
 
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
@@ -134,22 +115,25 @@ def side_by_side(drives: Mapping[int, np.ndarray], counts: np.ndarray) -> np.nda
     return together
 
 
-class HybridWorld:
+class HybridWorld(DrivenWorld):
     """World of a scene with a body: `lower` and `upper` gel, and the plasticine between them."""
 
-    sensors: tuple[str, ...] = ("lower", "upper")
+    sensors = ("lower", "upper")
+    balanced = True
 
     def __init__(self, scene: Scene, state: HybridState | None = None, index: int = 0) -> None:
         """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
         assert scene.body is not None
         self.scene = scene
-        self._state, self._index = HybridState([scene]) if state is None else state, index
+        self._state: HybridState = HybridState([scene]) if state is None else state
+        self._index = index
         self._gel, self._body = self._state.gel[index], self._state.body[index]
         height = float(extent(scene.body.geometry)[2])
         self._poses = {
             "lower": Pose(),
             "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
         }
+        self._rates = np.zeros((2, 6))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._speed = scene.settling.mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
@@ -180,7 +164,8 @@ class HybridWorld:
         held = {
             GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
         }  # fmt: skip
-        return Inertia({**self._masses(self._gel.density, self._body.density, step), **damping}, step, held=held)
+        masses = self._masses(self._gel.density, self._body.density, step)
+        return Inertia({**masses, **damping, SPREAD: 0.0}, step, held=held, flowing={SPREAD: 1.0})
 
     def _true_inertia(self) -> Inertia:
         assert self.scene.body is not None
@@ -188,7 +173,7 @@ class HybridWorld:
         density = kernel_density(self.scene.body.material.density, second)
         wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
         step = COURANT * min(self._body.cell / wave, self._gel.spacing)
-        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, LIGHTNESS: 1.0}
+        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, LIGHTNESS: 1.0, SPREAD: 0.0}
         return Inertia({**self._masses(self._gel.density, density, step), **undamped}, step, second)
 
     def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
@@ -203,23 +188,11 @@ class HybridWorld:
             GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
         }  # fmt: skip
 
-    def _take(self, inertia: Inertia) -> None:
-        """Answers to forces by `inertia` from now on."""
-        self._inertia = inertia
-        self._answer(held=False)
-
-    def _answer(self, *, held: bool) -> None:
-        entries = self._inertia.entries(held)
-        self._state.facts[self._index, list(entries)] = list(entries.values())
-
-    def _change(self, inertia: Inertia) -> None:
-        """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
-        if inertia is not self._inertia:
-            b, i = self._state.particles, self._index
-            for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
-                moving[...] = 0.0
-            b.refresh()
-            self._take(inertia)
+    def _stop(self) -> None:
+        b, i = self._state.particles, self._index
+        for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
+            moving[...] = 0.0
+        b.refresh()
 
     # ------------------------------------------------------------------ state
 
@@ -233,28 +206,12 @@ class HybridWorld:
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        state = taken(self._arrays(), self._poses)
-        state["speed"] = np.array(self._speed)
-        state["true_inertia"] = np.array(float(self._inertia.true))
-        return state
+        return {**super().snapshot(), "speed": np.array(self._speed)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        self._poses = put_back(self._arrays(), self.sensors, state)
+        super().restore(state)
         self._state.particles.refresh()
         self._speed = float(state["speed"])
-        self._take(self._true if state["true_inertia"] else self._scaled)
-
-    def pose(self, name: str) -> Pose:
-        return self._poses[name]
-
-    def wrench(self, name: str) -> np.ndarray:
-        first = FORCE + 6 * self.sensors.index(name)
-        wrench: np.ndarray = self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
-        wrench[3:] /= MM
-        return wrench
-
-    def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._state.gels, self._index, self.sensors.index(name))
 
     def truth(self) -> Truth:
         x, planes = self._state.particles.x(self._index), self._state.particles.plane(self._index)
@@ -262,45 +219,6 @@ class HybridWorld:
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
     # ----------------------------------------------------------------- motion
-
-    def move(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
-    ) -> MoveStats:
-        return run(self.motion(targets, loads, duration), self._advance)
-
-    def motion(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
-    ) -> Motion:
-        """`move`, a launch at a time."""
-        end = merged(self._poses, targets)
-        require_loads(loads or {}, self.sensors)
-        begin, goals = dict(self._poses), dict(end)
-        a, b, lever = list(begin.values()), list(end.values()), max(self._gel.half)
-        timed = None if duration is None else plan_in_time(a, b, duration, self._true, lever, bool(loads))
-
-        def tried(refine: int) -> Motion:
-            self._change(self._scaled if timed is None else self._true)
-            if timed is not None:
-                return move_in_time(replace(timed, refine=refine), self.scene.settling, balanced=True)
-            if loads:
-                end.update(goals)
-                return keep_loads(self, begin, end, loads, refine, balanced=True)
-            path = replace(self.plan(a, b), refine=refine)
-            return move_and_settle(path, self.scene.settling, balanced=True)
-
-        stats = yield from retried(self, targets, tried, loads, duration)
-        self._poses = end
-        return stats
-
-    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
-        """The path between two poses of all driven frames, at the scene's speed."""
-        mach, gel = self.scene.settling.mach, self._gel
-        return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness)
-
-    def _advance(self, path: Path, first: int, last: int) -> Reading:
-        prepared = self.prepare(Launch(path, first, last))
-        self._state.advance({self._index: prepared.drive})
-        return self.outcome(prepared)
 
     def prepare(self, launch: Launch) -> Prepared:
         """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
@@ -318,7 +236,8 @@ class HybridWorld:
         state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
         good = copies(self._arrays())
         state.facts[index, STEP] = path.step
-        self._answer(held=launch.held)
+        state.facts[index, CENTRE : CENTRE + 3] = [column.mean(dtype=np.float64) for column in x.T]
+        self._answer(launch)
         Health.clear(state.partial[index])
         return Prepared(launch, drive, where, good)
 

@@ -31,6 +31,7 @@ from tacsim.physics.layout import (
     BODY_DAMPING,
     BODY_MASS,
     CAPACITY,
+    CENTRE,
     FORCE,
     GRAVITY,
     GRID,
@@ -40,6 +41,7 @@ from tacsim.physics.layout import (
     ORIGIN,
     OVERLAP,
     PARTICLES,
+    SPREAD,
     STEP,
     STEPS,
     STRIDE,
@@ -90,6 +92,8 @@ def grid_update(
     A boost is added to every velocity: selective mass scaling of the slowest mode, the rigid translation of a body that
     hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
 
+    With SPREAD the reference also widens as fast as a body must whose volume stays (docs/decisions/0002).
+
     Only a sensor that touches the body imposes anything; one that nobody touches is damped towards rest. Across the
     sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides on one
     sensor must not be dragged back by the other.
@@ -114,6 +118,8 @@ def grid_update(
     held = ti.select(touch0 or touch1, 1.0, 0.0)
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
+    widening = -0.5 * facts[env, SPREAD] * share * (v1 - v0).dot(axis) / length2
+    centre = vec3(facts[env, CENTRE], facts[env, CENTRE + 1], facts[env, CENTRE + 2])
     nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
     base = env * counts[env, CAPACITY]
     nz = nz // NODES  # strips
@@ -136,7 +142,8 @@ def grid_update(
                         t = alone + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
                         reference = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
                         if driven:
-                            reference = axis * (reference.dot(axis) / length2) + mean_across
+                            across = (x - centre) - axis * ((x - centre).dot(axis) / length2)
+                            reference = axis * (reference.dot(axis) / length2) + mean_across + widening * across
                         velocity -= damping * dt * (velocity - reference)
                         for d in ti.static(range(3)):
                             moved[4 * n + d] = velocity[d]

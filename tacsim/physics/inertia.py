@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import PEAK, Path, longest_way
+from tacsim.physics.controller import PEAK, Launch, Path, longest_way
 from tacsim.physics.gel import MM, MPA, GelFacts
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
@@ -27,10 +27,13 @@ class Inertia:
     step: float  # nominal substep [mm]
     second: float = math.nan  # kernel time of one second [mm]; quasi-static motions have no real time
     held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven any more
+    flowing: Mapping[int, float] = field(default_factory=dict)  # and those of motions that flow into one another
 
-    def entries(self, held: bool) -> dict[int, float]:
-        """The entries while the scene is held, or driven."""
-        return {**self.facts, **self.held} if held else dict(self.facts)
+    def entries(self, launch: Launch | None = None) -> dict[int, float]:
+        """The entries for a launch; None: while something is driven."""
+        if launch is None:
+            return dict(self.facts)
+        return {**self.facts, **(self.held if launch.held else self.flowing if launch.flowing else {})}
 
     @property
     def true(self) -> bool:
@@ -47,16 +50,12 @@ def kernel_density(density: float, second: float) -> float:
     return density * (second / MM) ** 2 * MPA
 
 
-def plan_in_time(
-    start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float, loaded: bool
-) -> Path:
+def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
     """The path of a dynamic motion; `lever` [mm]: see `longest_way`.
 
     Raises ValueError for a duration [s] that is no positive number, or in which the fastest frame would race the gel's
-    own waves; and for a motion that is to hold loads.
+    own waves.
     """
-    if loaded:
-        raise ValueError("loads are held in settled states, not in a motion with a duration: give one of the two")
     if not (math.isfinite(duration) and duration > 0):
         raise ValueError(f"duration is {duration:g} s: give a positive time, or None for a quasi-static motion")
     kernel_time, wave = duration * inertia.second, inertia.second / MM

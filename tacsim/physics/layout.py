@@ -24,7 +24,9 @@ ORIGIN = 22  # of the grid x, y, z [mm]
 SHAPE = 25  # of an indenter: three sizes [mm]
 SHAPE_ORIGIN = 28  # of its distance grid x, y, z [mm]
 SHAPE_SPACING = 31  # of its distance grid [mm]
-FACTS = 32
+SPREAD = 32  # share of an incompressible body's widening that is part of the motion its damping is against
+CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
+FACTS = 36
 
 # counts (environments, COUNTS) int32
 NEVER = 0  # always 0: see tacsim.physics.lanes.keep_or

@@ -1,25 +1,13 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import (
-    Launch,
-    Motion,
-    Path,
-    Prepared,
-    Reading,
-    force_floor,
-    merged,
-    move_and_settle,
-    move_in_time,
-    plan,
-    run,
-)
+from tacsim.physics.controller import Launch, Prepared, Reading, force_floor
 from tacsim.physics.device import Mirror, run_press
+from tacsim.physics.driven import DrivenWorld
 from tacsim.physics.gel import (
     MM,
     MPA,
@@ -34,10 +22,9 @@ from tacsim.physics.gel import (
     gel_advance,
     gel_facts,
     gel_forces,
-    gel_surface,
     one_lattice,
 )
-from tacsim.physics.health import Health, copies, judged, retried
+from tacsim.physics.health import Health, copies, judged
 from tacsim.physics.hybrid import ZETA_GEL_HELD, side_by_side
 from tacsim.physics.hybrid_kernels import Drive
 from tacsim.physics.indenter import (
@@ -51,7 +38,7 @@ from tacsim.physics.indenter import (
     Values,
     indent,
 )
-from tacsim.physics.inertia import Inertia, kernel_second, plan_in_time
+from tacsim.physics.inertia import Inertia, kernel_second
 from tacsim.physics.lanes import ON_DEVICE, PARTS, Counts, Facts, Partial
 from tacsim.physics.layout import (
     BACKING,
@@ -70,11 +57,9 @@ from tacsim.physics.layout import (
     STEPS,
     STIFFNESS,
 )  # fmt: skip
-from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
-from tacsim.physics.world import MoveStats, put_back, taken
 from tacsim.runtime import start, ti
-from tacsim.scene import Box, Cylinder, GelSurface, Scene, Sphere
+from tacsim.scene import Box, Cylinder, Scene, Sphere
 from tacsim.shapes import distance_grid, extent
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
@@ -182,16 +167,18 @@ def _stacked(grids: Sequence[np.ndarray]) -> np.ndarray:
     return values
 
 
-class PressWorld:
+class PressWorld(DrivenWorld):
     """World of a scene with an indenter: the `lower` gel, and the `indenter` above it."""
 
-    sensors: tuple[str, ...] = ("lower",)
+    sensors = ("lower",)
+    balanced = False
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
         """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
         assert scene.indenter is not None
         self.scene = scene
-        self._state, self._index = PressState([scene]) if state is None else state, index
+        self._state: PressState = PressState([scene]) if state is None else state
+        self._index = index
         self._gel = self._state.gel[index]
         step = COURANT * self._gel.spacing
         # An elastic gel forgets its way, so it is damped on it as in the hold.
@@ -206,18 +193,11 @@ class PressWorld:
         self._take(self._scaled)
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
+        self._rates = np.zeros((2, 6))
         self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
 
-    def _take(self, inertia: Inertia) -> None:
-        """Answers to forces by `inertia` from now on."""
-        self._inertia = inertia
-        self._state.facts[self._index, list(inertia.facts)] = list(inertia.facts.values())
-
-    def _change(self, inertia: Inertia) -> None:
-        """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
-        if inertia is not self._inertia:
-            self._state.gels.v[self._index] = 0.0
-            self._take(inertia)
+    def _stop(self) -> None:
+        self._state.gels.v[self._index] = 0.0
 
     def _arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
@@ -226,68 +206,8 @@ class PressWorld:
             "pressure": state.pressure[i], "sums": state.partial[i],
         }  # fmt: skip
 
-    def snapshot(self) -> dict[str, np.ndarray]:
-        state = taken(self._arrays(), self._poses)
-        state["true_inertia"] = np.array(float(self._inertia.true))
-        return state
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        self._poses = put_back(self._arrays(), list(self._poses), state)
-        self._take(self._true if state["true_inertia"] else self._scaled)
-
-    def pose(self, name: str) -> Pose:
-        return self._poses[name]
-
-    def wrench(self, name: str) -> np.ndarray:
-        first = FORCE + 6 * self.sensors.index(name)
-        wrench = self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
-        wrench[3:] /= MM
-        return wrench
-
-    def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._state.gels, self._index, self.sensors.index(name))
-
     def truth(self) -> None:
         return None
-
-    def move(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
-    ) -> MoveStats:
-        return run(self.motion(targets, loads, duration), self._advance)
-
-    def motion(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
-    ) -> Motion:
-        """`move`, a launch at a time."""
-        end = merged(self._poses, targets)
-        require_loads(loads or {}, self.sensors)
-        begin, goals = dict(self._poses), dict(end)
-        a, b, lever = list(begin.values()), list(end.values()), max(self._gel.half)
-        timed = None if duration is None else plan_in_time(a, b, duration, self._true, lever, bool(loads))
-
-        def tried(refine: int) -> Motion:
-            self._change(self._scaled if timed is None else self._true)
-            if timed is not None:
-                return move_in_time(replace(timed, refine=refine), self.scene.settling, balanced=False)
-            if loads:
-                end.update(goals)
-                return keep_loads(self, begin, end, loads, refine, balanced=False)
-            path = replace(self.plan(a, b), refine=refine)
-            return move_and_settle(path, self.scene.settling, balanced=False)
-
-        stats = yield from retried(self, targets, tried, loads, duration)
-        self._poses = end
-        return stats
-
-    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
-        """The path between two poses of all driven frames, at the scene's speed."""
-        mach, gel = self.scene.settling.mach, self._gel
-        return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness)
-
-    def _advance(self, path: Path, first: int, last: int) -> Reading:
-        prepared = self.prepare(Launch(path, first, last))
-        self._state.advance({self._index: prepared.drive})
-        return self.outcome(prepared)
 
     def prepare(self, launch: Launch) -> Prepared:
         """Sets this environment's numbers for a launch."""

@@ -20,7 +20,7 @@ from tacsim.physics.controller import MM, Motion, Path, Reading, merged, move_an
 from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, require_room, retried
 from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
-from tacsim.physics.world import MoveStats, put_back
+from tacsim.physics.world import MoveStats, Order, put_back
 from tacsim.runtime import start
 from tacsim.sampling import body_points
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
@@ -183,28 +183,31 @@ class SeedWorld:
     # ----------------------------------------------------------------- motion
 
     def move(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
-    ) -> MoveStats:
-        """See World. Raises ValueError for a tilted target, or one that would crush the gels; and for a duration."""
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
+        *, flow: bool = False,
+    ) -> MoveStats:  # fmt: skip
+        """See World. Raises ValueError for a tilted target, one that would crush the gels, a duration, and flow."""
         if duration is not None:
             raise ValueError("physics 'seed' knows no true inertia; leave out the duration, or use physics 'hybrid'")
-        return run(self.motion(targets, loads), self._advance)
+        if flow:
+            raise ValueError("physics 'seed' settles every motion; leave out flow, or use physics 'hybrid'")
+        return run(self.motion(Order(targets, loads or {})), self._advance)
 
-    def motion(self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None) -> Motion:
+    def motion(self, order: Order) -> Motion:
         """`move`, a launch at a time."""
-        end = merged(self._poses, {name: self._upright(name, pose) for name, pose in targets.items()})
+        end = merged(self._poses, {name: self._upright(name, pose) for name, pose in order.targets.items()})
         self._check_room(end)
-        require_loads(loads or {}, self.sensors)
+        require_loads(order.loads, self.sensors)
         begin, goals = dict(self._poses), dict(end)
 
         def tried(refine: int) -> Motion:
-            if loads:
+            if order.loads:
                 end.update(goals)
-                return keep_loads(self, begin, end, loads, refine, balanced=True)
+                return keep_loads(self, begin, end, order.loads, refine, balanced=True)
             path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = yield from retried(self, targets, tried, loads)
+        stats = yield from retried(self, order, tried)
         self._poses = end
         return stats
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,6 +27,24 @@ class MoveStats:
     load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
 
 
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What one motion of a world is asked for; see `World.move`."""
+
+    targets: Mapping[str, Pose]
+    loads: Mapping[str, float] = field(default_factory=dict)
+    duration: float | None = None
+    flow: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for what excludes each other."""
+        if self.loads and self.duration is not None:
+            raise ValueError("loads are held in settled states, not in a motion with a duration: give one of the two")
+        if self.flow and (self.loads or self.duration is not None):
+            what = "loads are held in settled states" if self.loads else "a duration makes a motion dynamic"
+            raise ValueError(f"{what}, and a motion that flows ends in neither: give one of the two")
+
+
 class World(Protocol):
     """Gels, and what they touch. Sensors are driven; everything else follows. SI units, world frame.
 
@@ -41,8 +59,9 @@ class World(Protocol):
         ...
 
     def move(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None
-    ) -> MoveStats:
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
+        *, flow: bool = False,
+    ) -> MoveStats:  # fmt: skip
         """Drives the named frames to their targets along a ramped straight path, then holds until settled.
 
         loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis; across it,
@@ -53,6 +72,12 @@ class World(Protocol):
         densities and undamped, and is not held at its end; what still moves then goes on in a next motion with a
         duration, and stops in one without. Raises ValueError together with loads, for one too short, and where the
         world has no true inertia (`seed`).
+
+        flow: frames pass their targets at speed and nothing is held, so a next such motion goes on from there: for many
+        small steps in a row, each in a third of the time and some percent of force from its state of rest
+        (docs/physics.md). Frames without a target are told to stay. With nothing to do and nothing in motion it holds
+        until settled, like every other motion, which first brings to rest what flows. Raises ValueError together with
+        loads or a duration, and for `seed`.
 
         Raises SimulationDiverged (tacsim.physics.health) when no step size gives a finite state.
         """

@@ -80,7 +80,7 @@ def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, mon
 def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
     found = read(made)
     assert found.facts.scene == SCENE
-    assert found.targets["indenter"].position == pytest.approx([0, 0, 3.1e-3 - TOO_DEEP])
+    assert found.order.targets["indenter"].position == pytest.approx([0, 0, 3.1e-3 - TOO_DEEP])
     assert found.poses("before")["indenter"].position == pytest.approx([0, 0, 3.1e-3])
     assert found.poses("failed")["indenter"].position[2] < 3.1e-3
     assert found.facts.versions["numpy"] == np.__version__ and found.facts.refine == 4

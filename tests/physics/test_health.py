@@ -14,7 +14,7 @@ from tacsim.physics import diagnosis, press
 from tacsim.physics.controller import Launch, Motion, Path, Reading, run
 from tacsim.physics.health import RETRIES, Health, Place, SimulationDiverged, attempt, require_room, retried
 from tacsim.physics.press import PressWorld
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, Order
 from tacsim.scene import Gel, Indenter, Scene, Sphere
 
 STILL = Path([Pose()], [Pose()], substeps=0, dt=0.4)
@@ -111,7 +111,7 @@ def test_a_motion_starts_again_from_the_state_before_it() -> None:
         world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
         return REST
 
-    stats = run(retried(world, {}, one_launch), advance)
+    stats = run(retried(world, Order({}), one_launch), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
     assert stats.retries == 1 and world.arrays["position"][0, 0] == 2.0
 
@@ -127,7 +127,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
         return REST
 
     with pytest.raises(SimulationDiverged) as caught:
-        run(retried(world, {}, one_launch), advance)
+        run(retried(world, Order({}), one_launch), advance)
     assert steps == [2**retry for retry in range(RETRIES + 1)]
     assert all(world.arrays[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
@@ -139,7 +139,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
 def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
     """As whoever advances many worlds at once does: a failure is thrown into its own motion only."""
     good, bad = Particles(), Particles()
-    motions = [retried(good, {}, one_launch), retried(bad, {}, one_launch)]
+    motions = [retried(good, Order({}), one_launch), retried(bad, Order({}), one_launch)]
     launches = [next(motion) for motion in motions]
     good.arrays["position"] += 1.0
     bad.arrays["position"] += 1.0
@@ -160,7 +160,7 @@ def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None
         raise error
 
     with pytest.raises(error):
-        run(retried(world, {}, one_launch), advance)
+        run(retried(world, Order({}), one_launch), advance)
     assert world.arrays["position"].max() == 1.0
 
 
@@ -170,7 +170,7 @@ def test_a_broken_state_is_told_before_anything_moves() -> None:
     with pytest.raises(
         SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
     ):
-        run(retried(world, {}, one_launch), lambda path, first, last: pytest.fail("it moved"))
+        run(retried(world, Order({}), one_launch), lambda path, first, last: pytest.fail("it moved"))
 
 
 def test_a_grid_without_end_is_refused() -> None:

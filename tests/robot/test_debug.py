@@ -72,7 +72,7 @@ def test_a_motion_at_constant_load_is_replayed_with_its_load(
     with dumps_in(tmp_path), pytest.raises(SimulationDiverged):
         world.move({}, loads)
     dump = read(tmp_path / "00")
-    assert dump.facts.loads == loads and dump.targets == {}
+    assert dump.facts.loads == loads and dump.order.targets == {}
     assert debug.replay(dump, debug.open_world(dump)).identical
 
 

@@ -44,6 +44,7 @@ class SpringWorld:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.durations: list[float | None] = []
+        self.flows: list[bool] = []
         self.moves: list[dict[str, Pose]] = []  # every call of move
         self.worst = 0.0
         self.poses = {
@@ -54,12 +55,13 @@ class SpringWorld:
     def pose(self, name: str) -> Pose:
         return self.poses[name]
 
-    def move(self, targets: Mapping[str, Pose], duration: float | None = None) -> MoveStats:
+    def move(self, targets: Mapping[str, Pose], duration: float | None = None, *, flow: bool = False) -> MoveStats:
         self.durations.append(duration)
+        self.flows.append(flow)
         self.moves.append(dict(targets))
         self.poses |= targets
         self.worst = max(self.worst, self.force)
-        return MoveStats(substeps=30, hold=10, residual=0.001, settled=True, overlap=0.0, guard_hits=0)
+        return MoveStats(substeps=30, hold=10, residual=0.001, settled=not (flow and targets), overlap=0.0, guard_hits=0)
 
     @property
     def force(self) -> float:

@@ -202,12 +202,24 @@ def test_without_touch_force_the_gels_stay_clear(spring_world: Any) -> None:
 
 def test_a_dynamic_clock_gives_every_period_its_own_time(spring_world: Any) -> None:
     """Also one in which nothing is commanded: what moves goes on moving."""
-    clock = SimClock(spring_world, 0.1, dynamic=True)
+    clock = SimClock(spring_world, 0.1, motion="dynamic")
     clock.tick()
     clock.target("lower", shifted(Pose(), z=1e-4), limited=False)
     clock.tick()
     assert spring_world.durations == [0.1, 0.1]
     assert clock.now() == pytest.approx(0.2)
+
+
+def test_a_flowing_clock_waits_for_rest_once_nothing_is_commanded(spring_world: Any) -> None:
+    clock = SimClock(spring_world, 0.1, motion="flowing")
+    clock.target("lower", shifted(Pose(), z=1e-4), limited=False)
+    clock.tick()
+    assert clock.diagnostics()["settled"] == 0.0
+    clock.tick()
+    assert clock.diagnostics()["settled"] == 1.0
+    clock.tick()  # at rest: the world is left as it is
+    assert spring_world.flows == [True, True]
+    assert clock.diagnostics()["substeps"] == 0.0
 
 
 def guarded(world: Any, **changes: Any) -> tuple[SimClock, SimArm, SimArm]:

@@ -1,0 +1,179 @@
+"""What worlds of two kinds share, two gels round a body and an indenter on one: frames that are driven, and motions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import Pose
+from tacsim.physics.controller import (
+    Launch,
+    Motion,
+    Path,
+    Prepared,
+    Reading,
+    come_to_rest,
+    merged,
+    move_and_settle,
+    move_in_time,
+    move_on,
+    plan,
+    plan_on,
+    run,
+)
+from tacsim.physics.gel import MM, GelFacts, GelState, gel_surface
+from tacsim.physics.health import retried
+from tacsim.physics.inertia import Inertia, plan_in_time
+from tacsim.physics.layout import FORCE
+from tacsim.physics.load import keep_loads, require_loads
+from tacsim.physics.world import MoveStats, Order, put_back, taken
+from tacsim.scene import GelSurface, Scene
+
+
+class DrivenState(Protocol):
+    """Arrays of some environments (HybridState, PressState)."""
+
+    gels: GelState
+    facts: NDArray[np.float32]
+    partial: NDArray[np.float32]
+
+    def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None: ...
+
+
+class DrivenWorld:
+    """One environment of a state whose gels are layers of finite elements in their sensors' frames."""
+
+    sensors: tuple[str, ...]
+    balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
+
+    scene: Scene
+    _state: DrivenState
+    _index: int
+    _gel: GelFacts
+    _poses: dict[str, Pose]  # of the driven frames
+    _rates: NDArray[np.float64]  # (frames, 6) at which a motion that flows has left them [-, rad/mm]
+    _scaled: Inertia  # for the way to rest
+    _true: Inertia
+    _inertia: Inertia  # of the last motion
+
+    # ---------------------------------------------------- what a world adds
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Views of all that changes in a motion, by name."""
+        raise NotImplementedError
+
+    def _stop(self) -> None:
+        """Sets the speed of everything to zero."""
+        raise NotImplementedError
+
+    def prepare(self, launch: Launch) -> Prepared:
+        """Sets this environment's numbers for a launch. Raises SimulationDiverged if that cannot be done."""
+        raise NotImplementedError
+
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------ state
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        state = taken(self._arrays(), self._poses)
+        state["true_inertia"] = np.array(float(self._inertia.true))
+        state["rates"] = self._rates.copy()
+        return state
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        poses = put_back({**self._arrays(), "rates": self._rates}, list(self._poses), state)
+        self._poses = poses
+        self._take(self._true if state["true_inertia"] else self._scaled)
+
+    def pose(self, name: str) -> Pose:
+        return self._poses[name]
+
+    def wrench(self, name: str) -> NDArray[np.float64]:
+        first = FORCE + 6 * self.sensors.index(name)
+        wrench: NDArray[np.float64] = (
+            self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
+        )
+        wrench[3:] /= MM
+        return wrench
+
+    def surface(self, name: str) -> GelSurface:
+        return gel_surface(self._gel, self._state.gels, self._index, self.sensors.index(name))
+
+    # ---------------------------------------------------------------- inertia
+
+    def _take(self, inertia: Inertia) -> None:
+        """Answers to forces by `inertia` from now on."""
+        self._inertia = inertia
+        self._answer(None)
+
+    def _answer(self, launch: Launch | None) -> None:
+        entries = self._inertia.entries(launch)
+        self._state.facts[self._index, list(entries)] = list(entries.values())
+
+    def _change(self, inertia: Inertia) -> None:
+        """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
+        if inertia is not self._inertia:
+            self._stop()
+            self._take(inertia)
+
+    # ----------------------------------------------------------------- motion
+
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
+        *, flow: bool = False,
+    ) -> MoveStats:  # fmt: skip
+        return run(self.motion(Order(targets, loads or {}, duration, flow)), self._advance)
+
+    def motion(self, order: Order) -> Motion:
+        """`move`, a launch at a time."""
+        end = merged(self._poses, order.targets)
+        require_loads(order.loads, self.sensors)
+        begin, goals, rest = dict(self._poses), dict(end), np.zeros_like(self._rates)
+        a, b = list(begin.values()), list(end.values())
+        timed = None
+        if order.duration is not None:
+            timed = plan_in_time(a, b, order.duration, self._true, max(self._gel.half))
+        onward, stop = self._plan_on(a, b), self._plan_on(a, a)
+
+        def after_stop(refine: int) -> Motion:
+            self._change(self._scaled if timed is None else self._true)
+            settling, balanced = self.scene.settling, self.balanced
+            if timed is not None:
+                return (yield from move_in_time(replace(timed, refine=refine), settling, balanced=balanced))
+            if order.loads:
+                end.update(goals)
+                return (yield from keep_loads(self, begin, end, order.loads, refine, balanced=balanced))
+            return (yield from move_and_settle(replace(self.plan(a, b), refine=refine), settling, balanced=balanced))
+
+        def tried(refine: int) -> Motion:
+            if order.flow:
+                self._change(self._scaled)
+                return move_on(replace(onward, refine=refine), self.scene.settling, balanced=self.balanced)
+            if self._rates.any():
+                return come_to_rest(replace(stop, refine=refine), after_stop(refine))
+            return after_stop(refine)
+
+        stats = yield from retried(self, order, tried)
+        self._poses = end
+        self._rates[...] = onward.rates[1] if order.flow and onward.rates is not None else rest
+        return stats
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of all driven frames, at the scene's speed."""
+        mach, gel = self.scene.settling.mach, self._gel
+        return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness)
+
+    def _plan_on(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        mach, gel = self.scene.settling.flow_mach, self._gel
+        return plan_on(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
+
+    def _advance(self, path: Path, first: int, last: int) -> Reading:
+        prepared = self.prepare(Launch(path, first, last))
+        self._state.advance({self._index: prepared.drive})
+        return self.outcome(prepared)

@@ -23,7 +23,7 @@ from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.photometric import PhotometricLight, places_in_image
 from tacsim.optics.spline import line_matrices
-from tacsim.optics.surface import SurfaceTable, sample_surface
+from tacsim.optics.surface import SurfaceTable
 from tacsim.scene import GelSurface
 
 Float32 = NDArray[np.float32]
@@ -84,11 +84,12 @@ class Renderer:
 
     def _shaded(self, surface: GelSurface) -> Float32:
         """(H, W, 3) light of the lamps, by the slopes of the surface and of its texture; 255 is white."""
-        gradient = sample_surface(surface, self._grid).gradient
+        table = SurfaceTable(surface)
+        slopes, _ = table.seen(table.fields[..., 1:], self._grid, fine=False)
         light = np.empty((*self._grid.shape, 3), dtype=np.float32)
 
         for strip in strips(self._grid.rows):
-            light[strip] = WHITE * shade(gradient[strip] + self._texture[strip], self.model.lighting)
+            shade(slopes[strip] + self._texture[strip], self.model.lighting, 255.0, light[strip])
         return light
 
     def _calibrated(self, calibrated: PhotometricLight, surface: GelSurface) -> Float32:
@@ -108,24 +109,27 @@ class Renderer:
         return change
 
 
-def shade(gradient: Float32, lighting: Lighting) -> Float32:
-    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2); 1 is white. Exactly the same for lights
-    in any order: they are summed in an order of their own."""
+def shade(gradient: Float32, lighting: Lighting, white: float = 1.0, out: Float32 | None = None) -> Float32:
+    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2), into `out` if given. Exactly the same
+    for lights in any order: they are summed in an order of their own."""
     import cv2
 
-    slope_x, slope_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
-    facing = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)  # n . v
-    channels = [np.zeros(slope_x.shape, dtype=np.float32) for _ in range(3)]
+    slope_x, slope_y = cv2.split(gradient)
+    square = np.asarray(cv2.accumulateSquare(slope_y, slope_x * slope_x), dtype=np.float32)
+    facing = np.float32(1.0) / np.sqrt(square + np.float32(1.0))  # n . v
+    channels = np.zeros((3, *slope_x.shape), dtype=np.float32)
     for light in sorted(lighting.lights, key=_order):
-        lx, ly, lz = (np.float32(c / math.hypot(*light.direction)) for c in light.direction)
-        lit = np.maximum((slope_x * -lx + slope_y * -ly - lz) * facing, np.float32(0.0))  # n . l
-        brightness = lit * np.float32(light.diffuse)
+        lx, ly, lz = (c / math.hypot(*light.direction) for c in light.direction)
+        lit = np.maximum(cv2.addWeighted(slope_x, -lx, slope_y, -ly, -lz) * facing, np.float32(0.0))  # n . l
         if light.specular > 0:
-            mirrored = np.maximum(2.0 * lit * facing + lz, np.float32(0.0))  # r . v, as l . v = -lz
-            brightness += np.float32(light.specular) * cv2.pow(mirrored, lighting.shininess)
+            mirrored = np.maximum(2.0 * lit * facing + np.float32(lz), np.float32(0.0))  # r . v, as l . v = -lz
+            shiny = cv2.pow(mirrored, lighting.shininess)
+            brightness = cv2.addWeighted(lit, light.diffuse, shiny, light.specular, 0.0)
+        else:
+            brightness = lit * np.float32(light.diffuse)
         for channel, colour in zip(channels, light.colour, strict=True):
-            channel += brightness * np.float32(colour)
-    return np.asarray(cv2.merge(channels), dtype=np.float32)
+            cv2.scaleAdd(brightness, white * colour, channel, dst=channel)
+    return np.asarray(cv2.merge(list(channels), dst=out), dtype=np.float32)
 
 
 def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:

@@ -39,6 +39,8 @@ CASES: tuple[Case, ...] = (
     *reliability.CASES,
 )
 
+CPU_ONLY = "it runs on the CPU only"
+
 BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
     ("real", real.CASE): real.contact_radius,
     ("real", films.CASE): films.marker_film,
@@ -67,10 +69,7 @@ def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data
     ]
     if backend() == "cpu":
         return cases
-    return [
-        replace(case, missing=case.missing or "it runs on the CPU only") if case.cpu or case.method != "tacsim" else case
-        for case in cases
-    ]
+    return [replace(case, missing=case.missing or CPU_ONLY) if case.needs_cpu else case for case in cases]
 
 
 def _real_cases(data: Path) -> tuple[Case, ...]:

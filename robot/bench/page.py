@@ -52,9 +52,7 @@ ON_DEVICE = (
     "Kernels ran on the device; images are drawn by the processor there too, and MB is the process's own memory. "
     "*CPU / GPU* is seconds of the same row in the tables above over seconds here: two runs, perhaps on two machines."
 )
-NO_DEVICE = (
-    "No GPU has been measured yet: `make test-gpu`, where there is CUDA, tests and measures one and adds it to this page."
-)
+NO_DEVICE = "No GPU has been measured yet: where there is CUDA, `make test-gpu` measures it and adds it to this page."
 
 
 def cells(row: Row) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 from robot.bench.measure import Measurement, Timing, timed
 from robot.bench.press import press, press_scene
 from robot.bench.runner import Case
-from robot.bench.squeeze import NOT_SETTLED, PRESETS, close, closer, normal_forces, squeeze_scene, touching
+from robot.bench.squeeze import PRESETS, close, closer, normal_forces, squeeze_scene, touching
 from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
 
@@ -132,16 +132,18 @@ def batch(count: int, repeat: int) -> list[Measurement]:
 
     begin = touching(squeeze_scene("draft"))
     close(begin, 0.5e-3)
-    scene = squeeze_scene("draft", **NOT_SETTLED)
+    scene = squeeze_scene("draft", max_substeps=0)
     alone, many = make_world(scene), Batch([scene] * count)
     for world in (alone, *many.worlds):
         world.restore(begin.snapshot())
 
     def run() -> MoveStats:
-        for end in many.move([closer(world, STEP) for world in many.worlds]):
-            if not isinstance(end, MoveStats):
-                raise RuntimeError(f"an environment of the batch did not arrive: {end}")
-        return end
+        ends = many.move([closer(world, STEP) for world in many.worlds])
+        for end in ends:
+            if isinstance(end, Exception):
+                raise end
+        assert isinstance(ends[0], MoveStats)
+        return ends[0]
 
     timing, stats = timed(run, repeat)
     for _ in range(len(timing.samples) + 1):  # as often as the batch, which was moved once untimed
@@ -150,9 +152,7 @@ def batch(count: int, repeat: int) -> list[Measurement]:
     error = max(abs(float(normal_forces(world).mean()) / force - 1) for world in many.worlds) * 100
     each = timing.median * 1e6 / (stats.substeps * count)
     figures = {"wall_per_environment_substep_us": each, "force_n": force}
-    return [
-        Measurement(timing, error, "% of force", "the same motions of a world alone", "", stats.substeps, figures)
-    ]
+    return [Measurement(timing, error, "% of force", "the same motions of a world alone", "", stats.substeps, figures)]
 
 
 def _indenter(name: str, shape: Callable[[Path], Shape]) -> Case:

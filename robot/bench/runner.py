@@ -42,13 +42,13 @@ class Case:
     measure: Callable[[int], list[Measurement]]  # repetitions -> rows
     baseline: bool = False  # only with --baselines: a method that is not ours
     long: bool = False  # only with --long: ours, but more than some seconds
-    cpu: bool = False  # ours, but by kernels that a device does not have
+    cpu: bool = False  # ours, but in NumPy or by kernels of the CPU alone
     missing: str = ""  # why it cannot be measured here: what the user's folder lacks
 
     @property
     def needs_cpu(self) -> bool:
         """Whether it says nothing of a device. Other methods are written for the CPU, or in NumPy."""
-        return self.cpu or self.method != "tacsim"
+        return self.cpu or self.method != "tacsim" or self.group == "robot"
 
 
 def lacking(group: Group, name: str, why: str, resolution: str = "") -> Case:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from robot.bench import runner
+from robot.bench import observe, runner, touching
 from robot.bench.cases import CPU_ONLY, chosen
 from robot.bench.page import NO_DEVICE, markdown
 from robot.bench.runner import run_cases
@@ -112,6 +112,8 @@ def test_what_needs_the_cpu_is_named_and_not_run_on_a_device(monkeypatch: pytest
     assert {case.method for case in left} == {"tacsim", "seed", "textbook", "tacchi-settings", "layer"}
     measured = {case.name for case in there if not case.missing}
     assert measured >= {"sphere_press", "squeeze", "control_step", "batch", "gel_step", "yield_plateau", "second_world"}
+    assert all(case.missing for case in chosen(["robot"], baselines=False))
+    assert all(case.needs_cpu for case in (*observe.CASES, *touching.CASES))
     report = run_cases(left, 1, baselines=True)
     assert report.results == [] and report.failures == []
     assert {lack.cause for lack in report.missing} == {CPU_ONLY}

@@ -119,8 +119,8 @@ def test_what_needs_the_cpu_is_named_and_not_run_on_a_device(monkeypatch: pytest
     assert {lack.cause for lack in report.missing} == {CPU_ONLY}
 
 
-def test_each_single_block_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A case that makes a block of its own would fail on a device, which `start` refuses there."""
+def test_what_is_marked_in_the_materials_group_makes_a_single_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which `start` refuses on a device."""
     from robot.bench import blocks
 
     def refuse(cpu_only: str | None = None) -> str:

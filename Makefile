@@ -23,7 +23,7 @@ help:
 	@echo "make test         install with dev extras, then lint, types, import contract, tests   (ARGS=\"-k rig\")"
 	@echo "make check        the same without the tests"
 	@echo "make test-all     make test, then the long runs"
-	@echo "make test-gpu     the physics tests and benchmarks on CUDA   (without a CUDA device: says so, and fails)"
+	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
 	@echo "make test-extras  tests that need heavy extras"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
@@ -49,8 +49,9 @@ test-gpu: $(DEV)
 	@TACSIM_DEVICE=cuda $(BIN)/python -c 'from tacsim.runtime import start; start()' >/dev/null 2>&1 || { \
 	  echo "make test-gpu: Taichi finds no CUDA device (or no driver) on this machine, so nothing was tested."; exit 77; }
 	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q tests/physics $(ARGS)
-	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench press --json runs/gpu/press.json
-	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench squeeze --json runs/gpu/squeeze.json
+	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench all --long --json benchmarks/gpu/report.json
+	@$(BIN)/tacsim bench --from benchmarks/reference.json --from benchmarks/gpu/report.json --docs docs
+	@echo "To publish the figures, commit benchmarks/gpu and docs."
 
 test-extras:
 	@echo "No heavy extras yet: nothing to test."

@@ -163,6 +163,7 @@ def cases(folder: Path) -> tuple[Case, ...]:
     return tuple(
         Case(
             "real", CASE, "tacsim", f"{of.pixel_pitch * 1e3:.3g} mm a pixel", partial(ball_presses, folder, of),
+            cpu=True,
             missing="" if is_there(folder, of) else f"{of.name}: no {of.wanted} below {folder}",
         )
         for of in read_sets(folder)

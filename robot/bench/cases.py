@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from robot.bench import (
     twins,
 )
 from robot.bench.labels import BadData
-from robot.bench.runner import Case, lacking
+from robot.bench.runner import Case, backend, lacking
 from robot.bench.schema import Group
 
 CASES: tuple[Case, ...] = (
@@ -37,6 +38,8 @@ CASES: tuple[Case, ...] = (
     *scenes.CASES,
     *reliability.CASES,
 )
+
+CPU_ONLY = "it runs on the CPU only"
 
 BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
     ("real", real.CASE): real.contact_radius,
@@ -54,14 +57,19 @@ BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend o
 def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None) -> list[Case]:
     """The cases of `groups` in their order; other methods only with `baselines`, long ones only with `long`.
 
+    On a device (TACSIM_DEVICE) other methods, and cases that need the CPU, are named as not measured.
+
     `data`: folder of the real group's frames; without it that group has no cases. Raises BadData, ConfigError for one
     that cannot be used.
     """
     wanted = set(groups)
     every = CASES if data is None or "real" not in wanted else (*CASES, *_real_cases(data))
-    return [
+    cases = [
         case for case in every if case.group in wanted and (baselines or not case.baseline) and (long or not case.long)
     ]
+    if backend() == "cpu":
+        return cases
+    return [replace(case, missing=case.missing or CPU_ONLY) if case.needs_cpu else case for case in cases]
 
 
 def _real_cases(data: Path) -> tuple[Case, ...]:

@@ -147,6 +147,6 @@ def _frames(path: Path) -> Iterator[Image]:
 def cases(folder: Path) -> tuple[Case, ...]:
     """A case for each film below `folder`. Raises BadData, ConfigError."""
     return tuple(
-        Case("real", CASE, "tacsim", "the film's own pixels", partial(marker_film, film, path))
+        Case("real", CASE, "tacsim", "the film's own pixels", partial(marker_film, film, path), cpu=True)
         for film, path in read_films(folder).items()
     )

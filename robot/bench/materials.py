@@ -350,12 +350,12 @@ CUBES = (  # side, spacing [m]
 )
 
 CASES = (
-    Case("materials", "oedometer", "tacsim", "h 1 mm", partial(oedometer, 1e-3)),
-    Case("materials", "oedometer", "tacsim", "h 0.5 mm", partial(oedometer, 0.5e-3)),
+    Case("materials", "oedometer", "tacsim", "h 1 mm", partial(oedometer, 1e-3), cpu=True),
+    Case("materials", "oedometer", "tacsim", "h 0.5 mm", partial(oedometer, 0.5e-3), cpu=True),
     Case("materials", "simple_shear", "tacsim", "64000 points", simple_shear),
-    Case("materials", "wave_speed", "tacsim", "h 0.5 mm", partial(gel_wave, 0.5e-3)),
-    Case("materials", "wave_speed", "tacsim", "dx 0.5 mm", partial(body_wave, 0.25e-3)),
-    Case("materials", "momentum", "tacsim", "dx 1 mm", momentum),
+    Case("materials", "wave_speed", "tacsim", "h 0.5 mm", partial(gel_wave, 0.5e-3), cpu=True),
+    Case("materials", "wave_speed", "tacsim", "dx 0.5 mm", partial(body_wave, 0.25e-3), cpu=True),
+    Case("materials", "momentum", "tacsim", "dx 1 mm", momentum, cpu=True),
     *(Case("materials", name, "tacsim", at, partial(yield_plateau, side, fine)) for name, at, side, fine in CUBES),
     *(
         Case("materials", name, "textbook", at, partial(textbook_plateau, side, fine), baseline=True)
@@ -367,6 +367,7 @@ CASES = (
         "tacsim",
         "dx 0.5 mm, 64000 particles",
         partial(plasticine_alone, 10e-3, 0.25e-3),
+        cpu=True,
     ),
     Case("materials", "gel_step", "tacsim", "h 0.5 mm", gel_step),
 )

@@ -120,6 +120,9 @@ def normaliser(repeat: int) -> list[Measurement]:
 
 
 CASES = (
-    *(Case("real", RENDER, "tacsim", f"{width} px wide", partial(calibrated_render, width)) for width in (640, 320)),
-    Case("real", NORMALISE, "tacsim", "320 px wide", normaliser),
+    *(
+        Case("real", RENDER, "tacsim", f"{width} px wide", partial(calibrated_render, width), cpu=True)
+        for width in (640, 320)
+    ),
+    Case("real", NORMALISE, "tacsim", "320 px wide", normaliser, cpu=True),
 )

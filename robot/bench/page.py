@@ -8,7 +8,7 @@ from pathlib import Path
 from robot.bench import targets
 from robot.bench.cases import description
 from robot.bench.picture import PICTURE, RADII, draw, draw_radii
-from robot.bench.schema import Report, Row
+from robot.bench.schema import Machine, Report, Row
 
 GROUP_WORDS = {
     "press": "Press: a rigid indenter on one gel",
@@ -34,7 +34,8 @@ READING = (
     "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`, under a minute. Other methods need "
     "`--baselines`, our own long rows (fine meshes, `standard` squeezes, 100,000 substeps of rest) `--long`; both take "
     "many minutes. This page: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then `tacsim "
-    "bench --from benchmarks/reference.json --docs docs`.\n"
+    "bench --from benchmarks/reference.json --docs docs`, with `--from benchmarks/gpu/report.json` too where there is "
+    "one. That is of a GPU: `make test-gpu` measures it and writes the page.\n"
     "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
     "`robot/bench/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
@@ -45,6 +46,13 @@ READING = (
     "sensor of the known depths is calibrated. *null* beside an error is what no contact at all would score. What "
     "the folder lacks stands under *Not measured*."
 )
+
+
+ON_DEVICE = (
+    "Kernels ran on the device; images are drawn by the processor there too, and MB is the process's own memory. "
+    "*CPU / GPU* is seconds of the same row in the tables above over seconds here: two runs, perhaps on two machines."
+)
+NO_DEVICE = "No GPU has been measured yet: where there is CUDA, `make test-gpu` measures it and adds it to this page."
 
 
 def cells(row: Row) -> list[str]:
@@ -66,12 +74,13 @@ def costs(row: Row) -> list[str]:
     found = []
     for name, value in row.figures.items():
         kind, per, rest = name.partition("_per_")
-        if per and rest.endswith("_substep_ns"):
-            found.append(f"{value:.0f} ns {kind} a substep and {rest.removesuffix('_substep_ns')}")
+        what, substep, unit = rest.rpartition("_substep_")
+        if per and substep:
+            found.append(f"{value:.0f} {unit.replace('us', 'µs')} {kind} a substep and {what}")
     return found
 
 
-def write_page(report: Report, folder: Path) -> list[Path]:
+def write_page(report: Report, folder: Path, devices: Sequence[Report] = ()) -> list[Path]:
     """Writes benchmarks.md, and its pictures into images/, below `folder`; returns their paths. Raises OSError."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -80,12 +89,12 @@ def write_page(report: Report, folder: Path) -> list[Path]:
     if draw_radii(report.results, images / RADII):
         pictures.append(images / RADII)
     page = folder / "benchmarks.md"
-    page.write_text(markdown(report), encoding="utf-8")
+    page.write_text(markdown(report, devices), encoding="utf-8")
     return [page, *pictures]
 
 
-def markdown(report: Report) -> str:
-    """The page. The same report gives the same text."""
+def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
+    """The page of a report of the CPU, and of some of devices. The same reports give the same text."""
     parts = [
         "# Benchmarks",
         "Written by `tacsim bench --from FILE --docs docs`; do not edit. Every row is time, error and memory of one "
@@ -107,14 +116,54 @@ def markdown(report: Report) -> str:
         if group == "real" and rows:
             parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
     if report.failures:
-        parts += ["## Failed", *(f"- {f.case}, {f.method}, {f.resolution}: {f.cause}" for f in report.failures)]
+        parts += ["## Failed", _failures(report)]
+    for title in dict.fromkeys(_title(each) for each in devices):
+        parts += _on_device(title, [each for each in devices if _title(each) == title], report)
     parts += [
         "## Not measured",
         *(["\n".join(f"- {m.case}: {m.cause}" for m in report.missing)] if report.missing else []),
         "Whether hard cases end their process is counted by a test, `test_no_case_ended_the_process` in "
         "`tests/stability`.",
+        *([] if devices else [NO_DEVICE]),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _on_device(title: str, reports: Sequence[Report], cpu: Report) -> list[str]:
+    """The section of one device."""
+    usual = {_identity(row): row.seconds for row in cpu.results}
+
+    def ratio(row: Row) -> str:
+        seconds = usual.get(_identity(row))
+        return "" if seconds is None or row.seconds == 0 else f"{seconds / row.seconds:.3g} x"
+
+    parts = [f"## On a GPU: {title}", *dict.fromkeys(map(setting, reports)), ON_DEVICE]
+    for group, words in GROUP_WORDS.items():
+        rows = [row for report in reports for row in report.results if row.group == group]
+        if rows:
+            lines = ([*cells(row), ratio(row)] for row in rows)
+            parts += [f"### {words}", table((*COLUMNS, "CPU / GPU"), lines), *_remarks(rows)]
+    lost = [_failures(report) for report in reports if report.failures]
+    parts += ["### Failed there", *lost] if lost else []
+    missing = [lack for report in reports for lack in report.missing]
+    for cause in dict.fromkeys(lack.cause for lack in missing):
+        cases = dict.fromkeys(f"{lack.case}, {lack.method}" for lack in missing if lack.cause == cause)
+        parts.append(f"Not measured there ({cause}): {'; '.join(cases)}.")
+    return parts
+
+
+def _title(report: Report) -> str:
+    device = report.metadata.machine.device
+    return "" if device is None else device.title
+
+
+def _identity(row: Row) -> tuple[str, ...]:
+    """What the rows of two runs have in common when they measure the same."""
+    return row.group, row.case, row.variant, row.method, row.resolution
+
+
+def _failures(report: Report) -> str:
+    return "\n".join(f"- {f.case}, {f.method}, {f.resolution}: {f.cause}" for f in report.failures)
 
 
 def setting(report: Report) -> str:
@@ -130,9 +179,19 @@ def setting(report: Report) -> str:
     if facts.changed:
         commit += ", **and the code changed while this ran**: not all rows are of one version"
     return (
-        f"{machine.cpu}, {machine.cores} cores, {machine.system}; {load} (others worked on the machine if it is above "
-        f"the number of cores; compare CPU s then). {facts.date:%Y-%m-%d}, {commit}; {versions}."
+        f"{_hardware(machine)}; {load} (others worked on the machine if it is above the number of cores; compare CPU s "
+        f"then). {facts.date:%Y-%m-%d}, {commit}; {versions}."
     )
+
+
+def _hardware(machine: Machine) -> str:
+    """Processor and, if kernels ran on one, device."""
+    host, device = f"{machine.cpu}, {machine.cores} cores, {machine.system}", machine.device
+    if device is None:
+        return host
+    memory = f", {device.memory_gb:g} GB" if device.memory_gb is not None else ""
+    driver = f", driver {device.driver}" if device.driver is not None else ""
+    return f"{device.title} ({device.backend}{memory}{driver}) beside {host}"
 
 
 def _remarks(rows: Sequence[Row]) -> list[str]:

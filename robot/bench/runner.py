@@ -24,7 +24,7 @@ from typing import Any
 
 from robot.bench.cache import fingerprint
 from robot.bench.measure import Measurement, forget_peak_memory, peak_memory
-from robot.bench.schema import Failure, Group, Machine, Metadata, Missing, Report, Row
+from robot.bench.schema import Device, Failure, Group, Machine, Metadata, Missing, Report, Row
 from robot.realtime import allowed
 
 EXIT = 10.0  # [s] a process may take to end after its last word
@@ -42,7 +42,13 @@ class Case:
     measure: Callable[[int], list[Measurement]]  # repetitions -> rows
     baseline: bool = False  # only with --baselines: a method that is not ours
     long: bool = False  # only with --long: ours, but more than some seconds
+    cpu: bool = False  # ours, but in NumPy or by kernels of the CPU alone
     missing: str = ""  # why it cannot be measured here: what the user's folder lacks
+
+    @property
+    def needs_cpu(self) -> bool:
+        """Whether it says nothing of a device. Other methods are written for the CPU, or in NumPy."""
+        return self.cpu or self.method != "tacsim" or self.group == "robot"
 
 
 def lacking(group: Group, name: str, why: str, resolution: str = "") -> Case:
@@ -233,7 +239,36 @@ def _machine(load_before: list[float] | None) -> Machine:
         load_before=load_before,
         load_after=_load(),
         realtime=allowed(),
+        device=_device(),
     )
+
+
+def backend() -> str:
+    """Where the processes of cases compute. As tacsim.runtime reads it, which would import Taichi."""
+    return os.environ.get("TACSIM_DEVICE") or "cpu"
+
+
+def _device() -> Device | None:
+    """The GPU that cases compute on, None for the CPU; its name as far as a tool tells it."""
+    if backend() == "cpu":
+        return None
+    if backend() == "cuda":
+        try:
+            name, memory, driver = _nvidia()
+        except (OSError, subprocess.SubprocessError, ValueError, IndexError):
+            return Device(backend="cuda")
+        size = round(int(memory) * 2**20 / 1e9, 1) if memory.isdecimal() else None  # None: it shares the host's
+        return Device(backend="cuda", name=name, memory_gb=size, driver=driver)
+    return Device(backend=backend())
+
+
+def _nvidia() -> list[str]:
+    """Name, memory [MiB] and driver of the first GPU that may be seen, which Taichi takes."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").partition(",")[0]
+    words = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"]
+    words += [f"--id={visible}"] if visible else []
+    done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
+    return [word.strip() for word in done.stdout.splitlines()[0].split(",")]
 
 
 def _cpu() -> str:

@@ -13,13 +13,15 @@ import numpy as np
 from robot.bench.measure import Measurement, Timing, timed
 from robot.bench.press import press, press_scene
 from robot.bench.runner import Case
-from robot.bench.squeeze import PRESETS, close, normal_forces, squeeze_scene, touching
+from robot.bench.squeeze import PRESETS, close, closer, normal_forces, squeeze_scene, touching
 from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
 
 DEPTH = 0.3e-3  # of an indenter [m]
 CLOSE = 0.3e-3  # both sensors together [m]
 RADIUS = 4e-3
+ENVIRONMENTS = (1, 8, 64)
+STEP = 0.1e-3  # of a batch's sensors together [m]
 AT_REST = "contact force against force at the backing, and their change"
 
 
@@ -124,6 +126,35 @@ def _made_and_moved(scene: Scene) -> tuple[World, float, float]:
     return world, (made - began) * 1e3, (time.perf_counter() - made) * 1e3
 
 
+def batch(count: int, repeat: int) -> list[Measurement]:
+    """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: what a substep costs each of them."""
+    from tacsim.physics.batch import Batch
+
+    begin = touching(squeeze_scene("draft"))
+    close(begin, 0.5e-3)
+    scene = squeeze_scene("draft", max_substeps=0)
+    alone, many = make_world(scene), Batch([scene] * count)
+    for world in (alone, *many.worlds):
+        world.restore(begin.snapshot())
+
+    def run() -> MoveStats:
+        ends = many.move([closer(world, STEP) for world in many.worlds])
+        for end in ends:
+            if isinstance(end, Exception):
+                raise end
+        assert isinstance(ends[0], MoveStats)
+        return ends[0]
+
+    timing, stats = timed(run, repeat)
+    for _ in range(len(timing.samples) + 1):  # as often as the batch, which was moved once untimed
+        close(alone, STEP)
+    force = float(normal_forces(alone).mean())
+    error = max(abs(float(normal_forces(world).mean()) / force - 1) for world in many.worlds) * 100
+    each = timing.median * 1e6 / (stats.substeps * count)
+    figures = {"wall_per_environment_substep_us": each, "force_n": force}
+    return [Measurement(timing, error, "% of force", "the same motions of a world alone", "", stats.substeps, figures)]
+
+
 def _indenter(name: str, shape: Callable[[Path], Shape]) -> Case:
     return Case("scenes", f"indenter_{name}", "tacsim", "gel 1 mm", partial(rigid, shape))
 
@@ -132,4 +163,5 @@ CASES = (
     *(_indenter(n, f) for n, f in (("sphere", _ball), ("cylinder", _cylinder), ("box", _box), ("mesh", _mesh))),
     *(Case("scenes", f"body_{m}", "tacsim", PRESETS["draft"], partial(body, m)) for m in ("elastic", "plastic")),
     *(Case("scenes", "second_world", "tacsim", words, partial(second_world, p)) for p, words in PRESETS.items()),
+    *(Case("scenes", "batch", "tacsim", f"{n} x {PRESETS['draft']}", partial(batch, n)) for n in ENVIRONMENTS),
 )  # fmt: skip

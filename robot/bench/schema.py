@@ -58,6 +58,19 @@ class Missing(_Frozen):
     cause: str  # what is missing, and where it was looked for
 
 
+class Device(_Frozen):
+    """The GPU that kernels ran on. None: could not be found out."""
+
+    backend: str  # of Taichi: cuda, vulkan, metal
+    name: str | None = None
+    memory_gb: NotNegative | None = None
+    driver: str | None = None
+
+    @property
+    def title(self) -> str:
+        return self.name or f"a {self.backend} device"
+
+
 class Machine(_Frozen):
     """Where it was measured. The load averages tell how much else went on."""
 
@@ -68,6 +81,7 @@ class Machine(_Frozen):
     load_before: list[float] | None  # load averages of 1, 5 and 15 minutes; None where the system has none
     load_after: list[float] | None
     realtime: bool | None = None  # workers and mock controllers were real-time processes; None: not recorded
+    device: Device | None = None  # None: kernels ran on the CPU
 
 
 class Metadata(_Frozen):

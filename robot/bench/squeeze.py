@@ -42,13 +42,18 @@ def touching(scene: Scene) -> World:
     return world
 
 
-def close(world: World, by: float) -> MoveStats:
-    """Moves both sensors towards each other, by `by` [m] in all."""
+def closer(world: World, by: float) -> dict[str, Pose]:
+    """Targets of both sensors, nearer to each other by `by` [m] in all."""
     targets = {}
     for name, sign in (("lower", 1.0), ("upper", -1.0)):
         pose = world.pose(name)
         targets[name] = Pose(pose.position + [0.0, 0.0, sign * by / 2], pose.quaternion)
-    return world.move(targets)
+    return targets
+
+
+def close(world: World, by: float) -> MoveStats:
+    """Moves both sensors towards each other, by `by` [m] in all."""
+    return world.move(closer(world, by))
 
 
 def normal_forces(world: World) -> FloatArray:

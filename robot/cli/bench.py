@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -51,7 +52,12 @@ def bench(
         typer.Option("--docs", metavar="DIR", help="Write the pages here: benchmarks.md, reliability.md."),
     ] = None,
     from_: Annotated[
-        Path | None, typer.Option("--from", metavar="FILE", help="Measure nothing: show this report of an earlier run.")
+        list[Path] | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            help="Measure nothing: show this report of an earlier run. Repeat it to add reports of GPUs.",
+        ),
     ] = None,
     renew: Annotated[
         bool, typer.Option("--renew", help="First compute the limit of the ball's press anew: half an hour.")
@@ -64,18 +70,29 @@ def bench(
     Group `real` needs --data; `all` leaves it out without. Group `robot` measures what is promised of arms and cameras,
     on mock hardware; it wants an idle machine, so `all` leaves it out.
 
+    With TACSIM_DEVICE=cuda the cases run on a GPU, without those that need the CPU. Such a report comes on the page
+    beside one of the CPU: --from CPU.json --from GPU.json --docs docs.
+
     Example: tacsim bench press --json press.json
     """
-    if from_ is not None:
-        report = _read(from_)
+    if from_:
+        if json_ is not None and len(from_) > 1:
+            raise typer.BadParameter("one file holds one report: give --from once", param_hint="--json")
+        reports = [_read(path) for path in from_]
+        if docs is not None:
+            reports = _for_a_page(reports, from_)
     else:
+        if docs is not None:
+            _refuse_a_page_of_a_device()
         if renew:
             from robot.bench.limit import renew as compute
 
             with busy("computing the limit of fine meshes"):
                 compute(notes.print)
-        report = _measure(group, repeat, baselines=baselines, long=long, data=data)
-    _show(report)
+        reports = [_measure(group, repeat, baselines=baselines, long=long, data=data)]
+    for report in reports:
+        _show(report, titled=len(reports) > 1)
+    report, *devices = reports
     measured = report.metadata.groups
     physics = measured != ["robot"]
     written: list[Path] = []
@@ -93,10 +110,10 @@ def bench(
             from robot.bench.page import write_page
             from robot.bench.reliability_page import write_reliability
 
-            written += write_page(report, docs) if physics else []
+            written += write_page(report, docs, devices) if physics else []
             written += [write_reliability(report, docs)] if "robot" in measured else []
     say_files(*written)
-    if report.failures:
+    if any(report.failures for report in reports):
         raise typer.Exit(1)
 
 
@@ -107,11 +124,33 @@ def _read(path: Path) -> Report:
 
     try:
         return Report.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise typer.BadParameter(f"{path} cannot be read: {error.strerror}", param_hint="--from") from None
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the whole file"
         words = f"{path} is no report of tacsim bench: {place}: {first['msg']} ({error.error_count()} problems)"
         raise typer.BadParameter(words, param_hint="--from") from None
+
+
+def _refuse_a_page_of_a_device() -> None:
+    from robot.bench.runner import backend
+
+    if backend() != "cpu":
+        words = f"TACSIM_DEVICE is '{backend()}', but a page needs the CPU's report too: use --json now, then --from"
+        raise typer.BadParameter(words, param_hint="--docs")
+
+
+def _for_a_page(reports: Sequence[Report], paths: Sequence[Path]) -> list[Report]:
+    """The one report of the CPU, then those of devices."""
+    of_cpu = [report.metadata.machine.device is None for report in reports]
+    if sum(of_cpu) != 1:
+        found = ", ".join(str(path) for path, cpu in zip(paths, of_cpu, strict=True) if cpu) or "none"
+        raise typer.BadParameter(f"a page is made of one report of the CPU; given are: {found}", param_hint="--from")
+    report = reports[of_cpu.index(True)]
+    if len(reports) > 1 and report.metadata.groups == ["robot"]:
+        raise typer.BadParameter("reports of GPUs belong to one of the physics, not of the robot", param_hint="--from")
+    return [report, *(each for each in reports if each is not report)]
 
 
 def _measure(group: Groups, repeat: int, *, baselines: bool, long: bool, data: Path | None) -> Report:
@@ -149,11 +188,12 @@ def _measure(group: Groups, repeat: int, *, baselines: bool, long: bool, data: P
             raise typer.Exit(interrupt.exit_code) from None
 
 
-def _show(report: Report) -> None:
+def _show(report: Report, *, titled: bool) -> None:
+    """titled: says first where it was measured."""
     from rich.console import Console
     from rich.table import Table
 
-    from robot.bench.page import COLUMNS, cells
+    from robot.bench.page import COLUMNS, cells, setting
 
     table = Table(box=None, padding=(0, 1))
     for column in COLUMNS:
@@ -161,7 +201,10 @@ def _show(report: Report) -> None:
     for row in report.results:
         table.add_row(*cells(row))
     # a file or a pipe has no width; a table folded to 80 columns cannot be read there
-    Console(width=None if results.is_terminal else 160, highlight=False).print(table)
+    console = Console(width=None if results.is_terminal else 160, highlight=False)
+    if titled:
+        console.print(setting(report), markup=False)
+    console.print(table)
     for lack in report.missing:
         notes.print(f"not measured: {lack.case}: {lack.cause}", markup=False)
     for failure in report.failures:

@@ -9,6 +9,8 @@ import pytest
 from robot.bench import deep, press, scenes
 from robot.bench.squeeze import close, squeeze_scene, touching
 from tacsim.interface import Pose
+from tacsim.physics.batch import Batch
+from tacsim.physics.health import SimulationDiverged
 
 
 def test_slab_theory() -> None:
@@ -23,6 +25,21 @@ def test_a_second_world_is_the_first_once_more() -> None:
     (row,) = scenes.second_world("draft", 1)
     assert row.error == 0.0
     assert row.figures["second_ms"] > 0 and row.figures["first_ms"] > 0
+
+
+def test_a_batch_goes_the_way_of_a_world_alone() -> None:
+    (row,) = scenes.batch(2, 1)
+    assert row.error == 0.0 and row.figures["force_n"] > 0.1
+    assert row.substeps and row.substeps > 0
+    each = row.figures["wall_per_environment_substep_us"]
+    assert each == pytest.approx(row.timing.median * 1e6 / (2 * row.substeps))
+
+
+def test_a_batch_that_diverges_is_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = SimulationDiverged("lost", "made up")
+    monkeypatch.setattr(Batch, "move", lambda self, targets: [None, lost])
+    with pytest.raises(SimulationDiverged):
+        scenes.batch(2, 1)
 
 
 @pytest.mark.parametrize("shape", [scenes._ball, scenes._cylinder, scenes._box], ids=["ball", "cylinder", "box"])

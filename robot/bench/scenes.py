@@ -13,7 +13,7 @@ import numpy as np
 from robot.bench.measure import Measurement, Timing, timed
 from robot.bench.press import press, press_scene
 from robot.bench.runner import Case
-from robot.bench.squeeze import PRESETS, close, closer, normal_forces, squeeze_scene, touching
+from robot.bench.squeeze import PRESETS, STEP, close, closer, normal_forces, squeeze_scene, touching
 from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
 
@@ -21,7 +21,6 @@ DEPTH = 0.3e-3  # of an indenter [m]
 CLOSE = 0.3e-3  # both sensors together [m]
 RADIUS = 4e-3
 ENVIRONMENTS = (1, 8, 64)
-STEP = 0.1e-3  # of a batch's sensors together [m]
 AT_REST = "contact force against force at the backing, and their change"
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tacsim.interface import FloatArray
 
 SQUEEZE = 3e-3  # both sensors together, from touching [m]
+STEP, STEPS = 0.1e-3, 20  # both sensors together in a control step [m]; steps in a row
 TOUCH = 0.05e-3  # first indentation of each gel: contact is surely made [m]
 SLOW = {"mach": 0.003, "tolerance": 1e-3, "max_substeps": 100_000}
 NOT_SETTLED = {"max_substeps": 0}
@@ -51,9 +52,9 @@ def closer(world: World, by: float) -> dict[str, Pose]:
     return targets
 
 
-def close(world: World, by: float) -> MoveStats:
+def close(world: World, by: float, *, flow: bool = False) -> MoveStats:
     """Moves both sensors towards each other, by `by` [m] in all."""
-    return world.move(closer(world, by))
+    return world.move(closer(world, by), flow=flow)
 
 
 def normal_forces(world: World) -> FloatArray:
@@ -128,31 +129,65 @@ def _squeeze_rows(world: World, truth: float, variant: str, repeat: int, *, over
 
 
 def control_step(preset: str, physics: str, repeat: int) -> list[Measurement]:
-    """0.1 mm of motion in the middle of a squeeze, settled as by default, and both images of 320 x 240."""
+    """0.1 mm of motion in the middle of a squeeze, and both images of 320 x 240: settled as by default, and flowing."""
+    truth = slow_steps(preset, physics)
+    kinds = (False, True) if physics == "hybrid" else (False,)
+    return [_control_step_row(preset, physics, truth, flow, repeat) for flow in kinds]
+
+
+def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, repeat: int) -> Measurement:
     from tacsim.config import load_sensor
     from tacsim.optics.render import Renderer
 
     scene = squeeze_scene(preset, physics)
     sensor = load_sensor("ideal", ["geometry.width=320", "geometry.height=240"])
     camera = Renderer(sensor, scene.gel.size[:2])
-    world = touching(scene)
-    close(world, 1e-3)
-    begin = world.snapshot()
+    world = _squeezed(scene)
+    forces = [_force_after_a_step(world, flow) for _ in range(STEPS // 2)]
+    begin = world.snapshot()  # under way, if it flows
 
     def run() -> MoveStats:
         world.restore(begin)
-        stats = close(world, 0.1e-3)
+        stats = close(world, STEP, flow=flow)
         for name in world.sensors:
             camera(world.surface(name))
         return stats
 
     timing, stats = timed(run, repeat)
-    forces = normal_forces(world)
-    imbalance = abs(float(forces[0] - forces[1])) / float(forces.mean()) * 100
-    return [
-        Measurement(timing, imbalance, "% imbalance", "equal forces on both sensors", "0.1 mm and two images",
-                    stats.substeps, {"residual": stats.residual}, "" if stats.settled else "not settled")
-    ]  # fmt: skip
+    forces.append(float(normal_forces(world).mean()))
+    forces += [_force_after_a_step(world, flow) for _ in range(STEPS - len(forces))]
+    errors = np.abs(np.array(forces) / truth - 1) * 100
+    figures = {"first_step_percent": float(errors[0]), "worst_percent": float(errors.max())}
+    return Measurement(
+        timing, float(np.sqrt(np.mean(errors**2))), "% of force", f"rms of {STEPS} steps, each settled at Mach 0.003",
+        "0.1 mm, flowing, and two images" if flow else "0.1 mm, settled, and two images", stats.substeps,
+        {**figures, "residual": stats.residual}, "" if stats.settled or flow else "not settled",
+    )  # fmt: skip
+
+
+def _squeezed(scene: Scene) -> World:
+    """By 1 mm from touch, so slowly that the way there adds nothing."""
+    slow = touching(squeeze_scene(scene.preset, scene.physics, **{**SLOW, "mach": 0.01}))
+    close(slow, 1e-3)
+    world = make_world(scene)
+    world.restore(slow.snapshot())
+    return world
+
+
+def _force_after_a_step(world: World, flow: bool) -> float:
+    close(world, STEP, flow=flow)
+    return float(normal_forces(world).mean())
+
+
+def slow_steps(preset: str, physics: str) -> FloatArray:
+    """Forces [N] after each of STEPS steps so slow that speed plays no part; kept."""
+    scene = squeeze_scene(preset, physics, **SLOW)
+
+    def compute() -> list[float]:
+        world = _squeezed(scene)
+        return [_force_after_a_step(world, flow=False) for _ in range(STEPS)]
+
+    return np.array(cached(f"steps-{preset}-{physics}", scene.model_dump_json(), compute))
 
 
 def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:

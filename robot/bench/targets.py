@@ -119,6 +119,10 @@ def _squeeze(what: str, variant: str, preset: str = "", scale: float = 1.0) -> F
     return pick(what, "squeeze", variant, resolution=preset, scale=scale)
 
 
+def _step(what: str, variant: str, scale: float = 1.0) -> Find:
+    return pick(what, "control_step", variant, scale=scale)
+
+
 def _ball(what: str, name: str) -> Find:
     return mean(what, "ball_presses", name, ": picture")
 
@@ -156,7 +160,10 @@ TARGETS: tuple[Target, ...] = (
     Target("... force balance", "%", 0.1, 0.01, _squeeze("error", "force balance")),
     Target("... overlap of plasticine and gel", "mm", 0.02, 0.005, _squeeze("error", "overlap")),
     Target("... peak memory, draft (the default)", "MB", 600, 400, _squeeze("peak_mb", "settled", _DRAFT)),
-    Target("control step, draft, two images", "ms", 30, 10, pick("seconds", "control_step", scale=1e3)),
+    Target("control step, draft, two images: flowing", "ms", 30, 10, _step("seconds", "0.1 mm, flowing", 1e3)),
+    Target("... force, 20 of them in a row", "% rms", None, 5, _step("error", "0.1 mm, flowing")),
+    Target("control step, draft, two images: each one settled", "ms", 30, 10, _step("seconds", "0.1 mm, settled", 1e3)),
+    Target("... force, 20 settled ones in a row", "% rms", None, 5, _step("error", "0.1 mm, settled")),
     Target("a second world is ready", "ms", 50, None, pick("second_ms", "second_world")),
     Target("gel force, oedometer", "%", 0.1, 0.01, pick("error", "oedometer")),
     Target("gel force, ball against FFT layer, h 0.25 mm", "%", 3, None,

@@ -61,7 +61,9 @@ class SpringWorld:
         self.moves.append(dict(targets))
         self.poses |= targets
         self.worst = max(self.worst, self.force)
-        return MoveStats(substeps=30, hold=10, residual=0.001, settled=not (flow and targets), overlap=0.0, guard_hits=0)
+        return MoveStats(
+            substeps=30, hold=10, residual=0.001, settled=not (flow and targets), overlap=0.0, guard_hits=0
+        )
 
     @property
     def force(self) -> float:

@@ -58,8 +58,9 @@ def test_the_worst_row_counts() -> None:
 def test_figures_of_a_row_and_units() -> None:
     step = row(case="plasticine_alone", figures={"wall_per_particle_substep_ns": 76.0})
     assert target("plasticine step, 64,000 particles, wall").judge([step]) == (76.0, "missed")
-    control = row(case="control_step", seconds=0.02)
-    assert target("control step, draft, two images").judge([control]) == (pytest.approx(20.0), "met")
+    control = row(case="control_step", variant="0.1 mm, flowing, and two images", seconds=0.02)
+    assert target("control step, draft, two images: flowing").judge([control]) == (pytest.approx(20.0), "met")
+    assert target("control step, draft, two images: each one settled").judge([control])[1] == "not measured"
 
 
 def test_only_an_aim() -> None:
@@ -105,7 +106,7 @@ NOT_YET = {"hard cases that end their process"}
 def test_every_figure_is_fed_by_a_case_that_exists() -> None:
     """Rows made of the cases' own names and resolutions, with the variants and figures that the targets ask for."""
     variants = ["", "tolerance", "two speeds, Mach 0.03 and 0.015", "not settled", "settled to 1 %",
-                "force balance", "overlap",
+                "force balance", "overlap", "0.1 mm, flowing", "0.1 mm, settled",
                 "80 % of its height", "stick limit", "lattice, 3 mm", "random, 3 mm",
                 "R 3 mm, 1 mm deep: image", "R 3 mm, 1 mm deep: pressure",
                 "THUsight: picture", "THUsight: normals", "Taxim: picture", "FOTS: picture", "R 3 mm: height",

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tacsim.physics import reference
@@ -132,6 +134,58 @@ def test_rigid_motion_gives_no_force() -> None:
     f, smallest = run(nodes() @ turn.T - nodes() + [1.0, 2.0, 3.0])
     assert np.abs(f).max() < 2e-6
     assert smallest == pytest.approx(1.0, abs=1e-5)
+
+
+def stress(deformation: np.ndarray) -> np.ndarray:
+    """(3, 3) first Piola-Kirchhoff stress [MPa] of a gel deformed alike everywhere: the virial of its nodal forces."""
+    f, _ = run(nodes() @ (deformation - np.eye(3)).T)
+    return -np.einsum("abci,abcj->ij", f.astype(np.float64), nodes()) / np.prod(np.array(GEL.size) * 1e3)
+
+
+def random_deformation(seed: int, size: float) -> np.ndarray:
+    """(3, 3) with principal stretches of exp(-size) to exp(size), and any axes."""
+    rng = np.random.default_rng(seed)
+    first, second = Rotation.random(2, rng=rng).as_matrix()
+    return first @ np.diag(np.exp(rng.uniform(-size, size, 3))) @ second
+
+
+def pure_stretch(seed: int, size: float) -> np.ndarray:
+    """(3, 3) symmetric; whatever lies between two of them has a positive volume."""
+    axes = Rotation.random(rng=seed).as_matrix()
+    return axes @ np.diag(np.exp(np.random.default_rng(seed).uniform(-size, size, 3))) @ axes.T
+
+
+SEEDS, SIZES = st.integers(0, 10_000), st.floats(0.01, 0.4)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, size=SIZES)
+def test_the_law_is_objective_isotropic_and_balances_moments(seed: int, size: float) -> None:
+    f = random_deformation(seed, size)
+    turn = Rotation.random(rng=seed).as_matrix()
+    p = stress(f)
+    scale = np.abs(p).max() + 1e-3 * gel_facts(GEL, 1e-3).density
+    assert np.abs(stress(turn @ f) - turn @ p).max() < 1e-4 * scale
+    assert np.abs(stress(f @ turn) - p @ turn).max() < 1e-4 * scale
+    assert np.abs(p @ f.T - f @ p.T).max() < 1e-4 * scale
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS, size=SIZES)
+def test_work_is_the_change_of_the_stored_energy_whatever_the_way(seed: int, size: float) -> None:
+    """W = mu/2 (|F|^2 - 3 - 2 ln J) + lambda/2 ln^2 J, straight and by a detour, each leg by Gauss-Legendre."""
+    facts = gel_facts(GEL, 1e-3)
+    rest, end, detour = np.eye(3), *(pure_stretch(seed + other, size) for other in (0, 1))
+    log_j = np.log(np.linalg.det(end))
+    energy = facts.mu / 2 * (np.sum(end**2) - 3 - 2 * log_j) + facts.lam / 2 * log_j**2
+    places, weights = np.polynomial.legendre.leggauss(6)
+
+    def work(a: np.ndarray, b: np.ndarray) -> float:
+        powers = [np.sum(stress(a + (1 + place) / 2 * (b - a)) * (b - a)) for place in places]
+        return float(weights @ powers) / 2
+
+    assert work(rest, end) == pytest.approx(energy, rel=1e-3, abs=1e-5)
+    assert work(rest, detour) + work(detour, end) == pytest.approx(energy, rel=1e-3, abs=1e-4)
 
 
 @pytest.mark.parametrize("stretch", [0.5, 0.9, 1.1])

@@ -13,6 +13,7 @@ A dent is a bump to this camera: its right flank (dh/dx < 0) faces a light on th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -71,26 +72,22 @@ class Renderer:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
         import cv2
 
-        light = self._shaded(surface) if self._light is None else self._calibrated(self._light, surface)
+        light = self._shaded(surface) if self._light is None else self._calibrated(self._light, surface).__getitem__
         dots = None if self._markers is None else marker_transmission(surface, self._markers, self.model.geometry)
-        image = np.empty(light.shape, dtype=np.uint8)
+        image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
 
-        for strip in strips(self._grid.rows):
-            lit, unlit = light[strip], self._unlit[strip]
+        for strip in strips(*self._grid.shape):
+            lit, unlit = light(strip), self._unlit[strip]
             if dots is not None:
                 lit, unlit = lit * dots[strip, :, None], unlit * dots[strip, :, None]
             cv2.add(lit, unlit, image[strip], dtype=cv2.CV_8U)  # rounds, and saturates at black and white
         return image
 
-    def _shaded(self, surface: GelSurface) -> Float32:
-        """(H, W, 3) light of the lamps, by the slopes of the surface and of its texture; 255 is white."""
+    def _shaded(self, surface: GelSurface) -> Callable[[slice], Float32]:
+        """Rows of an image -> (rows, W, 3) light of the lamps, by the slopes of surface and texture; 255 is white."""
         table = SurfaceTable(surface)
         slopes, _ = table.seen(table.fields[..., 1:], self._grid, fine=False)
-        light = np.empty((*self._grid.shape, 3), dtype=np.float32)
-
-        for strip in strips(self._grid.rows):
-            shade(slopes[strip] + self._texture[strip], self.model.lighting, 255.0, light[strip])
-        return light
+        return lambda rows: shade(slopes[rows] + self._texture[rows], self.model.lighting, white=255.0)
 
     def _calibrated(self, calibrated: PhotometricLight, surface: GelSurface) -> Float32:
         """(H, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is white.
@@ -101,7 +98,7 @@ class Renderer:
 
         assert self.model.photometric is not None
         table = SurfaceTable(surface)
-        colours, beyond = calibrated.change(table.fields[..., 1:], *self._grid.in_image(*table.place))
+        colours, beyond = calibrated.change(table.fields[..., 1:], *self._grid.in_image(*table.place()))
         self._beyond = beyond / (colours.size // 3)
         change, _ = table.seen(colours, self._grid, fine=False)
         if self.model.photometric.blur > 0:
@@ -109,8 +106,8 @@ class Renderer:
         return change
 
 
-def shade(gradient: Float32, lighting: Lighting, white: float = 1.0, out: Float32 | None = None) -> Float32:
-    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2), into `out` if given. Exactly the same
+def shade(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:
+    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2), where `white` is white. Exactly the same
     for lights in any order: they are summed in an order of their own."""
     import cv2
 
@@ -129,7 +126,7 @@ def shade(gradient: Float32, lighting: Lighting, white: float = 1.0, out: Float3
             brightness = lit * np.float32(light.diffuse)
         for channel, colour in zip(channels, light.colour, strict=True):
             cv2.scaleAdd(brightness, white * colour, channel, dst=channel)
-    return np.asarray(cv2.merge(list(channels), dst=out), dtype=np.float32)
+    return np.asarray(cv2.merge(list(channels)), dtype=np.float32)
 
 
 def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:

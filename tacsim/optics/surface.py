@@ -65,19 +65,21 @@ class SurfaceTable:
     """A gel surface at material points that halve the cells of its lattice; rows along y, columns along x."""
 
     fields: Float32  # (rows, columns, 3) height [m], its derivatives by x and y in the image [-]
-    place: tuple[Float32, Float32]  # x and y (rows, columns) where each point is seen [m]
 
     def __init__(self, surface: GelSurface) -> None:
         """Raises what :func:`sample_surface` raises."""
         check_surface(surface)
         self._surface = surface
         self.fields, self._lateral = _table(surface)
-        rows, columns = self.fields.shape[:2]
         self._pitch = surface.spacing / _table_points(surface)  # [m]
-        pitch = np.float32(self._pitch)
-        x = np.float32(surface.origin[0]) + pitch * (np.arange(columns, dtype=np.float32) + self._lateral[..., 0])
-        y = np.float32(surface.origin[1]) + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
-        self.place = x, y
+
+    def place(self) -> tuple[Float32, Float32]:
+        """x and y (rows, columns) where each point is seen [m]."""
+        (rows, columns), pitch = self.fields.shape[:2], np.float32(self._pitch)
+        origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
+        x = origin_x + pitch * (np.arange(columns, dtype=np.float32) + self._lateral[..., 0])
+        y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
+        return x, y
 
     def seen(self, values: Float32, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
         """`values` (rows, columns, n <= 4) of the table's points, linear between them, as seen at the points of `grid`:
@@ -247,7 +249,7 @@ def _look_up(field: Float32, points: Float32) -> Float32:
     import cv2
 
     nothing = np.empty(0, dtype=np.float32)
-    found = cv2.remap(field, points, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    found = cv2.remap(np.ascontiguousarray(field), points, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found, dtype=np.float32)
 
 

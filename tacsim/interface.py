@@ -66,6 +66,7 @@ class TactileFrame:
     time: float  # exposure time on the rig's monotonic clock [s]
     index: int  # frame counter; a gap = dropped frames
     surface: SurfaceMap | None = None  # only from sources that know it
+    stats: Mapping[str, float] = field(default_factory=dict)  # what a simulation reached (residual ...) for just this
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -234,7 +234,11 @@ class SimSensor:
             if self._noise is not None:
                 image = self._noise(image, self._index, self._episode)
             self._newest = TactileFrame(
-                image=image, time=self._clock.now(), index=self._index, surface=self._sample(surface)
+                image=image,
+                time=self._clock.now(),
+                index=self._index,
+                surface=self._sample(surface),
+                stats=self._clock.diagnostics(),
             )
             self._version, self._index = self._clock.version, self._index + 1
         return self._newest

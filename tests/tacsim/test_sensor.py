@@ -261,6 +261,19 @@ def test_a_simulated_arm_that_feels_too_much_follows_nothing(spring_world: Any) 
         lower.command(None)
 
 
+def test_every_picture_says_how_its_state_was_reached(spring_world: Any) -> None:
+    clock, lower, _ = make_arms(spring_world)
+    spec = SensorSpec((4, 6), height=True, flow=False, arm="lower")
+    image = np.zeros((4, 6, 3), np.uint8)
+    sensor = SimSensor(spring_world, clock, "lower", spec, lambda surface: image, lambda surface: None)  # type: ignore[arg-type, return-value]
+    assert sensor.read(0.0).stats == {}
+    lower.command(shifted(Pose(), z=1e-4))
+    clock.tick()
+    stats = sensor.read(0.0).stats
+    assert stats == clock.diagnostics()
+    assert stats["residual"] == 0.001
+
+
 def test_noise_is_another_in_each_sensor_frame_and_episode_and_the_same_again(open_springs: Any) -> None:
     plain = open_springs()
     noise = "{deviation: [2, 2, 2]}"

@@ -85,11 +85,13 @@ def mean(what: str, case: str, variant: str = "", ending: str = "", *, method: s
     return find
 
 
-def from_depth(least: float, what: str, ending: str) -> Find:
-    """The worst contact radius of the real group, presses of at least `least` [mm], by the end of the variant."""
+def from_depth(least: float, what: str, ending: str, gel: str = "") -> Find:
+    """The worst contact radius of the real group, presses of at least `least` [mm], by the end of the variant; of one
+    thickness of the gel, if its name is given."""
 
     def find(rows: Sequence[Row]) -> float | None:
         deep = [r for r in rows if r.figures.get("depth_mm", 0.0) >= least - 1e-9 and r.variant.endswith(ending)]
+        deep = [r for r in deep if gel in r.resolution]
         return pick(what, "contact_radius")(deep)
 
     return find
@@ -183,6 +185,8 @@ TARGETS: tuple[Target, ...] = (
     Target("contact radius, our image against real ones", "px", 2, None, from_depth(0.5, "error", ": image")),
     Target("contact radius, our contact against labels", "px", 2, None, from_depth(0.5, "error", ": pressure"),
            remark="0.05 mm of depth, the uncertainty of the set, are 1 px"),
+    Target("... if the gel is 8 mm thick (the set says 8 to 10 mm)", "px", 2, None,
+           from_depth(0.5, "error", ": pressure", "gel 8 mm")),
     Target("ball presses left out, THUsight: contact error", "grey", 7.2, 6, _ball("error", "THUsight")),
     Target("... correlation of its change of colour", "", 0.98, 0.99, _ball("ncc", "THUsight"), True),
     Target("ball presses left out, Taxim GelSight: contact error", "grey", 6.1, 5, _ball("error", "Taxim")),

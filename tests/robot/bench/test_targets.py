@@ -80,6 +80,8 @@ def test_shallow_real_presses_do_not_count() -> None:
     assert target("contact radius, our image against real ones").judge(rows)[1] == "met"
     assert target("contact radius, our contact against labels").judge(rows)[1] == "missed"
     assert from_depth(0.5, "error", ": image")(rows[:1]) is None
+    thin = [each.model_copy(update={"resolution": f"gel {8 + index} mm"}) for index, each in enumerate(rows)]
+    assert from_depth(0.5, "error", ": image", "gel 10 mm")(thin) == 1.5
 
 
 def test_the_table_says_it_in_words() -> None:
@@ -118,7 +120,7 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
     names += ["ncc", "ssim", "whole_percent", "auc_low", "extra_deg", "bound_ratio"]
     figures = {**dict.fromkeys(names, 1.0), "depth_mm": 1.0}
     keys = [(case.group, case.name, case.method, case.resolution) for case in CASES]
-    keys.append(("real", "contact_radius", "tacsim", "ball R 3 mm"))
+    keys.append(("real", "contact_radius", "tacsim", "ball R 3 mm, gel 8 mm"))
     keys.append(("real", "marker_film", "tacsim", "the film's own pixels"))
     keys += [("real", name, "tacsim", "") for name in ("ball_presses", "known_depth", "invariance")]
     keys.append(("real", "punch", "layer", ""))

@@ -230,6 +230,16 @@ def impact(world: World) -> Iterator[Targets]:
     yield {}
 
 
+def flow_about(world: World) -> Iterator[Targets]:
+    """Steps that flow into one another, each against the one before, while the gap closes; then at rest."""
+    frame = "indenter" if world.truth() is None else "upper"
+    yield from (push(0.3e-3) if world.truth() is None else squeeze_by(0.5e-3))(world)
+    for step in range(12):
+        sign = -1.0 if step % 2 else 1.0
+        world.move(by(world, frame, x=sign * 0.3e-3, z=-0.02e-3, turn=sign * 0.05), flow=True)
+    yield {}
+
+
 def over_the_rim(world: World) -> Iterator[Targets]:
     yield {**by(world, "lower", x=4e-3), **by(world, "upper", x=4e-3)}
     yield from squeeze_by(1.2e-3)(world)
@@ -279,6 +289,7 @@ def with_nan(times: int) -> dict[str, Any]:
 
 SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}
 TOO_LONG = {"hybrid.COURANT": 1.2, "press.COURANT": 1.2, "seed.COURANT": 1.5}
+RUSHED = Settling(mach=0.1, tolerance=1e-2, max_substeps=600, flow_mach=0.3)
 SLOWER = Settling(mach=0.05, tolerance=1e-2, max_substeps=600)
 BALL = indented(Sphere(radius=4e-3))
 SMALL = cube(3e-3, gel=Gel(size=(8e-3, 8e-3, 4e-3)))
@@ -313,6 +324,10 @@ CASES: dict[str, Case] = {
     "impact, elastic": Case(cube(material=BodyMaterial()), impact, ("hybrid",)),
     "impact, plastic": Case(cube(), impact, ("hybrid",)),
     "impact, press": Case(BALL, impact, PRESS),
+    "flow, back and forth": Case(cube(), flow_about, ("hybrid",)),
+    "flow, back and forth, fast": Case(cube(settling=RUSHED), flow_about, ("hybrid",)),
+    "flow, back and forth, press": Case(BALL, flow_about, PRESS),
+    "flow, back and forth, fast, press": Case(indented(Sphere(radius=4e-3), settling=RUSHED), flow_about, PRESS),
     "yield and slide": Case(cube(), then(squeeze_by(1.2e-3), drag)),
     "sensor through the body": Case(cube(), through),
     "indenter through the gel": Case(BALL, push(5e-3), PRESS),

@@ -85,6 +85,17 @@ EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
     "impact, plastic": {"hybrid": lambda f: keeps(0.9, 1.05)(f) and f["height"] < 3.0e-3},
     # As deep as at Mach 0.3 above: an elastic gel forgets how it got there.
     "impact, press": {"press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(2.14, rel=0.1)},
+    # However fast it came there: an elastic gel forgets its way, and the body remembers little of it.
+    "flow, back and forth": {"hybrid": lambda f: keeps(0.9, 1.05)(f) and f["force"] == pytest.approx(0.46, rel=0.05)},
+    "flow, back and forth, fast": {
+        "hybrid": lambda f: keeps(0.9, 1.05)(f) and f["force"] == pytest.approx(0.46, rel=0.05)
+    },
+    "flow, back and forth, press": {
+        "press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(0.324, rel=0.01)
+    },
+    "flow, back and forth, fast, press": {
+        "press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(0.324, rel=0.01)
+    },
     # By symmetry the body goes half of the upper sensor's 3 mm.
     "yield and slide": dict.fromkeys(
         ("hybrid", "seed"), lambda f: balanced(f) and f["x"] == pytest.approx(1.5e-3, rel=0.2)

@@ -34,9 +34,7 @@ from tacsim.physics.material import convect, hencky_return, mat3, vec6
 from tacsim.physics.plasticine import BodyFacts, BodyState
 from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.transfers import (
-    Points,
-    Rates,
-    Strains,
+    Particles,
     Strips,
     clear_masses,
     grid_to_particles,
@@ -53,7 +51,7 @@ Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 @ti.kernel
 def body_substeps(
     team: ti.i32, steps: Steps,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips, sums: Strips,
+    particles: Particles, masses: Strips, velocities: Strips,
     facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
 ):  # fmt: skip
     """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
@@ -65,7 +63,7 @@ def body_substeps(
                 for share in range(shares(member, team)):
                     part = member + share * team
                     clear_masses(0, part, masses, counts)
-                    particles_to_grid(0, part, points, rates, strains, masses, sums, facts, counts, partial)
+                    particles_to_grid(0, part, particles, masses, facts, counts, partial)
                 meet(sync, 0, team, 2 * it + 1)
                 plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
                 for share in range((rows - member + team - 1) // team):
@@ -82,7 +80,7 @@ def body_substeps(
                 meet(sync, 0, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    grid_to_particles(0, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
+                    grid_to_particles(0, part, particles, velocities, facts, counts, partial)
 
 
 @ti.kernel

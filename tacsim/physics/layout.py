@@ -50,3 +50,12 @@ BACKING = 18  # force of this part's gel on its backing [N], of the last substep
 MOTION = 21  # sum of the particles' velocities
 HOUSED = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
 NUMBERS = 30
+
+# rows of a body's particles, one number of all of them each: float32
+PLANE = 0  # tangent plane x, y, z [1/mm] (tacsim.physics.body_surface)
+PLACE = 3  # x, y, z [mm]
+STRAIN = 6  # elastic e = b_e - I: xx, yy, zz, xy, xz, yz
+FLOW = 12  # equivalent plastic strain
+VELOCITY = 13  # x, y, z
+AFFINE = 16  # affine velocity C, column by column [1/mm]
+KNOWN = 25

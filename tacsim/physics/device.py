@@ -28,11 +28,9 @@ from tacsim.physics.indenter import Pressure, Slip, Values, indent
 from tacsim.physics.lanes import (
     LANES,
     PARTS,
-    SUMS,
     Counts,
     Facts,
     Partial,
-    empty_strip,
     least_lane,
     note_least,
     real,
@@ -53,7 +51,7 @@ from tacsim.physics.layout import (
     STEPS,
 )  # fmt: skip
 from tacsim.physics.plasticine import BodyState
-from tacsim.physics.transfers import Points, Rates, Strains, Strips, gather, scatter
+from tacsim.physics.transfers import Particles, Strips, grid_to_particles, particles_to_grid
 from tacsim.runtime import ti
 
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
@@ -181,8 +179,7 @@ def elements_of_hybrid(
 def scatter_of_hybrid(
     it: ti.i32, drive: Drive,
     nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips,
-    memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
+    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
     layers: ti.i32, room: ti.i32, most: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
@@ -194,13 +191,12 @@ def scatter_of_hybrid(
             nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
             for g in range(2):
                 touch_gel(
-                    env, p, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
-                    ceiling[env, g], layers, nx, ny,
+                    env, p, g, it, drive, particles, memory, skin, touch, facts, counts, partial, ceiling[env, g],
+                    layers, nx, ny,
                 )  # fmt: skip
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            sums = [empty_strip() for _ in range(SUMS)]
-            scatter(env, p, points, rates, strains, masses, sums, 0, facts, counts, partial)
+            particles_to_grid(env, p, particles, masses, facts, counts, partial)
     for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
         if goes(env, it, counts):
             nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
@@ -216,14 +212,12 @@ def scatter_of_hybrid(
 
 @ti.kernel
 def gather_of_hybrid(
-    it: ti.i32, points: Points, planes: Points, rates: Rates, strains: Strains, velocities: Strips,
-    facts: Facts, counts: Counts, partial: Partial, room: ti.i32,
+    it: ti.i32, particles: Particles, velocities: Strips, facts: Facts, counts: Counts, partial: Partial, room: ti.i32,
 ):  # fmt: skip
     """Last third: the grid back to the particles."""
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            sums = [empty_strip() for _ in range(SUMS)]
-            gather(env, p, points, planes, rates, strains, velocities, sums, 0, facts, counts, partial)
+            grid_to_particles(env, p, particles, velocities, facts, counts, partial)
 
 
 class Mirror:
@@ -282,13 +276,10 @@ def run_hybrid(
     counts: np.ndarray, partial: np.ndarray,
 ) -> None:  # fmt: skip
     """One launch; the arrays are those of `HybridState`."""
-    points, planes, rates, strains, masses, velocities, _ = body.arguments()
+    known, masses, velocities = body.arguments()
     there = mirror.sent("drive", drive, ti.f32)
     nodes, skin, touch, corners, lattice = mirror.send_gels(gels)
-    particles = (
-        mirror.sent("points", points, vec4), mirror.sent("planes", planes, vec4), mirror.sent("rates", rates, vec4),
-        mirror.sent("strains", strains, vec4),
-    )  # fmt: skip
+    particles = mirror.sent("known", known, ti.f32)
     mass = mirror.room("masses", strip, masses.shape[:-1])
     velocity = mirror.room("velocities", strip, velocities.shape[:-1])
     kept = mirror.sent("memory", memory, vec4)
@@ -297,16 +288,13 @@ def run_hybrid(
         mirror.sent("partial", partial, ti.f32),
     )  # fmt: skip
     ceiling = mirror.room("ceiling", ti.f32, (len(counts), 2))
-    layers, room = gels.nodes.shape[4] - 1, body.points.shape[1]
+    layers, room = gels.nodes.shape[4] - 1, max(body.counts)
     most = int(counts[:, GRID : GRID + 3].prod(axis=1).max())
     for it in range(drive.shape[1]):
         elements_of_hybrid(it, nodes, skin, touch, corners, lattice, mass, *numbers, ceiling, layers, most)
         scatter_of_hybrid(
-            it, there, nodes, skin, touch, corners, lattice, *particles, mass, velocity, kept, *numbers, ceiling,
+            it, there, nodes, skin, touch, corners, lattice, particles, mass, velocity, kept, *numbers, ceiling,
             layers, room, most,
         )  # fmt: skip
-        gather_of_hybrid(it, *particles, velocity, *numbers, room)
-    mirror.bring(
-        nodes=gels.memory()[0], points=points, planes=planes, rates=rates, strains=strains, memory=memory,
-        partial=partial,
-    )  # fmt: skip
+        gather_of_hybrid(it, particles, velocity, *numbers, room)
+    mirror.bring(nodes=gels.memory()[0], known=known, memory=memory, partial=partial)

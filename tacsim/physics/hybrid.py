@@ -91,7 +91,7 @@ class HybridState:
         self.body = [body for body, _, _ in placed]
         self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
-        self.memory = np.zeros((len(scenes), 2, self.particles.points.shape[1], 4), np.float32)
+        self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), 4), np.float32)
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
@@ -218,7 +218,6 @@ class HybridWorld:
             b, i = self._state.particles, self._index
             for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
                 moving[...] = 0.0
-            b.refresh()
             self._take(inertia)
 
     # ------------------------------------------------------------------ state
@@ -240,7 +239,6 @@ class HybridWorld:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self._poses = put_back(self._arrays(), self.sensors, state)
-        self._state.particles.refresh()
         self._speed = float(state["speed"])
         self._take(self._true if state["true_inertia"] else self._scaled)
 

@@ -2,8 +2,8 @@
 
 Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
 side by side, starting from stores to neighbouring addresses that it has seen before. Hence `real` holds one number of
-eight neighbours (particles, elements, nodes), arrays keep these eight side by side, and `keep_or` and `anchor` store in
-the way that is recognised.
+eight neighbours (particles, elements, nodes), arrays keep these eight side by side, and `keep_or` stores in the way that is
+recognised.
 
 Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
 a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
@@ -32,7 +32,6 @@ vec4 = ti.types.vector(4, ti.f32)
 real = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
 strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
 
-SUMS = 40  # strips for each environment and part: where the body's transfers drop theirs
 Facts = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, facts)
 Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, counts)
 Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, numbers)
@@ -64,12 +63,6 @@ def keep_or(never, old, new):
 def opaque(never, index):
     """index. The compiler takes a sum of several indices apart, and lanes behind it are no neighbours any more."""
     return index | never
-
-
-@ti.func
-def anchor(work: ti.template(), slot: ti.template(), value, never):
-    """Where the compiler starts to merge lanes: long chains of operations need one every ten or so."""
-    work[slot] = keep_or(never, work[slot], value)
 
 
 @ti.func
@@ -163,12 +156,3 @@ def note_most(partial: ti.template(), env, slot, number, value):
             ti.atomic_max(partial[env, slot, number], value)
     else:
         partial[env, slot, number] = ti.max(partial[env, slot, number], value)
-
-
-# Registers of one thread on a device, where the CPU has arrays to drop values in.
-
-
-@ti.func
-def empty_strip():
-    empty = strip(0.0)
-    return empty  # noqa: RET504 - only a variable can be written to

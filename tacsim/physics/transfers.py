@@ -76,8 +76,8 @@ STENCIL = D_Y + 2
 # Whole numbers: the first strip of each of the stencil's 9 lines along z, then
 OFF, FAR = 9, 10  # off the grid; strain for `return_far`
 WHOLE = 11
-# What node (i, j, n) gets is w_i w_j w_n (q + i ax + j ay + n az); three numbers each
-PULL, PULL_X, PULL_Y, PULL_Z = 0, 3, 6, 9
+# What node (i, j, n) gets is w_i w_j w_n (q + i ax + j ay + n az), each of these momentum x, y, z and mass.
+PULL, PULL_X, PULL_Y, PULL_Z = 0, 4, 8, 12
 # Sums over the stencil: plain, and by x, y, z with the node's number as a factor
 SUM, BY_X, BY_Y, BY_Z = 0, 1, 2, 3
 
@@ -135,6 +135,11 @@ def store(
 @ti.func
 def three(rows: ti.template(), row: ti.template(), lane):
     return vec3(rows[row, lane], rows[row + 1, lane], rows[row + 2, lane])
+
+
+@ti.func
+def four(rows: ti.template(), row: ti.template(), lane):
+    return vec4(rows[row, lane], rows[row + 1, lane], rows[row + 2, lane], rows[row + 3, lane])
 
 
 @ti.func
@@ -217,9 +222,11 @@ def particles_to_grid(
     new = ti.Matrix.zero(ti.f32, 7, LANES)
     stress = ti.Matrix.zero(ti.f32, 6, LANES)
     rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
-    pull = ti.Matrix.zero(ti.f32, 12, LANES)
+    pull = ti.Matrix.zero(ti.f32, LANES, 16)
     grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
     whole = ti.Matrix.zero(ti.i32, WHOLE, LANES)
+    for lane in range(LANES):
+        pull[lane, PULL + 3] = mass
     for block in range(first_block, last_block):
         start = env * KNOWN * stride + block * LANES
         load(particles, start, stride, PLACE, 3, place)
@@ -251,17 +258,14 @@ def particles_to_grid(
             ay = impulse * vec3(tau[3], tau[1], tau[5]) + inertia * three(rate, 6, lane)
             az = impulse * vec3(tau[4], tau[5], tau[2]) + inertia * three(rate, 9, lane)
             q = mass * three(rate, 0, lane)
-            put(pull, PULL, lane, q - grid[AT, lane] * ax - grid[AT + 1, lane] * ay - grid[AT + 2, lane] * az)
-            put(pull, PULL_X, lane, ax)
-            put(pull, PULL_Y, lane, ay)
-            put(pull, PULL_Z, lane, az)
+            q -= grid[AT, lane] * ax + grid[AT + 1, lane] * ay + grid[AT + 2, lane] * az
+            for d in ti.static(range(3)):
+                pull[lane, PULL + d], pull[lane, PULL_X + d] = q[d], ax[d]
+                pull[lane, PULL_Y + d], pull[lane, PULL_Z + d] = ay[d], az[d]
         store(particles, start, stride, STRAIN, 7, new, never)
         for lane in range(ti.min(LANES, counts[env, PARTICLES] - block * LANES)):
             lost += whole[OFF, lane]
-            q = vec4(pull[PULL, lane], pull[PULL + 1, lane], pull[PULL + 2, lane], mass)
-            ax = vec4(pull[PULL_X, lane], pull[PULL_X + 1, lane], pull[PULL_X + 2, lane], none)
-            ay = vec4(pull[PULL_Y, lane], pull[PULL_Y + 1, lane], pull[PULL_Y + 2, lane], none)
-            az = vec4(pull[PULL_Z, lane], pull[PULL_Z + 1, lane], pull[PULL_Z + 2, lane], none)
+            q, ax, ay, az = [vec4([pull[lane, 4 * k + d] for d in range(4)]) for k in range(4)]
             for s in ti.static(range(LINE)):
                 w = each(grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
                 along = w * (twice(q) + each(none + NODES * s, none + (NODES * s + 1)) * twice(az))

@@ -27,6 +27,7 @@ COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
 
 NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
 
+vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
 real = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours

@@ -27,6 +27,7 @@ from tacsim.physics.lanes import (
     real,
     slot_of,
     strip,
+    vec2,
     vec3,
     vec4,
 )
@@ -138,8 +139,12 @@ def three(rows: ti.template(), row: ti.template(), lane):
 
 
 @ti.func
-def four(rows: ti.template(), row: ti.template(), lane):
-    return vec4(rows[row, lane], rows[row + 1, lane], rows[row + 2, lane], rows[row + 3, lane])
+def four(rows: ti.template(), row: ti.template(), lane, spare):
+    """Four numbers of one lane. The write between them keeps LLVM from making a gather of them; spare: a row's number
+    that the compiler does not know."""
+    first = vec2(rows[row, lane], rows[row + 1, lane])
+    rows[spare, lane] = first[0]
+    return vec4(first[0], first[1], rows[row + 2, lane], rows[row + 3, lane])
 
 
 @ti.func
@@ -216,17 +221,17 @@ def particles_to_grid(
     base = (env * COPIES + copy) * counts[env, CAPACITY]
     dump = base + counts[env, GRID] * ny * (nz // NODES)  # three planes behind the grid
     none = ti.cast(never, ti.f32)  # 0: with a 0 that it knows, the compiler does other things than with other numbers
-    lost = 0
+    lost, spare = 0, opaque(never, 16)
     place = ti.Matrix.zero(ti.f32, 3, LANES)
     old = ti.Matrix.zero(ti.f32, 7, LANES)  # strain, flow
     new = ti.Matrix.zero(ti.f32, 7, LANES)
     stress = ti.Matrix.zero(ti.f32, 6, LANES)
     rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
-    pull = ti.Matrix.zero(ti.f32, LANES, 16)
+    pull = ti.Matrix.zero(ti.f32, 17, LANES)
     grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
     whole = ti.Matrix.zero(ti.i32, WHOLE, LANES)
     for lane in range(LANES):
-        pull[lane, PULL + 3] = mass
+        pull[PULL + 3, lane] = mass
     for block in range(first_block, last_block):
         start = env * KNOWN * stride + block * LANES
         load(particles, start, stride, PLACE, 3, place)
@@ -259,13 +264,14 @@ def particles_to_grid(
             az = impulse * vec3(tau[4], tau[5], tau[2]) + inertia * three(rate, 9, lane)
             q = mass * three(rate, 0, lane)
             q -= grid[AT, lane] * ax + grid[AT + 1, lane] * ay + grid[AT + 2, lane] * az
-            for d in ti.static(range(3)):
-                pull[lane, PULL + d], pull[lane, PULL_X + d] = q[d], ax[d]
-                pull[lane, PULL_Y + d], pull[lane, PULL_Z + d] = ay[d], az[d]
+            put(pull, PULL, lane, q)
+            put(pull, PULL_X, lane, ax)
+            put(pull, PULL_Y, lane, ay)
+            put(pull, PULL_Z, lane, az)
         store(particles, start, stride, STRAIN, 7, new, never)
         for lane in range(ti.min(LANES, counts[env, PARTICLES] - block * LANES)):
             lost += whole[OFF, lane]
-            q, ax, ay, az = [vec4([pull[lane, 4 * k + d] for d in range(4)]) for k in range(4)]
+            q, ax, ay, az = [four(pull, row, lane, spare) for row in (PULL, PULL_X, PULL_Y, PULL_Z)]
             for s in ti.static(range(LINE)):
                 w = each(grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
                 along = w * (twice(q) + each(none + NODES * s, none + (NODES * s + 1)) * twice(az))

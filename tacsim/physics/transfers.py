@@ -229,6 +229,7 @@ def particles_to_grid(
     rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
     pull = ti.Matrix.zero(ti.f32, 17, LANES)
     grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
+    shares = ti.Matrix.zero(ti.f32, 9, LANES)  # of the stencil's lines
     whole = ti.Matrix.zero(ti.i32, WHOLE, LANES)
     for lane in range(LANES):
         pull[PULL + 3, lane] = mass
@@ -268,20 +269,22 @@ def particles_to_grid(
             put(pull, PULL_X, lane, ax)
             put(pull, PULL_Y, lane, ay)
             put(pull, PULL_Z, lane, az)
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                shares[3 * i + j, lane] = grid[W_X + i, lane] * grid[W_Y + j, lane]
         store(particles, start, stride, STRAIN, 7, new, never)
         for lane in range(ti.min(LANES, counts[env, PARTICLES] - block * LANES)):
             lost += whole[OFF, lane]
             q, ax, ay, az = [four(pull, row, lane, spare) for row in (PULL, PULL_X, PULL_Y, PULL_Z)]
             for s in ti.static(range(LINE)):
                 w = each(grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
-                along = w * (twice(q) + each(none + NODES * s, none + (NODES * s + 1)) * twice(az))
                 by_x, by_y = w * twice(ax), w * twice(ay)
+                plane = w * (twice(q) + each(none + NODES * s, none + (NODES * s + 1)) * twice(az))
                 for i in ti.static(range(3)):
-                    wx = grid[W_X + i, lane]
-                    qi, yi = wx * (along + float(i) * by_x), wx * by_y
+                    line = plane
                     for j in ti.static(range(3)):
-                        wy = grid[W_Y + j, lane]
-                        add_to(masses, small(whole[3 * i + j, lane]) + s, wy * (qi + float(j) * yi))
+                        add_to(masses, small(whole[3 * i + j, lane]) + s, shares[3 * i + j, lane] * line)
+                        line += by_y
+                    plane += by_x
     note_more(partial, env, slot_of(part), OFF_GRID, float(lost))
 
 

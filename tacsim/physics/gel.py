@@ -321,23 +321,26 @@ def gel_advance(
                 place = n0[x] + dt * speed
                 n0[v] = keep_or(never, n0[v], speed)
                 n0[x] = keep_or(never, n0[x], place)
-    for n in range(first * LANES, ti.min(last * LANES, count)):
-        i, j = n // row, n % row
-        for quantity in ti.static(range(2)):
-            at = vec4(0.0)
-            for d in ti.static(range(3)):
-                if ti.static(ON_DEVICE):
-                    at[d] = n0[u + (3 * quantity + d) * axis + layers * blocks + n][0]
-                else:
-                    at[d] = nodes[env, g, quantity, d, layers, n]
-            for p in range(i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)):
-                for q in range(j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)):
-                    skin[env, g, quantity, p, q] = at
+    first_n, last_n = first * LANES, ti.min(last * LANES, count)
+    top = u + layers * blocks
+    for i in range(first_n // row, (last_n + row - 1) // row):
+        p0, p1 = i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)
+        for j in range(ti.max(first_n - i * row, 0), ti.min(last_n - i * row, row)):
+            q0, q1 = j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)
+            for quantity in ti.static(range(2)):
+                at = vec4(0.0)
+                for d in ti.static(range(3)):
+                    if ti.static(ON_DEVICE):
+                        at[d] = n0[top + (3 * quantity + d) * axis + i * row + j][0]
+                    else:
+                        at[d] = nodes[env, g, quantity, d, layers, i * row + j]
+                for p, q in ti.ndrange((p0, p1), (q0, q1)):
+                    skin[env, g, quantity, p, q] = keep_or(never, skin[env, g, quantity, p, q], at)
 
 
 @ti.func
-def clear_touch(env, part, gels, touch: ti.template()):
+def clear_touch(env, part, gels, touch: ti.template(), never):
     """This part's copy of the contact forces, for all gels."""
     for g in range(gels):
         for n in range(touch.shape[3]):
-            touch[env, part, g, n] = vec4(0.0)
+            touch[env, part, g, n] = keep_or(never, touch[env, part, g, n], vec4(0.0))

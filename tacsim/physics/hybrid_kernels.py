@@ -39,6 +39,7 @@ from tacsim.physics.layout import (
     KNOWN,
     LIGHTNESS,
     MOTION,
+    NEVER,
     ORIGIN,
     OVERLAP,
     PARTICLES,
@@ -226,7 +227,7 @@ def substeps(
                 for share in range(shares(member, team)):
                     part = member + share * team
                     partial[env, part, OVERLAP] = 0.0
-                    clear_touch(env, part, 2, touch)
+                    clear_touch(env, part, 2, touch, counts[env, NEVER])
                     for g in range(2):
                         touch_gel(
                             env, part, g, it, drive, particles, memory, skin, touch, facts, counts, partial, highest[g],

@@ -61,6 +61,7 @@ from tacsim.physics.layout import (
     FRICTION,
     GEL_DAMPING,
     KIND,
+    NEVER,
     NUMBERS,
     SHAPE,
     SHAPE_NODES,
@@ -102,7 +103,7 @@ def press_substeps(
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    clear_touch(env, part, 1, touch)
+                    clear_touch(env, part, 1, touch, counts[env, NEVER])
                     indent(env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
                     gel_forces(
                         env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,

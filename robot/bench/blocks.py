@@ -13,6 +13,7 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
+    elements_across,
     gel_advance,
     gel_forces,
 )
@@ -93,7 +94,8 @@ def gel_substeps(
     """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
     ti.loop_config(serialize=True)
     for _ in range(counts[0, STEPS]):
-        layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+        layers = nodes.shape[4] - 1
+        nx, ny = elements_across(skin, 1, 1)
         for part in range(PARTS):
             gel_forces(0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny)
         for part in range(PARTS):

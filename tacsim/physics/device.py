@@ -20,8 +20,10 @@ from tacsim.physics.gel import (
     NodeLanes,
     Skin,
     Touch,
+    elements_across,
     gel_advance,
     node_block,
+    skin_row,
 )
 from tacsim.physics.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
 from tacsim.physics.indenter import Pressure, Slip, Values, indent
@@ -125,20 +127,19 @@ def press_substep(
     for at in range(counts.shape[0] * PARTS):
         if goes(at // PARTS, it, counts):
             clear_sums(at // PARTS, at % PARTS, partial)
-    for env, n in ti.ndrange(touch.shape[0], touch.shape[3]):
+    for env, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            touch[env, 0, 0, n] = vec4(0.0)
-    for env, k, n in ti.ndrange(counts.shape[0], layers, touch.shape[3]):
-        if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = elements_across(skin, counts.shape[0], 1)
             element(env, env, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
-    for env, cell in ti.ndrange(counts.shape[0], (skin.shape[3] - 3) * (skin.shape[4] - 3)):
+    for env, cell in ti.ndrange(
+        counts.shape[0], (skin.shape[0] // (2 * counts.shape[0]) - 3) * (skin.shape[1] - 3)
+    ):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = elements_across(skin, counts.shape[0], 1)
             indent(env, cell, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
-    for env, n in ti.ndrange(counts.shape[0], touch.shape[3]):
+    for env, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = elements_across(skin, counts.shape[0], 1)
             column(env, 0, 1, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
 
 
@@ -148,7 +149,7 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    it: ti.i32, nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice, masses: Strips,
+    it: ti.i32, nodes: NodeLanes, skin: Skin, corners: Corners, lattice: Lattice, masses: Strips,
     facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body (`tacsim.physics.hybrid_kernels.substeps`):
@@ -159,19 +160,18 @@ def elements_of_hybrid(
     for env, g in ti.ndrange(counts.shape[0], 2):
         if goes(env, it, counts):
             ceiling[env, g] = 0.0
-    for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
+    for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            touch[env, 0, g, n] = vec4(0.0)
-            row = skin.shape[4] - 2
-            height = skin[env, g, 0, n // row + 1, n % row + 1][2]
+            nx, ny = elements_across(skin, counts.shape[0], 2)
+            height = skin[skin_row(env, 2, g, nx) + n // (ny + 1) + 1, n % (ny + 1) + 1][2]
             if height > ceiling[env, g]:
                 ti.atomic_max(ceiling[env, g], height)
     for env, node in ti.ndrange(counts.shape[0], most):
         if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
             masses[env * counts[env, CAPACITY] + node] = strip(0.0)
-    for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, touch.shape[3]):
+    for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = elements_across(skin, counts.shape[0], 2)
             element(env, env * 2 + g, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
 
 
@@ -188,7 +188,7 @@ def scatter_of_hybrid(
     """
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = elements_across(skin, counts.shape[0], 2)
             for g in range(2):
                 touch_gel(
                     env, p, g, it, drive, particles, memory, skin, touch, facts, counts, partial, ceiling[env, g],
@@ -197,9 +197,9 @@ def scatter_of_hybrid(
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
             particles_to_grid(env, p, particles, masses, facts, counts, partial)
-    for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
+    for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = elements_across(skin, counts.shape[0], 2)
             column(env, g, 2, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
     for env, node in ti.ndrange(counts.shape[0], most):
         if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
@@ -250,7 +250,7 @@ class Mirror:
         nodes, skin, touch, corners, lattice = gels.memory()
         return (
             self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, vec4),
-            self.room("touch", vec4, touch.shape[:-1]), self.room("corners", real, corners.shape),
+            self.room("touch", ti.f32, touch.shape), self.room("corners", real, corners.shape),
             self.sent("lattice", lattice.reshape(-1, 1), real),
         )  # fmt: skip
 
@@ -291,7 +291,7 @@ def run_hybrid(
     layers, room = gels.nodes.shape[4] - 1, max(body.counts)
     most = int(counts[:, GRID : GRID + 3].prod(axis=1).max())
     for it in range(drive.shape[1]):
-        elements_of_hybrid(it, nodes, skin, touch, corners, lattice, mass, *numbers, ceiling, layers, most)
+        elements_of_hybrid(it, nodes, skin, corners, lattice, mass, *numbers, ceiling, layers, most)
         scatter_of_hybrid(
             it, there, nodes, skin, touch, corners, lattice, particles, mass, velocity, kept, *numbers, ceiling,
             layers, room, most,

@@ -24,6 +24,7 @@ from tacsim.physics.lanes import (
     opaque,
     padded,
     real,
+    small,
     vec4,
 )
 from tacsim.physics.layout import (
@@ -46,8 +47,8 @@ MPA = 1e-6  # megapascals in a pascal
 Nodes = ti.types.ndarray(dtype=ti.f32, ndim=6)
 # Lanes have one axis: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
 NodeLanes = ti.types.ndarray(dtype=real, ndim=1)
-Skin = ti.types.ndarray(dtype=vec4, ndim=5)
-Touch = ti.types.ndarray(dtype=vec4, ndim=4)
+Skin = ti.types.ndarray(dtype=vec4, ndim=2)
+Touch = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Corners = ti.types.ndarray(dtype=real, ndim=1)
 Lattice = ti.types.ndarray(dtype=real, ndim=1)
 
@@ -117,7 +118,7 @@ class GelState:
     nodes: (E, gels, 3, 3, nz + 1, P) displacement, velocity, force; axis; layer; the nodes of a layer as one row, node
     (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
     skin: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside.
-    touch: (E, COPIES, gels, P, 4) contact force on the surface nodes, one copy a part.
+    touch: (E, COPIES, gels, P, 4) contact force on the surface nodes, one copy a part; zeros between substeps.
     corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
     which works on all layers at once, (E, gels, nz, 24, W).
     lattice: (2, P) 1 at the first node of an element, else 0; and 1 / share of a node's mass, 0 where there is no node.
@@ -190,14 +191,16 @@ class GelState:
         """What every kernel with gels takes, in this order; arrays of lanes are the same memory once more."""
         shifts = (0, 1, self._row, self._row + 1)
         return (
-            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts), self.skin, self.touch,
-            *(shifted(self._corners, self.corners, -shift) for shift in shifts),
+            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts),
+            self.skin.reshape(-1, *self.skin.shape[-2:]), self.touch.reshape(-1), *(shifted(self._corners, self.corners, -shift) for shift in shifts),
             self.lattice.reshape(-1, LANES),
         )  # fmt: skip
 
     def memory(self) -> tuple[np.ndarray, ...]:
         """What a device takes: nodes with the margin round them, skin, touch, corners with theirs, lattice."""
-        return self._nodes, self.skin, self.touch, self._corners, self.lattice
+        return (
+            self._nodes, self.skin.reshape(-1, *self.skin.shape[-2:]), self.touch.reshape(-1), self._corners, self.lattice,
+        )  # fmt: skip
 
 
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
@@ -217,6 +220,24 @@ def gel_surface(facts: GelFacts, state: GelState, environment: int, gel: int) ->
     top = state.u[environment, gel, :, :, -1] / np.float32(MM)
     half = facts.half
     return GelSurface(np.ascontiguousarray(top), facts.spacing / MM, (-half[0] / MM, -half[1] / MM))
+
+
+@ti.func
+def elements_across(skin: ti.template(), environments, gels):
+    """Elements of a gel along x and y."""
+    return skin.shape[0] // (2 * environments * gels) - 3, skin.shape[1] - 3
+
+
+@ti.func
+def skin_row(env, gels, g, nx):
+    """First row of a gel's displacements in `skin`; its velocities begin nx + 3 rows further on."""
+    return (env * gels + g) * 2 * (nx + 3)
+
+
+@ti.func
+def touch_start(env, copy, gels, g, nx, ny):
+    """Where a gel's forces on its nodes begin in a copy of `touch`."""
+    return ((env * COPIES + copy) * gels + g) * 4 * LANES * (((nx + 1) * (ny + 1) + LANES - 1) // LANES)
 
 
 @ti.func
@@ -303,13 +324,27 @@ def gel_advance(
         for block in range(first, last):
             held += ti.select(lattice[blocks + block] > 0.0, n0[u + (6 + d) * axis + block], 0.0)
         note_sum(partial, env, slot, BACKING + d, held.sum())
-    for block in range(first, last):  # contact forces of all parts
-        for d in ti.static(range(3)):
-            total = real(0.0)
+    top = u + layers * blocks
+    push = ti.Matrix.zero(ti.f32, 1, 4 * LANES)
+    turned = ti.Matrix.zero(ti.f32, 4, LANES)
+    for block in range(first, last):  # contact forces of all parts, which are zero again in the next substep
+        for c in range(4 * LANES):
+            total = 0.0
             for other in ti.static(range(COPIES)):
-                total += real([touch[env, other, g, block * LANES + lane][d] for lane in range(LANES)])
-            at = u + (6 + d) * axis + layers * blocks + block
-            n0[at] = n0[at] + total
+                total += touch[small(touch_start(env, other, gels, g, nx, ny) + block * 4 * LANES) + c]
+            push[0, c] = total
+        for lane in range(LANES):
+            for d in ti.static(range(4)):
+                turned[d, lane] = push[0, 4 * lane + d]
+        for d in ti.static(range(3)):
+            at = opaque(never, top + (6 + d) * axis + block)
+            n0[at] = keep_or(never, n0[at], n0[at] + real([turned[d, lane] for lane in range(LANES)]))
+        for other in ti.static(range(COPIES)):
+            for quarter in range(4):
+                at = small(touch_start(env, other, gels, g, nx, ny) + (block * 4 + quarter) * LANES)
+                zeros = real([keep_or(never, touch[at + lane], 0.0) for lane in range(LANES)])
+                for lane in ti.static(range(LANES)):
+                    touch[at + lane] = zeros[lane]
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
@@ -322,7 +357,7 @@ def gel_advance(
                 n0[v] = keep_or(never, n0[v], speed)
                 n0[x] = keep_or(never, n0[x], place)
     first_n, last_n = first * LANES, ti.min(last * LANES, count)
-    top = u + layers * blocks
+    skin_at = skin_row(env, gels, g, nx)
     for i in range(first_n // row, (last_n + row - 1) // row):
         p0, p1 = i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)
         for j in range(ti.max(first_n - i * row, 0), ti.min(last_n - i * row, row)):
@@ -335,12 +370,5 @@ def gel_advance(
                     else:
                         at[d] = nodes[env, g, quantity, d, layers, i * row + j]
                 for p, q in ti.ndrange((p0, p1), (q0, q1)):
-                    skin[env, g, quantity, p, q] = keep_or(never, skin[env, g, quantity, p, q], at)
-
-
-@ti.func
-def clear_touch(env, part, gels, touch: ti.template(), never):
-    """This part's copy of the contact forces, for all gels."""
-    for g in range(gels):
-        for n in range(touch.shape[3]):
-            touch[env, part, g, n] = keep_or(never, touch[env, part, g, n], vec4(0.0))
+                    r = opaque(never, skin_at + quantity * (nx + 3) + p)
+                    skin[r, q] = keep_or(never, skin[r, q], at)

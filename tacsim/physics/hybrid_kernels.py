@@ -8,9 +8,11 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    clear_touch,
+    elements_across,
     gel_advance,
     gel_forces,
+    skin_row,
+    touch_start,
 )
 from tacsim.physics.lanes import (
     LANES,
@@ -20,6 +22,7 @@ from tacsim.physics.lanes import (
     Counts,
     Facts,
     Partial,
+    copy_of,
     note_sum,
     part_range,
     slot_of,
@@ -39,7 +42,6 @@ from tacsim.physics.layout import (
     KNOWN,
     LIGHTNESS,
     MOTION,
-    NEVER,
     ORIGIN,
     OVERLAP,
     PARTICLES,
@@ -170,7 +172,8 @@ def touch_gel(
     spacing = 0.5 * facts[env, BODY_CELL]
     rate = facts[env, STEP] / facts[env, BODY_MASS]
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
-    stride = counts[env, STRIDE]
+    stride, rows = counts[env, STRIDE], skin_row(env, 2, g, nx)
+    pushed = touch_start(env, copy_of(part), 2, g, nx, ny)
     first, last = block_range(env, part, counts)
     for p in range(first * LANES, ti.min(last * LANES, counts[env, PARTICLES])):
         known = env * KNOWN * stride + p
@@ -185,7 +188,8 @@ def touch_gel(
             moving = numbers(particles, known + VELOCITY * stride, stride)
             relative = back @ (moving - velocity - spin.cross(arm))
             touching, housed, force, kept = particle_contact(
-                env, part, g, local, relative, memory[env, g, p], radius, skin, touch, facts, layers, nx, ny, partial
+                env, part, g, local, relative, memory[env, g, p], radius, skin, rows, touch, pushed, facts, layers, nx,
+                ny, partial,
             )
             memory[env, g, p] = kept
             if touching:
@@ -221,13 +225,13 @@ def substeps(
         for _ in range(first_in_chunk(task)):
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
-            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            layers = nodes.shape[4] - 1
+            nx, ny = elements_across(skin, counts.shape[0], 2)
             for it in range(counts[env, STEPS]):
-                highest = ti.Vector([contact_ceiling(skin, env, 0), contact_ceiling(skin, env, 1)])
+                highest = ti.Vector([contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny) for g in range(2)])
                 for share in range(shares(member, team)):
                     part = member + share * team
                     partial[env, part, OVERLAP] = 0.0
-                    clear_touch(env, part, 2, touch, counts[env, NEVER])
                     for g in range(2):
                         touch_gel(
                             env, part, g, it, drive, particles, memory, skin, touch, facts, counts, partial, highest[g],

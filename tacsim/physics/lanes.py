@@ -67,6 +67,15 @@ def opaque(never, index):
 
 
 @ti.func
+def small(index):
+    """index. That it is neither negative nor large lets the compiler see which numbers behind it are neighbours."""
+    if ti.static(ON_DEVICE):
+        return index
+    else:
+        return index & (2**30 - 1)
+
+
+@ti.func
 def least_lane(rows: ti.template(), row: ti.template()):
     """Smallest number of a row of lanes."""
     least = rows[row, 0]
@@ -115,6 +124,16 @@ def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
         ti.atomic_add(array[at], value)
     else:
         array[at] = array[at] + value
+
+
+@ti.func
+def add_four(array: ti.template(), at, value):
+    """Adds to four neighbours of what a part scatters into."""
+    for c in ti.static(range(4)):
+        if ti.static(ON_DEVICE):
+            ti.atomic_add(array[at + c], value[c])
+        else:
+            array[at + c] = array[at + c] + value[c]
 
 
 # What a part notes in `partial`. On the CPU a slot has one writer. On a device it has many, so a sum starts from a zero

@@ -30,7 +30,7 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    clear_touch,
+    elements_across,
     gel_advance,
     gel_facts,
     gel_forces,
@@ -61,7 +61,6 @@ from tacsim.physics.layout import (
     FRICTION,
     GEL_DAMPING,
     KIND,
-    NEVER,
     NUMBERS,
     SHAPE,
     SHAPE_NODES,
@@ -99,11 +98,11 @@ def press_substeps(
         for _ in range(first_in_chunk(task)):
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
-            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            layers = nodes.shape[4] - 1
+            nx, ny = elements_across(skin, counts.shape[0], 1)
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    clear_touch(env, part, 1, touch, counts[env, NEVER])
                     indent(env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
                     gel_forces(
                         env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,

@@ -26,6 +26,7 @@ from tacsim.physics.lanes import (
     part_range,
     real,
     slot_of,
+    small,
     strip,
     vec2,
     vec3,
@@ -84,15 +85,6 @@ SUM, BY_X, BY_Y, BY_Z = 0, 1, 2, 3
 
 
 @ti.func
-def small(index):
-    """index. That it is neither negative nor large lets the compiler see which numbers are neighbours."""
-    if ti.static(ON_DEVICE):
-        return index
-    else:
-        return index & (2**27 - 1)
-
-
-@ti.func
 def twice(a):
     """A vector of four for every node of a strip."""
     return strip([a[c % 4] for c in range(4 * NODES)])
@@ -116,7 +108,7 @@ def load(particles: ti.template(), at, stride, first: ti.template(), count: ti.t
     and gathers."""
     for begin in ti.static(range(0, count, 6)):
         for r in range(begin, min(begin + 6, count)):
-            start = (at + (first + r) * stride) & (2**30 - 1)
+            start = small(at + (first + r) * stride)
             values = real([particles[start + lane] for lane in range(LANES)])
             for lane in ti.static(range(LANES)):
                 rows[r, lane] = values[lane]
@@ -127,7 +119,7 @@ def store(
     particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template(), never
 ):  # fmt: skip
     for r in range(count):
-        start = (at + (first + r) * stride) & (2**30 - 1)
+        start = small(at + (first + r) * stride)
         values = real([keep_or(never, particles[start + lane], rows[r, lane]) for lane in range(LANES)])
         for lane in ti.static(range(LANES)):
             particles[start + lane] = values[lane]

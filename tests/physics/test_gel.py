@@ -14,6 +14,7 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
+    elements_across,
     gel_advance,
     gel_facts,
     gel_forces,
@@ -35,7 +36,8 @@ def substep(
 ):  # fmt: skip
     ti.loop_config(serialize=True)
     for env in range(nodes.shape[0]):
-        layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+        layers = nodes.shape[4] - 1
+        nx, ny = elements_across(skin, nodes.shape[0], gels)
         for part in range(PARTS):
             gel_forces(
                 env, part, gels, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny
@@ -105,7 +107,9 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
     state.u[..., 1:, :] = u = rng.normal(scale=0.05, size=state.u[..., 1:, :].shape)
     state.v[..., 1:, :] = v = rng.normal(scale=0.01, size=u.shape)
     state.touch[..., :count, :3] = rng.normal(scale=0.01, size=state.touch[..., :count, :3].shape)
+    touch = state.touch.copy()
     partial = launch(state, advance=True)
+    assert not state.touch.any()  # zero for the next substep
     share = np.full(state.u.shape[2:5], 1.0)
     share[[0, -1]] *= 0.5
     share[:, [0, -1]] *= 0.5
@@ -116,7 +120,7 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
         force = reference.gel_forces(whole, facts.spacing, facts.mu, facts.lam, HOURGLASS)
         held = partial[0].reshape(2, -1, NUMBERS)[gel, :, BACKING : BACKING + 3].sum(axis=0)
         assert held == pytest.approx(force[:, :, 0].sum(axis=(0, 1)), abs=1e-5 * np.abs(force).max())
-        contact = state.touch[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
+        contact = touch[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
         force[:, :, -1] += contact
         velocity = (1 - DAMPING * DT) * v[0, gel] + DT * force[:, :, 1:] / mass
         assert np.abs(state.v[0, gel, :, :, 1:] - velocity).max() < 1e-5 * np.abs(velocity).max()

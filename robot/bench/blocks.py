@@ -70,7 +70,7 @@ def body_substeps(
                 for share in range((rows - member + team - 1) // team):
                     i = member + share * team
                     for at in range(i * plane, (i + 1) * plane):
-                        q = node_sum(0, i, at, masses, counts)
+                        q = node_sum(0, i, at, masses, velocities, counts)
                         moved = strip(0.0)
                         for n in ti.static(range(NODES)):
                             if q[4 * n + 3] > 0.0:

@@ -131,9 +131,7 @@ def press_substep(
         if goes(env, it, counts):
             nx, ny = elements_across(skin, counts.shape[0], 1)
             element(env, env, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
-    for env, cell in ti.ndrange(
-        counts.shape[0], (skin.shape[0] // (2 * counts.shape[0]) - 3) * (skin.shape[1] - 3)
-    ):
+    for env, cell in ti.ndrange(counts.shape[0], (skin.shape[0] // (2 * counts.shape[0]) - 3) * (skin.shape[1] - 3)):
         if goes(env, it, counts):
             nx, ny = elements_across(skin, counts.shape[0], 1)
             indent(env, cell, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)

@@ -295,6 +295,32 @@ def gel_forces(
 
 
 @ti.func
+def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch: ti.template(), never, nx, ny):
+    """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
+    zeros for the next substep. forces: where the blocks' forces along x begin, `axis` the way to y and z."""
+    push = ti.Matrix.zero(ti.f32, 4 * LANES, 1)
+    turned = ti.Matrix.zero(ti.f32, 4, LANES)
+    for block in range(first, last):
+        for c in range(4 * LANES):
+            total = 0.0
+            for copy in ti.static(range(COPIES)):
+                total += touch[small(touch_start(env, copy, gels, g, nx, ny) + block * 4 * LANES) + c]
+            push[c, 0] = total
+        for lane in range(LANES):
+            for d in ti.static(range(4)):
+                turned[d, lane] = push[4 * lane + d, 0]
+        for d in ti.static(range(3)):
+            at = opaque(never, forces + d * axis + block)
+            n0[at] = keep_or(never, n0[at], n0[at] + real([turned[d, lane] for lane in range(LANES)]))
+        for copy in ti.static(range(COPIES)):
+            for quarter in range(4):
+                at = small(touch_start(env, copy, gels, g, nx, ny) + (block * 4 + quarter) * LANES)
+                zeros = real([keep_or(never, touch[at + lane], 0.0) for lane in range(LANES)])
+                for lane in ti.static(range(LANES)):
+                    touch[at + lane] = zeros[lane]
+
+
+@ti.func
 def gel_advance(
     env, part, gels, nodes: ti.template(), n0: ti.template(), skin: ti.template(), touch: ti.template(),
     lattice: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
@@ -325,26 +351,13 @@ def gel_advance(
             held += ti.select(lattice[blocks + block] > 0.0, n0[u + (6 + d) * axis + block], 0.0)
         note_sum(partial, env, slot, BACKING + d, held.sum())
     top = u + layers * blocks
-    push = ti.Matrix.zero(ti.f32, 1, 4 * LANES)
-    turned = ti.Matrix.zero(ti.f32, 4, LANES)
-    for block in range(first, last):  # contact forces of all parts, which are zero again in the next substep
-        for c in range(4 * LANES):
-            total = 0.0
-            for other in ti.static(range(COPIES)):
-                total += touch[small(touch_start(env, other, gels, g, nx, ny) + block * 4 * LANES) + c]
-            push[0, c] = total
-        for lane in range(LANES):
-            for d in ti.static(range(4)):
-                turned[d, lane] = push[0, 4 * lane + d]
+    if ti.static(ON_DEVICE):
         for d in ti.static(range(3)):
-            at = opaque(never, top + (6 + d) * axis + block)
-            n0[at] = keep_or(never, n0[at], n0[at] + real([turned[d, lane] for lane in range(LANES)]))
-        for other in ti.static(range(COPIES)):
-            for quarter in range(4):
-                at = small(touch_start(env, other, gels, g, nx, ny) + (block * 4 + quarter) * LANES)
-                zeros = real([keep_or(never, touch[at + lane], 0.0) for lane in range(LANES)])
-                for lane in ti.static(range(LANES)):
-                    touch[at + lane] = zeros[lane]
+            at = touch_start(env, 0, gels, g, nx, ny) + 4 * first + d
+            n0[top + (6 + d) * axis + first] += touch[at]
+            touch[at] = 0.0
+    else:
+        take_touch(env, gels, g, first, last, top + 6 * axis, axis, n0, touch, never, nx, ny)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):

@@ -140,7 +140,7 @@ def grid_update(
         for j in range(j0, j1):
             for k in range(k0, k1):
                 at = (i * ny + j) * nz + k
-                q = node_sum(env, i, at, masses, counts)
+                q = node_sum(env, i, at, masses, velocities, counts)
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
                     if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
@@ -188,8 +188,22 @@ def touch_gel(
             moving = numbers(particles, known + VELOCITY * stride, stride)
             relative = back @ (moving - velocity - spin.cross(arm))
             touching, housed, force, kept = particle_contact(
-                env, part, g, local, relative, memory[env, g, p], radius, skin, rows, touch, pushed, facts, layers, nx,
-                ny, partial,
+                env,
+                part,
+                g,
+                local,
+                relative,
+                memory[env, g, p],
+                radius,
+                skin,
+                rows,
+                touch,
+                pushed,
+                facts,
+                layers,
+                nx,
+                ny,
+                partial,
             )
             memory[env, g, p] = kept
             if touching:

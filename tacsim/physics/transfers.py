@@ -33,7 +33,6 @@ from tacsim.physics.lanes import (
     vec4,
 )
 from tacsim.physics.layout import (
-    AFFINE,
     BODY_BULK,
     BODY_CELL,
     BODY_HARDENING,
@@ -43,7 +42,6 @@ from tacsim.physics.layout import (
     BODY_VOLUME,
     CAPACITY,
     FASTEST,
-    FLOW,
     GRID,
     KNOWN,
     MOTION,
@@ -51,8 +49,8 @@ from tacsim.physics.layout import (
     OFF_GRID,
     ORIGIN,
     PARTICLES,
-    PLANE,
     PLACE,
+    PLANE,
     SLAB,
     SMALLEST_STEP_VOLUME,
     STEP,
@@ -281,13 +279,22 @@ def particles_to_grid(
 
 
 @ti.func
-def node_sum(env, i, at, masses: ti.template(), counts: ti.template()):
-    """Momentum and mass of a strip of nodes in plane i: the copies of all parts, in their order."""
-    q = strip(0.0)
-    for part in ti.static(range(COPIES)):
-        if i >= counts[env, SLAB + 2 * part] and i < counts[env, SLAB + 2 * part + 1]:
-            q += masses[opaque(counts[env, NEVER], (env * COPIES + part) * counts[env, CAPACITY] + at)]
-    return q
+def node_sum(env, i, at, masses: ti.template(), velocities: ti.template(), counts: ti.template()):
+    """Momentum and mass of a strip of nodes in plane i: the copies of all parts, in their order.
+
+    They are added up where the velocities will be: stores to neighbours make it sums of whole vectors.
+    """
+    if ti.static(ON_DEVICE):
+        return masses[env * counts[env, CAPACITY] + at]
+    else:
+        never = counts[env, NEVER]
+        here = opaque(never, env * counts[env, CAPACITY] + at)
+        velocities[here] = keep_or(never, velocities[here], strip(0.0))
+        for part in ti.static(range(COPIES)):
+            if i >= counts[env, SLAB + 2 * part] and i < counts[env, SLAB + 2 * part + 1]:
+                copy = opaque(never, (env * COPIES + part) * counts[env, CAPACITY] + at)
+                velocities[here] = velocities[here] + masses[copy]
+        return velocities[here]
 
 
 @ti.func
@@ -348,10 +355,14 @@ def grid_to_particles(
                         plain[i] = grid[W_Y, lane] * v0 + grid[W_Y + 1, lane] * v1 + grid[W_Y + 2, lane] * v2
                         sloped[i] = grid[D_Y, lane] * v1 + grid[D_Y + 1, lane] * v2
                     w = ti.select(c < 4, grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
-                    here = w * (grid[W_X, lane] * plain[0] + grid[W_X + 1, lane] * plain[1] + grid[W_X + 2, lane] * plain[2])
+                    here = w * (
+                        grid[W_X, lane] * plain[0] + grid[W_X + 1, lane] * plain[1] + grid[W_X + 2, lane] * plain[2]
+                    )
                     total += here
                     by_x += w * (grid[D_X, lane] * plain[1] + grid[D_X + 1, lane] * plain[2])
-                    by_y += w * (grid[W_X, lane] * sloped[0] + grid[W_X + 1, lane] * sloped[1] + grid[W_X + 2, lane] * sloped[2])
+                    by_y += w * (
+                        grid[W_X, lane] * sloped[0] + grid[W_X + 1, lane] * sloped[1] + grid[W_X + 2, lane] * sloped[2]
+                    )
                     by_z += ti.select(c < 4, float(NODES * s), float(NODES * s + 1)) * here
                 nodes[SUM, c], nodes[BY_X, c], nodes[BY_Y, c], nodes[BY_Z, c] = total, by_x, by_y, by_z
             for k in ti.static(range(4)):

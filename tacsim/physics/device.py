@@ -177,8 +177,8 @@ def elements_of_hybrid(
 def scatter_of_hybrid(
     it: ti.i32, drive: Drive,
     nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
-    layers: ti.i32, room: ti.i32, most: ti.i32,
+    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
+    facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, room: ti.i32, most: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
 

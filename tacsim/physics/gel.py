@@ -191,16 +191,17 @@ class GelState:
         """What every kernel with gels takes, in this order; arrays of lanes are the same memory once more."""
         shifts = (0, 1, self._row, self._row + 1)
         return (
-            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts),
-            self.skin.reshape(-1, *self.skin.shape[-2:]), self.touch.reshape(-1), *(shifted(self._corners, self.corners, -shift) for shift in shifts),
-            self.lattice.reshape(-1, LANES),
+            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts), *self._surface(),
+            *(shifted(self._corners, self.corners, -shift) for shift in shifts), self.lattice.reshape(-1, LANES),
         )  # fmt: skip
 
     def memory(self) -> tuple[np.ndarray, ...]:
         """What a device takes: nodes with the margin round them, skin, touch, corners with theirs, lattice."""
-        return (
-            self._nodes, self.skin.reshape(-1, *self.skin.shape[-2:]), self.touch.reshape(-1), self._corners, self.lattice,
-        )  # fmt: skip
+        return self._nodes, *self._surface(), self._corners, self.lattice
+
+    def _surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Skin and touch with the fewest axes."""
+        return self.skin.reshape(-1, *self.skin.shape[-2:]), self.touch.reshape(-1)
 
 
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:

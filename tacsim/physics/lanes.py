@@ -1,9 +1,8 @@
 """Eight of everything at once: how kernels are laid out so that the CPU works on whole vectors.
 
 Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
-side by side, starting from stores to neighbouring addresses that it has seen before. Hence `real` holds one number of
-eight neighbours (particles, elements, nodes), arrays keep these eight side by side, and `keep_or` stores in the way that is
-recognised.
+side by side, starting from stores to neighbouring addresses that it has seen before. Hence arrays keep one number of
+eight neighbours (particles, elements, nodes; `real`) side by side, and `keep_or` stores in the way that is recognised.
 
 Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
 a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.

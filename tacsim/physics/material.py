@@ -182,7 +182,8 @@ def after_flow(growth, shrink):
 
 @ti.func
 def third_root(z):
-    """t with (1 - t) / (1 + t) = (1 + x)^(-1/3), where z = x / (2 + x): tanh(artanh(z) / 3) by its series, |x| <= 0.4."""
+    """t with (1 - t) / (1 + t) = (1 + x)^(-1/3) for |x| up to 0.4, where z = x / (2 + x): tanh(artanh(z) / 3) by its
+    series."""
     q = z * z
     q2 = q * q
     low, high = 1.0 / 3.0 + 8.0 / 81.0 * q, 40.0 / 729.0 + 728.0 / 19683.0 * q

@@ -115,7 +115,7 @@ class BodyState:
 
     def c(self, environment: int = 0) -> np.ndarray:
         """Affine velocities, (n, 3, 3), a view."""
-        columns = self.known[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
+        columns: np.ndarray = self.known[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
         return columns[..., : self.counts[environment]].T
 
     def e(self, environment: int = 0) -> np.ndarray:
@@ -124,7 +124,7 @@ class BodyState:
 
     def flow(self, environment: int = 0) -> np.ndarray:
         """Equivalent plastic strains, (n,), a view."""
-        return self._rows(environment, FLOW, 1)[0]
+        return self._rows(environment, FLOW, 1).reshape(-1)
 
     def fit(self, environment: int, cell: float, margin: float, facts: np.ndarray, counts: np.ndarray) -> None:
         """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.

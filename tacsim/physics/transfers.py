@@ -2,11 +2,13 @@
 
 Work is laid out for a CPU's vector registers. What concerns one particle alone (stencil, strain, return mapping) is
 done for LANES particles in an inner loop over arrays of its own, which LLVM turns into whole vectors: nothing else can
-lie where it writes. What goes to nodes and comes from them is done particle by particle with NODES neighbours of a grid
+lie where it writes. Particles are kept in rows of one number of all of them, so such a block is loaded and stored in
+whole vectors, too. What goes to nodes and comes from them is done particle by particle with NODES neighbours of a grid
 line in a register; a stencil of three nodes begins at any node, a strip at every second one, so two strips hold it, and
-the node too many has weight 0. Between the two kinds of loop numbers are copied one by one, `as_it_comes`.
+the node too many has weight 0.
 
-On a device LANES and NODES are 1, and all inner loops run once.
+On a device LANES and NODES are 1, and all inner loops run once. Numbers behind the last particle are nobody's: they
+stay as they are.
 """
 
 from tacsim.physics.lanes import (
@@ -210,7 +212,7 @@ def particles_to_grid(
     stride = counts[env, STRIDE]
     base = (env * COPIES + copy) * counts[env, CAPACITY]
     dump = base + counts[env, GRID] * ny * (nz // NODES)  # three planes behind the grid
-    none = ti.cast(never, ti.f32)  # 0: with a 0 that it knows, the compiler does other things than with other numbers
+    none = ti.cast(never, ti.f32)  # 0, but a 0 that the compiler knows would make a lane unlike its neighbours
     lost, spare = 0, opaque(never, 16)
     place = ti.Matrix.zero(ti.f32, 3, LANES)
     old = ti.Matrix.zero(ti.f32, 7, LANES)  # strain, flow
@@ -298,6 +300,18 @@ def node_sum(env, i, at, masses: ti.template(), velocities: ti.template(), count
 
 
 @ti.func
+def mean(rows: ti.template(), row: ti.template(), lane, a, b, c):
+    """Sum of three numbers by the weights in three rows."""
+    return rows[row, lane] * a + rows[row + 1, lane] * b + rows[row + 2, lane] * c
+
+
+@ti.func
+def slope(rows: ti.template(), row: ti.template(), lane, b, c):
+    """The same with the node's number as a factor, by two rows: it is 0 for the first node."""
+    return rows[row, lane] * b + rows[row + 1, lane] * c
+
+
+@ti.func
 def moved_plane(plane, x, y, z, dt):
     """A tangent plane of the surface goes with the material, as F^-T does: m' = -C^T m; x, y, z: columns of C."""
     return plane - dt * vec3(x.dot(plane), y.dot(plane), z.dot(plane))
@@ -346,23 +360,16 @@ def grid_to_particles(
             for c in range(4 * NODES):
                 total, by_x, by_y, by_z = 0.0, 0.0, 0.0, 0.0
                 for s in ti.static(range(LINE)):
-                    plain = [0.0, 0.0, 0.0]
-                    sloped = [0.0, 0.0, 0.0]
+                    plane, sloped = vec3(0.0), vec3(0.0)  # sums over y
                     for i in ti.static(range(3)):
-                        v0 = velocities[small(whole[3 * i, lane]) + s][c]
-                        v1 = velocities[small(whole[3 * i + 1, lane]) + s][c]
-                        v2 = velocities[small(whole[3 * i + 2, lane]) + s][c]
-                        plain[i] = grid[W_Y, lane] * v0 + grid[W_Y + 1, lane] * v1 + grid[W_Y + 2, lane] * v2
-                        sloped[i] = grid[D_Y, lane] * v1 + grid[D_Y + 1, lane] * v2
+                        v0, v1, v2 = [velocities[small(whole[3 * i + j, lane]) + s][c] for j in range(3)]
+                        plane[i] = mean(grid, W_Y, lane, v0, v1, v2)
+                        sloped[i] = slope(grid, D_Y, lane, v1, v2)
                     w = ti.select(c < 4, grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
-                    here = w * (
-                        grid[W_X, lane] * plain[0] + grid[W_X + 1, lane] * plain[1] + grid[W_X + 2, lane] * plain[2]
-                    )
+                    here = w * mean(grid, W_X, lane, plane[0], plane[1], plane[2])
                     total += here
-                    by_x += w * (grid[D_X, lane] * plain[1] + grid[D_X + 1, lane] * plain[2])
-                    by_y += w * (
-                        grid[W_X, lane] * sloped[0] + grid[W_X + 1, lane] * sloped[1] + grid[W_X + 2, lane] * sloped[2]
-                    )
+                    by_x += w * slope(grid, D_X, lane, plane[1], plane[2])
+                    by_y += w * mean(grid, W_X, lane, sloped[0], sloped[1], sloped[2])
                     by_z += ti.select(c < 4, float(NODES * s), float(NODES * s + 1)) * here
                 nodes[SUM, c], nodes[BY_X, c], nodes[BY_Y, c], nodes[BY_Z, c] = total, by_x, by_y, by_z
             for k in ti.static(range(4)):

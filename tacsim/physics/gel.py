@@ -305,7 +305,7 @@ def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch
         for c in range(4 * LANES):
             total = 0.0
             for copy in ti.static(range(COPIES)):
-                total += touch[small(touch_start(env, copy, gels, g, nx, ny) + block * 4 * LANES) + c]
+                total += touch[small(touch_start(env, copy, gels, g, nx, ny) + block * 4 * LANES, 1) + c]
             push[c, 0] = total
         for lane in range(LANES):
             for d in ti.static(range(4)):
@@ -315,7 +315,7 @@ def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch
             n0[at] = keep_or(never, n0[at], n0[at] + real([turned[d, lane] for lane in range(LANES)]))
         for copy in ti.static(range(COPIES)):
             for quarter in range(4):
-                at = small(touch_start(env, copy, gels, g, nx, ny) + (block * 4 + quarter) * LANES)
+                at = small(touch_start(env, copy, gels, g, nx, ny) + (block * 4 + quarter) * LANES, 1)
                 zeros = real([keep_or(never, touch[at + lane], 0.0) for lane in range(LANES)])
                 for lane in ti.static(range(LANES)):
                     touch[at + lane] = zeros[lane]

@@ -66,12 +66,13 @@ def opaque(never, index):
 
 
 @ti.func
-def small(index):
-    """index. That it is neither negative nor large lets the compiler see which numbers behind it are neighbours."""
+def small(index, width: ti.template()):
+    """index, of things of `width` numbers. That it is neither negative nor large lets the compiler see which numbers
+    behind it are neighbours."""
     if ti.static(ON_DEVICE):
         return index
     else:
-        return index & (2**30 - 1)
+        return index & (2**30 // width - 1)
 
 
 @ti.func

@@ -108,7 +108,7 @@ def load(particles: ti.template(), at, stride, first: ti.template(), count: ti.t
     and gathers."""
     for begin in ti.static(range(0, count, 6)):
         for r in range(begin, min(begin + 6, count)):
-            start = small(at + (first + r) * stride)
+            start = small(at + (first + r) * stride, 1)
             values = real([particles[start + lane] for lane in range(LANES)])
             for lane in ti.static(range(LANES)):
                 rows[r, lane] = values[lane]
@@ -119,7 +119,7 @@ def store(
     particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template(), never
 ):  # fmt: skip
     for r in range(count):
-        start = small(at + (first + r) * stride)
+        start = small(at + (first + r) * stride, 1)
         values = real([keep_or(never, particles[start + lane], rows[r, lane]) for lane in range(LANES)])
         for lane in ti.static(range(LANES)):
             particles[start + lane] = values[lane]
@@ -274,7 +274,7 @@ def particles_to_grid(
                 for i in ti.static(range(3)):
                     line = plane
                     for j in ti.static(range(3)):
-                        add_to(masses, small(whole[3 * i + j, lane]) + s, shares[3 * i + j, lane] * line)
+                        add_to(masses, small(whole[3 * i + j, lane], 4 * NODES) + s, shares[3 * i + j, lane] * line)
                         line += by_y
                     plane += by_x
     note_more(partial, env, slot_of(part), OFF_GRID, float(lost))
@@ -362,7 +362,7 @@ def grid_to_particles(
                 for s in ti.static(range(LINE)):
                     plane, sloped = vec3(0.0), vec3(0.0)  # sums over y
                     for i in ti.static(range(3)):
-                        v0, v1, v2 = [velocities[small(whole[3 * i + j, lane]) + s][c] for j in range(3)]
+                        v0, v1, v2 = [velocities[small(whole[3 * i + j, lane], 4 * NODES) + s][c] for j in range(3)]
                         plane[i] = mean(grid, W_Y, lane, v0, v1, v2)
                         sloped[i] = slope(grid, D_Y, lane, v1, v2)
                     w = ti.select(c < 4, grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])

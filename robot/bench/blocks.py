@@ -13,7 +13,6 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    elements_across,
     gel_advance,
     gel_forces,
 )
@@ -21,6 +20,7 @@ from tacsim.physics.lanes import NODES, PARTS, Counts, Facts, Partial, strip, ve
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
+    ELEMENTS,
     FACTS,
     GEL_DAMPING,
     GRID,
@@ -95,11 +95,11 @@ def gel_substeps(
     ti.loop_config(serialize=True)
     for _ in range(counts[0, STEPS]):
         layers = nodes.shape[4] - 1
-        nx, ny = elements_across(skin, 1, 1)
+        nx, ny = counts[0, ELEMENTS], counts[0, ELEMENTS + 1]
         for part in range(PARTS):
             gel_forces(0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny)
         for part in range(PARTS):
-            gel_advance(0, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+            gel_advance(0, part, 1, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
         dt, keep = facts[0, STEP], vec3(keep_x, keep_y, keep_z)
         for d in ti.static(range(3)):
             for k in range(1, layers + 1):
@@ -167,6 +167,7 @@ class GelBlock(Block):
     def __init__(self, facts: GelFacts, dt: float, damping: float) -> None:
         super().__init__({**facts.facts(), GEL_DAMPING: damping}, dt)
         self.state = GelState(facts, 1, 1)
+        self.counts[:, ELEMENTS : ELEMENTS + 2] = facts.elements[:2]
         self._arguments = (*self.state.arguments(), self.facts, self.counts, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:

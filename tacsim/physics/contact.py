@@ -6,7 +6,8 @@ rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 197
 holds nothing.
 """
 
-from tacsim.physics.lanes import add_four, note_more, note_most, slot_of, vec3, vec4
+from tacsim.physics.gel import skin_at
+from tacsim.physics.lanes import ON_DEVICE, add_four, note_more, note_most, slot_of, vec3, vec4
 from tacsim.physics.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
 from tacsim.runtime import ti
 
@@ -28,13 +29,33 @@ def spline(a):
 
 
 @ti.func
-def displacement_at(skin: ti.template(), row, a):
+def skin_sum(skin: ti.template(), row, i, j, wx, wy, ny):
+    """Sum over the 3 x 3 nodes of a stencil from (i, j) on, weighted by wx and wy; row: the quantity's first.
+
+    A loop over the four numbers of a node, of which a CPU makes vectors; all four nodes' first numbers at once would be
+    a gather.
+    """
+    if ti.static(ON_DEVICE):
+        total = vec4(0.0)
+        for p, q in ti.static(ti.ndrange(3, 3)):
+            at = skin_at(row + i + p + 1, j + q + 1, ny)
+            total += (wx[p] * wy[q]) * vec4([skin[at + c] for c in range(4)])
+        return total
+    else:
+        sums = ti.Matrix.zero(ti.f32, 4, 1)
+        for c in range(4):
+            total = 0.0
+            for p, q in ti.static(ti.ndrange(3, 3)):
+                total += (wx[p] * wy[q]) * skin[skin_at(row + i + p + 1, j + q + 1, ny) + c]
+            sums[c, 0] = total
+        return vec4([sums[c, 0] for c in range(4)])
+
+
+@ti.func
+def displacement_at(skin: ti.template(), row, a, ny):
     i, wx, _ = spline(a[0])
     j, wy, _ = spline(a[1])
-    us = vec4(0.0)
-    for p, q in ti.static(ti.ndrange(3, 3)):
-        us += (wx[p] * wy[q]) * skin[row + i + p + 1, j + q + 1]
-    return us
+    return skin_sum(skin, row, i, j, wx, wy, ny)
 
 
 @ti.func
@@ -44,7 +65,7 @@ def material_point(skin: ti.template(), row, x, h, nx, ny):
     a = start
     us = vec4(0.0)
     for _ in range(3):
-        us = displacement_at(skin, row, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))))
+        us = displacement_at(skin, row, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))), ny)
         a = start - vec2(us[0], us[1]) / h
     return a, us
 
@@ -89,7 +110,7 @@ def contact_ceiling(skin: ti.template(), row, nx, ny):
     highest = 0.0
     for i in range(1, nx + 2):
         for j in range(1, ny + 2):
-            height = skin[row + i, j][2]
+            height = skin[skin_at(row + i, j, ny) + 2]
             highest = ti.select(height > highest, height, highest)
     return highest
 
@@ -122,12 +143,9 @@ def particle_contact(
             if depth + taken > 0.0:
                 i, wx, dx = spline(a[0])
                 j, wy, dy = spline(a[1])
-                t1, t2, vs = vec4(1.0, 0.0, 0.0, 0.0), vec4(0.0, 1.0, 0.0, 0.0), vec4(0.0)
-                for p, q in ti.static(ti.ndrange(3, 3)):
-                    node = skin[row + i + p + 1, j + q + 1]
-                    t1 += (dx[p] * wy[q] / h) * node
-                    t2 += (wx[p] * dy[q] / h) * node
-                    vs += (wx[p] * wy[q]) * skin[row + nx + 3 + i + p + 1, j + q + 1]
+                t1 = vec4(1.0, 0.0, 0.0, 0.0) + skin_sum(skin, row, i, j, dx / h, wy, ny)
+                t2 = vec4(0.0, 1.0, 0.0, 0.0) + skin_sum(skin, row, i, j, wx, dy / h, ny)
+                vs = skin_sum(skin, row + nx + 3, i, j, wx, wy, ny)
                 n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
                 if gap > deepest:  # an overlap found late must not explode; counted

@@ -20,13 +20,13 @@ from tacsim.physics.gel import (
     NodeLanes,
     Skin,
     Touch,
-    elements_across,
     gel_advance,
     node_block,
+    skin_at,
     skin_row,
 )
 from tacsim.physics.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
-from tacsim.physics.indenter import Pressure, Slip, Values, indent
+from tacsim.physics.indenter import POINTS, Pressure, Slip, Values, indent
 from tacsim.physics.lanes import (
     LANES,
     PARTS,
@@ -43,6 +43,7 @@ from tacsim.physics.lanes import (
 from tacsim.physics.layout import (
     BACKING,
     CAPACITY,
+    ELEMENTS,
     FORCE,
     GRID,
     HOUSED,
@@ -112,9 +113,7 @@ def column(
                 margin + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
                 nodes, corners, corners, corners, corners, 1, ny + 1, 0,
             )  # fmt: skip
-    gel_advance(
-        env, g * blocks + block, gels, nodes, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny
-    )
+    gel_advance(env, g * blocks + block, gels, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
 
 
 @ti.kernel
@@ -129,15 +128,15 @@ def press_substep(
             clear_sums(at // PARTS, at % PARTS, partial)
     for env, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = elements_across(skin, counts.shape[0], 1)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             element(env, env, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
-    for env, cell in ti.ndrange(counts.shape[0], (skin.shape[0] // (2 * counts.shape[0]) - 3) * (skin.shape[1] - 3)):
+    for env, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
         if goes(env, it, counts):
-            nx, ny = elements_across(skin, counts.shape[0], 1)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             indent(env, cell, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
     for env, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = elements_across(skin, counts.shape[0], 1)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             column(env, 0, 1, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
 
 
@@ -160,8 +159,8 @@ def elements_of_hybrid(
             ceiling[env, g] = 0.0
     for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = elements_across(skin, counts.shape[0], 2)
-            height = skin[skin_row(env, 2, g, nx) + n // (ny + 1) + 1, n % (ny + 1) + 1][2]
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
+            height = skin[skin_at(skin_row(env, 2, g, nx) + n // (ny + 1) + 1, n % (ny + 1) + 1, ny) + 2]
             if height > ceiling[env, g]:
                 ti.atomic_max(ceiling[env, g], height)
     for env, node in ti.ndrange(counts.shape[0], most):
@@ -169,7 +168,7 @@ def elements_of_hybrid(
             masses[env * counts[env, CAPACITY] + node] = strip(0.0)
     for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = elements_across(skin, counts.shape[0], 2)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             element(env, env * 2 + g, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
 
 
@@ -186,7 +185,7 @@ def scatter_of_hybrid(
     """
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            nx, ny = elements_across(skin, counts.shape[0], 2)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             for g in range(2):
                 touch_gel(
                     env, p, g, it, drive, particles, memory, skin, touch, facts, counts, partial, ceiling[env, g],
@@ -197,7 +196,7 @@ def scatter_of_hybrid(
             particles_to_grid(env, p, particles, masses, facts, counts, partial)
     for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = elements_across(skin, counts.shape[0], 2)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             column(env, g, 2, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
     for env, node in ti.ndrange(counts.shape[0], most):
         if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
@@ -247,7 +246,7 @@ class Mirror:
         """What every kernel with gels takes."""
         nodes, skin, touch, corners, lattice = gels.memory()
         return (
-            self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, vec4),
+            self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, ti.f32),
             self.room("touch", ti.f32, touch.shape), self.room("corners", real, corners.shape),
             self.sent("lattice", lattice.reshape(-1, 1), real),
         )  # fmt: skip

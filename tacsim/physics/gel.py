@@ -47,7 +47,7 @@ MPA = 1e-6  # megapascals in a pascal
 Nodes = ti.types.ndarray(dtype=ti.f32, ndim=6)
 # Lanes have one axis: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
 NodeLanes = ti.types.ndarray(dtype=real, ndim=1)
-Skin = ti.types.ndarray(dtype=vec4, ndim=2)
+Skin = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Touch = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Corners = ti.types.ndarray(dtype=real, ndim=1)
 Lattice = ti.types.ndarray(dtype=real, ndim=1)
@@ -200,8 +200,7 @@ class GelState:
         return self._nodes, *self._surface(), self._corners, self.lattice
 
     def _surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """Skin and touch with the fewest axes."""
-        return self.skin.reshape(-1, *self.skin.shape[-2:]), self.touch.reshape(-1)
+        return self.skin.reshape(-1), self.touch.reshape(-1)
 
 
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
@@ -224,15 +223,15 @@ def gel_surface(facts: GelFacts, state: GelState, environment: int, gel: int) ->
 
 
 @ti.func
-def elements_across(skin: ti.template(), environments, gels):
-    """Elements of a gel along x and y."""
-    return skin.shape[0] // (2 * environments * gels) - 3, skin.shape[1] - 3
-
-
-@ti.func
 def skin_row(env, gels, g, nx):
     """First row of a gel's displacements in `skin`; its velocities begin nx + 3 rows further on."""
     return (env * gels + g) * 2 * (nx + 3)
+
+
+@ti.func
+def skin_at(row, column, ny):
+    """Where the four numbers of a node stand in `skin`."""
+    return small(4 * (row * (ny + 3) + column), 1)
 
 
 @ti.func
@@ -323,8 +322,8 @@ def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch
 
 @ti.func
 def gel_advance(
-    env, part, gels, nodes: ti.template(), n0: ti.template(), skin: ti.template(), touch: ti.template(),
-    lattice: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
+    env, part, gels, n0: ti.template(), skin: ti.template(), touch: ti.template(), lattice: ti.template(),
+    facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Symplectic Euler with lumped masses on this part's nodes of its gel, and their skin.
 
@@ -370,19 +369,22 @@ def gel_advance(
                 place = n0[x] + dt * speed
                 n0[v] = keep_or(never, n0[v], speed)
                 n0[x] = keep_or(never, n0[x], place)
-    first_n, last_n = first * LANES, ti.min(last * LANES, count)
-    skin_at = skin_row(env, gels, g, nx)
-    for i in range(first_n // row, (last_n + row - 1) // row):
-        p0, p1 = i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)
-        for j in range(ti.max(first_n - i * row, 0), ti.min(last_n - i * row, row)):
+    first_row = skin_row(env, gels, g, nx)
+    i, j = first * LANES // row, first * LANES % row
+    for block in range(first, last):
+        for lane in range(ti.min(LANES, count - block * LANES)):
+            p0, p1 = i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)
             q0, q1 = j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)
             for quantity in ti.static(range(2)):
                 at = vec4(0.0)
                 for d in ti.static(range(3)):
-                    if ti.static(ON_DEVICE):
-                        at[d] = n0[top + (3 * quantity + d) * axis + i * row + j][0]
-                    else:
-                        at[d] = nodes[env, g, quantity, d, layers, i * row + j]
-                for p, q in ti.ndrange((p0, p1), (q0, q1)):
-                    r = opaque(never, skin_at + quantity * (nx + 3) + p)
-                    skin[r, q] = keep_or(never, skin[r, q], at)
+                    at[d] = n0[top + (3 * quantity + d) * axis + block][lane]
+                for p in range(p0, p1):
+                    for q in range(q0, q1):
+                        to = skin_at(first_row + quantity * (nx + 3) + p, q, ny)
+                        values = vec4([keep_or(never, skin[to + c], at[c]) for c in range(4)])
+                        for c in ti.static(range(4)):
+                            skin[to + c] = values[c]
+            j += 1
+            if j == row:
+                i, j = i + 1, 0

@@ -8,7 +8,6 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    elements_across,
     gel_advance,
     gel_forces,
     skin_row,
@@ -35,6 +34,7 @@ from tacsim.physics.layout import (
     BODY_DAMPING,
     BODY_MASS,
     CAPACITY,
+    ELEMENTS,
     FORCE,
     GRAVITY,
     GRID,
@@ -240,7 +240,7 @@ def substeps(
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
             layers = nodes.shape[4] - 1
-            nx, ny = elements_across(skin, counts.shape[0], 2)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             for it in range(counts[env, STEPS]):
                 highest = ti.Vector([contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny) for g in range(2)])
                 for share in range(shares(member, team)):
@@ -260,7 +260,7 @@ def substeps(
                 meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, 2, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
                 meet(sync, turn, team, 2 * it + 2)
                 for share in range(shares(member, team)):

@@ -30,7 +30,6 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    elements_across,
     gel_advance,
     gel_facts,
     gel_forces,
@@ -56,6 +55,7 @@ from tacsim.physics.lanes import ON_DEVICE, PARTS, Counts, Facts, Partial
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
+    ELEMENTS,
     FACTS,
     FORCE,
     FRICTION,
@@ -99,7 +99,7 @@ def press_substeps(
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
             layers = nodes.shape[4] - 1
-            nx, ny = elements_across(skin, counts.shape[0], 1)
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
                     part = member + share * team
@@ -111,7 +111,7 @@ def press_substeps(
                 meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, 1, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                 meet(sync, turn, team, 2 * it + 2)
 
 
@@ -145,6 +145,7 @@ class PressState:
         self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # multiplier of the normal contact [MPa]
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.counts[:, ELEMENTS : ELEMENTS + 2] = nx, ny
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
         self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])

@@ -14,13 +14,12 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    elements_across,
     gel_advance,
     gel_facts,
     gel_forces,
 )
 from tacsim.physics.lanes import PARTS, Counts, Facts, Partial
-from tacsim.physics.layout import BACKING, COUNTS, FACTS, GEL_DAMPING, NUMBERS, SMALLEST_VOLUME, STEP
+from tacsim.physics.layout import BACKING, COUNTS, ELEMENTS, FACTS, GEL_DAMPING, NUMBERS, SMALLEST_VOLUME, STEP
 from tacsim.runtime import start, ti
 from tacsim.scene import Gel, GelMaterial
 
@@ -37,13 +36,13 @@ def substep(
     ti.loop_config(serialize=True)
     for env in range(nodes.shape[0]):
         layers = nodes.shape[4] - 1
-        nx, ny = elements_across(skin, nodes.shape[0], gels)
+        nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
         for part in range(PARTS):
             gel_forces(
                 env, part, gels, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny
             )
         for part in range(PARTS * advance):
-            gel_advance(env, part, gels, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+            gel_advance(env, part, gels, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
 
 
 GEL = Gel(size=(6e-3, 5e-3, 4e-3), material=GelMaterial(poisson_ratio=0.48))
@@ -59,6 +58,7 @@ def launch(state: GelState, advance: bool, element: float = 1e-3, gel: Gel = GEL
     for index, value in {**facts.facts(), STEP: DT, GEL_DAMPING: DAMPING}.items():
         numbers[:, index] = value
     counts = np.zeros((environments, COUNTS), np.int32)
+    counts[:, ELEMENTS : ELEMENTS + 2] = facts.elements[:2]
     partial = np.full((environments, PARTS, NUMBERS), 1e9, np.float32)
     state.refresh()
     substep(gels, int(advance), *state.arguments(), numbers, counts, partial)

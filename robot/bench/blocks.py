@@ -20,6 +20,7 @@ from tacsim.physics.lanes import NODES, PARTS, Counts, Facts, Partial, strip, ve
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
+    ELEMENTS,
     FACTS,
     GEL_DAMPING,
     GRID,
@@ -34,9 +35,7 @@ from tacsim.physics.material import convect, hencky_return, mat3, vec6
 from tacsim.physics.plasticine import BodyFacts, BodyState
 from tacsim.physics.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.physics.transfers import (
-    Points,
-    Rates,
-    Strains,
+    Particles,
     Strips,
     clear_masses,
     grid_to_particles,
@@ -53,7 +52,7 @@ Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 @ti.kernel
 def body_substeps(
     team: ti.i32, steps: Steps,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips, sums: Strips,
+    particles: Particles, masses: Strips, velocities: Strips,
     facts: Facts, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
 ):  # fmt: skip
     """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
@@ -65,13 +64,13 @@ def body_substeps(
                 for share in range(shares(member, team)):
                     part = member + share * team
                     clear_masses(0, part, masses, counts)
-                    particles_to_grid(0, part, points, rates, strains, masses, sums, facts, counts, partial)
+                    particles_to_grid(0, part, particles, masses, facts, counts, partial)
                 meet(sync, 0, team, 2 * it + 1)
                 plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
                 for share in range((rows - member + team - 1) // team):
                     i = member + share * team
                     for at in range(i * plane, (i + 1) * plane):
-                        q = node_sum(0, i, at, masses, counts)
+                        q = node_sum(0, i, at, masses, velocities, counts)
                         moved = strip(0.0)
                         for n in ti.static(range(NODES)):
                             if q[4 * n + 3] > 0.0:
@@ -82,7 +81,7 @@ def body_substeps(
                 meet(sync, 0, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    grid_to_particles(0, part, points, planes, rates, strains, velocities, sums, facts, counts, partial)
+                    grid_to_particles(0, part, particles, velocities, facts, counts, partial)
 
 
 @ti.kernel
@@ -95,11 +94,12 @@ def gel_substeps(
     """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
     ti.loop_config(serialize=True)
     for _ in range(counts[0, STEPS]):
-        layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+        layers = nodes.shape[4] - 1
+        nx, ny = counts[0, ELEMENTS], counts[0, ELEMENTS + 1]
         for part in range(PARTS):
             gel_forces(0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny)
         for part in range(PARTS):
-            gel_advance(0, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+            gel_advance(0, part, 1, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
         dt, keep = facts[0, STEP], vec3(keep_x, keep_y, keep_z)
         for d in ti.static(range(3)):
             for k in range(1, layers + 1):
@@ -167,6 +167,7 @@ class GelBlock(Block):
     def __init__(self, facts: GelFacts, dt: float, damping: float) -> None:
         super().__init__({**facts.facts(), GEL_DAMPING: damping}, dt)
         self.state = GelState(facts, 1, 1)
+        self.counts[:, ELEMENTS : ELEMENTS + 2] = facts.elements[:2]
         self._arguments = (*self.state.arguments(), self.facts, self.counts, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:

@@ -6,7 +6,8 @@ rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 197
 holds nothing.
 """
 
-from tacsim.physics.lanes import add_to, copy_of, note_more, note_most, slot_of, vec3, vec4
+from tacsim.physics.gel import skin_at
+from tacsim.physics.lanes import ON_DEVICE, add_four, note_more, note_most, slot_of, vec3, vec4
 from tacsim.physics.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
 from tacsim.runtime import ti
 
@@ -28,23 +29,43 @@ def spline(a):
 
 
 @ti.func
-def displacement_at(skin: ti.template(), env, g, a):
-    i, wx, _ = spline(a[0])
-    j, wy, _ = spline(a[1])
-    us = vec4(0.0)
-    for p, q in ti.static(ti.ndrange(3, 3)):
-        us += (wx[p] * wy[q]) * skin[env, g, 0, i + p + 1, j + q + 1]
-    return us
+def skin_sum(skin: ti.template(), row, i, j, wx, wy, ny):
+    """Sum over the 3 x 3 nodes of a stencil from (i, j) on, weighted by wx and wy; row: the quantity's first.
+
+    A loop over the four numbers of a node, of which a CPU makes vectors; all four nodes' first numbers at once would be
+    a gather.
+    """
+    if ti.static(ON_DEVICE):
+        total = vec4(0.0)
+        for p, q in ti.static(ti.ndrange(3, 3)):
+            at = skin_at(row + i + p + 1, j + q + 1, ny)
+            total += (wx[p] * wy[q]) * vec4([skin[at + c] for c in range(4)])
+        return total
+    else:
+        sums = ti.Matrix.zero(ti.f32, 4, 1)
+        for c in range(4):
+            total = 0.0
+            for p, q in ti.static(ti.ndrange(3, 3)):
+                total += (wx[p] * wy[q]) * skin[skin_at(row + i + p + 1, j + q + 1, ny) + c]
+            sums[c, 0] = total
+        return vec4([sums[c, 0] for c in range(4)])
 
 
 @ti.func
-def material_point(skin: ti.template(), env, g, x, h, nx, ny):
+def displacement_at(skin: ti.template(), row, a, ny):
+    i, wx, _ = spline(a[0])
+    j, wy, _ = spline(a[1])
+    return skin_sum(skin, row, i, j, wx, wy, ny)
+
+
+@ti.func
+def material_point(skin: ti.template(), row, x, h, nx, ny):
     """Lattice coordinates a of the surface point now under (x, y): three fixed-point steps of a h + u(a) = x."""
     start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)
     a = start
     us = vec4(0.0)
     for _ in range(3):
-        us = displacement_at(skin, env, g, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))))
+        us = displacement_at(skin, row, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))), ny)
         a = start - vec2(us[0], us[1]) / h
     return a, us
 
@@ -84,20 +105,20 @@ def support_radius(plane, spacing):
 
 
 @ti.func
-def contact_ceiling(skin: ti.template(), env, g):
+def contact_ceiling(skin: ti.template(), row, nx, ny):
     """Height of the highest surface node [mm], at least 0: the spline stays below it, and what is above touches not."""
     highest = 0.0
-    for i in range(1, skin.shape[3] - 1):
-        for j in range(1, skin.shape[4] - 1):
-            height = skin[env, g, 0, i, j][2]
+    for i in range(1, nx + 2):
+        for j in range(1, ny + 2):
+            height = skin[skin_at(row + i, j, ny) + 2]
             highest = ti.select(height > highest, height, highest)
     return highest
 
 
 @ti.func
 def particle_contact(
-    env, part, g, x, v, memory, radius, skin: ti.template(), touch: ti.template(), facts: ti.template(), layers, nx, ny,
-    partial: ti.template(),
+    env, part, g, x, v, memory, radius, skin: ti.template(), row, touch: ti.template(), pushed, facts: ti.template(),
+    layers, nx, ny, partial: ti.template(),
 ):  # fmt: skip
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
@@ -115,19 +136,16 @@ def particle_contact(
     reach = 2.2 * 0.5 * h
     c_n = CONTACT_DAMPING * k_n * dt
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
-        a, us = material_point(skin, env, g, x, h, nx, ny)
+        a, us = material_point(skin, row, x, h, nx, ny)
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
             depth = us[2] + radius - x[2]
             if depth + taken > 0.0:
                 i, wx, dx = spline(a[0])
                 j, wy, dy = spline(a[1])
-                t1, t2, vs = vec4(1.0, 0.0, 0.0, 0.0), vec4(0.0, 1.0, 0.0, 0.0), vec4(0.0)
-                for p, q in ti.static(ti.ndrange(3, 3)):
-                    node = skin[env, g, 0, i + p + 1, j + q + 1]
-                    t1 += (dx[p] * wy[q] / h) * node
-                    t2 += (wx[p] * dy[q] / h) * node
-                    vs += (wx[p] * wy[q]) * skin[env, g, 1, i + p + 1, j + q + 1]
+                t1 = vec4(1.0, 0.0, 0.0, 0.0) + skin_sum(skin, row, i, j, dx / h, wy, ny)
+                t2 = vec4(0.0, 1.0, 0.0, 0.0) + skin_sum(skin, row, i, j, wx, dy / h, ny)
+                vs = skin_sum(skin, row + nx + 3, i, j, wx, wy, ny)
                 n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
                 if gap > deepest:  # an overlap found late must not explode; counted
@@ -144,7 +162,7 @@ def particle_contact(
                 back = vec4(force[0], force[1], force[2], 0.0)
                 for p, q in ti.static(ti.ndrange(3, 3)):
                     node = surface_node(i + p, j + q, nx, ny)
-                    add_to(touch, (env, copy_of(part), g, node), -(wx[p] * wy[q]) * back)
+                    add_four(touch, pushed + 4 * node, -(wx[p] * wy[q]) * back)
         elif housing >= 0.0:
             gap = radius - housing - x[2]
             if gap + taken > 0.0:

@@ -22,17 +22,17 @@ from tacsim.physics.gel import (
     Touch,
     gel_advance,
     node_block,
+    skin_at,
+    skin_row,
 )
 from tacsim.physics.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
-from tacsim.physics.indenter import Pressure, Slip, Values, indent
+from tacsim.physics.indenter import POINTS, Pressure, Slip, Values, indent
 from tacsim.physics.lanes import (
     LANES,
     PARTS,
-    SUMS,
     Counts,
     Facts,
     Partial,
-    empty_strip,
     least_lane,
     note_least,
     real,
@@ -43,6 +43,7 @@ from tacsim.physics.lanes import (
 from tacsim.physics.layout import (
     BACKING,
     CAPACITY,
+    ELEMENTS,
     FORCE,
     GRID,
     HOUSED,
@@ -53,7 +54,7 @@ from tacsim.physics.layout import (
     STEPS,
 )  # fmt: skip
 from tacsim.physics.plasticine import BodyState
-from tacsim.physics.transfers import Points, Rates, Strains, Strips, gather, scatter
+from tacsim.physics.transfers import Particles, Strips, grid_to_particles, particles_to_grid
 from tacsim.runtime import ti
 
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
@@ -112,9 +113,7 @@ def column(
                 margin + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
                 nodes, corners, corners, corners, corners, 1, ny + 1, 0,
             )  # fmt: skip
-    gel_advance(
-        env, g * blocks + block, gels, nodes, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny
-    )
+    gel_advance(env, g * blocks + block, gels, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
 
 
 @ti.kernel
@@ -127,20 +126,17 @@ def press_substep(
     for at in range(counts.shape[0] * PARTS):
         if goes(at // PARTS, it, counts):
             clear_sums(at // PARTS, at % PARTS, partial)
-    for env, n in ti.ndrange(touch.shape[0], touch.shape[3]):
+    for env, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            touch[env, 0, 0, n] = vec4(0.0)
-    for env, k, n in ti.ndrange(counts.shape[0], layers, touch.shape[3]):
-        if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             element(env, env, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
-    for env, cell in ti.ndrange(counts.shape[0], (skin.shape[3] - 3) * (skin.shape[4] - 3)):
+    for env, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             indent(env, cell, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
-    for env, n in ti.ndrange(counts.shape[0], touch.shape[3]):
+    for env, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             column(env, 0, 1, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
 
 
@@ -150,7 +146,7 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    it: ti.i32, nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice, masses: Strips,
+    it: ti.i32, nodes: NodeLanes, skin: Skin, corners: Corners, lattice: Lattice, masses: Strips,
     facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body (`tacsim.physics.hybrid_kernels.substeps`):
@@ -161,19 +157,18 @@ def elements_of_hybrid(
     for env, g in ti.ndrange(counts.shape[0], 2):
         if goes(env, it, counts):
             ceiling[env, g] = 0.0
-    for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
+    for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            touch[env, 0, g, n] = vec4(0.0)
-            row = skin.shape[4] - 2
-            height = skin[env, g, 0, n // row + 1, n % row + 1][2]
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
+            height = skin[skin_at(skin_row(env, 2, g, nx) + n // (ny + 1) + 1, n % (ny + 1) + 1, ny) + 2]
             if height > ceiling[env, g]:
                 ti.atomic_max(ceiling[env, g], height)
     for env, node in ti.ndrange(counts.shape[0], most):
         if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
             masses[env * counts[env, CAPACITY] + node] = strip(0.0)
-    for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, touch.shape[3]):
+    for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             element(env, env * 2 + g, k, n, nodes, corners, lattice, facts, partial, layers, nx, ny)
 
 
@@ -181,9 +176,8 @@ def elements_of_hybrid(
 def scatter_of_hybrid(
     it: ti.i32, drive: Drive,
     nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips,
-    memory: ContactMemory, facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling,
-    layers: ti.i32, room: ti.i32, most: ti.i32,
+    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
+    facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, room: ti.i32, most: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
 
@@ -191,19 +185,18 @@ def scatter_of_hybrid(
     """
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             for g in range(2):
                 touch_gel(
-                    env, p, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
-                    ceiling[env, g], layers, nx, ny,
+                    env, p, g, it, drive, particles, memory, skin, touch, facts, counts, partial, ceiling[env, g],
+                    layers, nx, ny,
                 )  # fmt: skip
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            sums = [empty_strip() for _ in range(SUMS)]
-            scatter(env, p, points, rates, strains, masses, sums, 0, facts, counts, partial)
-    for env, g, n in ti.ndrange(counts.shape[0], 2, touch.shape[3]):
+            particles_to_grid(env, p, particles, masses, facts, counts, partial)
+    for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         if goes(env, it, counts):
-            nx, ny = skin.shape[3] - 3, skin.shape[4] - 3
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             column(env, g, 2, n, nodes, skin, touch, corners, lattice, facts, counts, partial, layers, nx, ny)
     for env, node in ti.ndrange(counts.shape[0], most):
         if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
@@ -216,14 +209,12 @@ def scatter_of_hybrid(
 
 @ti.kernel
 def gather_of_hybrid(
-    it: ti.i32, points: Points, planes: Points, rates: Rates, strains: Strains, velocities: Strips,
-    facts: Facts, counts: Counts, partial: Partial, room: ti.i32,
+    it: ti.i32, particles: Particles, velocities: Strips, facts: Facts, counts: Counts, partial: Partial, room: ti.i32,
 ):  # fmt: skip
     """Last third: the grid back to the particles."""
     for env, p in ti.ndrange(counts.shape[0], room):
         if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            sums = [empty_strip() for _ in range(SUMS)]
-            gather(env, p, points, planes, rates, strains, velocities, sums, 0, facts, counts, partial)
+            grid_to_particles(env, p, particles, velocities, facts, counts, partial)
 
 
 class Mirror:
@@ -255,8 +246,8 @@ class Mirror:
         """What every kernel with gels takes."""
         nodes, skin, touch, corners, lattice = gels.memory()
         return (
-            self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, vec4),
-            self.room("touch", vec4, touch.shape[:-1]), self.room("corners", real, corners.shape),
+            self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, ti.f32),
+            self.room("touch", ti.f32, touch.shape), self.room("corners", real, corners.shape),
             self.sent("lattice", lattice.reshape(-1, 1), real),
         )  # fmt: skip
 
@@ -282,13 +273,10 @@ def run_hybrid(
     counts: np.ndarray, partial: np.ndarray,
 ) -> None:  # fmt: skip
     """One launch; the arrays are those of `HybridState`."""
-    points, planes, rates, strains, masses, velocities, _ = body.arguments()
+    known, masses, velocities = body.arguments()
     there = mirror.sent("drive", drive, ti.f32)
     nodes, skin, touch, corners, lattice = mirror.send_gels(gels)
-    particles = (
-        mirror.sent("points", points, vec4), mirror.sent("planes", planes, vec4), mirror.sent("rates", rates, vec4),
-        mirror.sent("strains", strains, vec4),
-    )  # fmt: skip
+    particles = mirror.sent("known", known, ti.f32)
     mass = mirror.room("masses", strip, masses.shape[:-1])
     velocity = mirror.room("velocities", strip, velocities.shape[:-1])
     kept = mirror.sent("memory", memory, vec4)
@@ -297,16 +285,13 @@ def run_hybrid(
         mirror.sent("partial", partial, ti.f32),
     )  # fmt: skip
     ceiling = mirror.room("ceiling", ti.f32, (len(counts), 2))
-    layers, room = gels.nodes.shape[4] - 1, body.points.shape[1]
+    layers, room = gels.nodes.shape[4] - 1, max(body.counts)
     most = int(counts[:, GRID : GRID + 3].prod(axis=1).max())
     for it in range(drive.shape[1]):
-        elements_of_hybrid(it, nodes, skin, touch, corners, lattice, mass, *numbers, ceiling, layers, most)
+        elements_of_hybrid(it, nodes, skin, corners, lattice, mass, *numbers, ceiling, layers, most)
         scatter_of_hybrid(
-            it, there, nodes, skin, touch, corners, lattice, *particles, mass, velocity, kept, *numbers, ceiling,
+            it, there, nodes, skin, touch, corners, lattice, particles, mass, velocity, kept, *numbers, ceiling,
             layers, room, most,
         )  # fmt: skip
-        gather_of_hybrid(it, *particles, velocity, *numbers, room)
-    mirror.bring(
-        nodes=gels.memory()[0], points=points, planes=planes, rates=rates, strains=strains, memory=memory,
-        partial=partial,
-    )  # fmt: skip
+        gather_of_hybrid(it, particles, velocity, *numbers, room)
+    mirror.bring(nodes=gels.memory()[0], known=known, memory=memory, partial=partial)

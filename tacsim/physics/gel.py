@@ -24,6 +24,7 @@ from tacsim.physics.lanes import (
     opaque,
     padded,
     real,
+    small,
     vec4,
 )
 from tacsim.physics.layout import (
@@ -46,8 +47,8 @@ MPA = 1e-6  # megapascals in a pascal
 Nodes = ti.types.ndarray(dtype=ti.f32, ndim=6)
 # Lanes have one axis: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
 NodeLanes = ti.types.ndarray(dtype=real, ndim=1)
-Skin = ti.types.ndarray(dtype=vec4, ndim=5)
-Touch = ti.types.ndarray(dtype=vec4, ndim=4)
+Skin = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Touch = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Corners = ti.types.ndarray(dtype=real, ndim=1)
 Lattice = ti.types.ndarray(dtype=real, ndim=1)
 
@@ -117,7 +118,7 @@ class GelState:
     nodes: (E, gels, 3, 3, nz + 1, P) displacement, velocity, force; axis; layer; the nodes of a layer as one row, node
     (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
     skin: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside.
-    touch: (E, COPIES, gels, P, 4) contact force on the surface nodes, one copy a part.
+    touch: (E, COPIES, gels, P, 4) contact force on the surface nodes, one copy a part; zeros between substeps.
     corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
     which works on all layers at once, (E, gels, nz, 24, W).
     lattice: (2, P) 1 at the first node of an element, else 0; and 1 / share of a node's mass, 0 where there is no node.
@@ -190,14 +191,16 @@ class GelState:
         """What every kernel with gels takes, in this order; arrays of lanes are the same memory once more."""
         shifts = (0, 1, self._row, self._row + 1)
         return (
-            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts), self.skin, self.touch,
-            *(shifted(self._corners, self.corners, -shift) for shift in shifts),
-            self.lattice.reshape(-1, LANES),
+            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts), *self._surface(),
+            *(shifted(self._corners, self.corners, -shift) for shift in shifts), self.lattice.reshape(-1, LANES),
         )  # fmt: skip
 
     def memory(self) -> tuple[np.ndarray, ...]:
         """What a device takes: nodes with the margin round them, skin, touch, corners with theirs, lattice."""
-        return self._nodes, self.skin, self.touch, self._corners, self.lattice
+        return self._nodes, *self._surface(), self._corners, self.lattice
+
+    def _surface(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.skin.reshape(-1), self.touch.reshape(-1)
 
 
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
@@ -217,6 +220,24 @@ def gel_surface(facts: GelFacts, state: GelState, environment: int, gel: int) ->
     top = state.u[environment, gel, :, :, -1] / np.float32(MM)
     half = facts.half
     return GelSurface(np.ascontiguousarray(top), facts.spacing / MM, (-half[0] / MM, -half[1] / MM))
+
+
+@ti.func
+def skin_row(env, gels, g, nx):
+    """First row of a gel's displacements in `skin`; its velocities begin nx + 3 rows further on."""
+    return (env * gels + g) * 2 * (nx + 3)
+
+
+@ti.func
+def skin_at(row, column, ny):
+    """Where the four numbers of a node stand in `skin`."""
+    return small(4 * (row * (ny + 3) + column), 1)
+
+
+@ti.func
+def touch_start(env, copy, gels, g, nx, ny):
+    """Where a gel's forces on its nodes begin in a copy of `touch`."""
+    return ((env * COPIES + copy) * gels + g) * 4 * LANES * (((nx + 1) * (ny + 1) + LANES - 1) // LANES)
 
 
 @ti.func
@@ -274,9 +295,35 @@ def gel_forces(
 
 
 @ti.func
+def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch: ti.template(), never, nx, ny):
+    """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
+    zeros for the next substep. forces: where the blocks' forces along x begin, `axis` the way to y and z."""
+    push = ti.Matrix.zero(ti.f32, 4 * LANES, 1)
+    turned = ti.Matrix.zero(ti.f32, 4, LANES)
+    for block in range(first, last):
+        for c in range(4 * LANES):
+            total = 0.0
+            for copy in ti.static(range(COPIES)):
+                total += touch[small(touch_start(env, copy, gels, g, nx, ny) + block * 4 * LANES, 1) + c]
+            push[c, 0] = total
+        for lane in range(LANES):
+            for d in ti.static(range(4)):
+                turned[d, lane] = push[4 * lane + d, 0]
+        for d in ti.static(range(3)):
+            at = opaque(never, forces + d * axis + block)
+            n0[at] = keep_or(never, n0[at], n0[at] + real([turned[d, lane] for lane in range(LANES)]))
+        for copy in ti.static(range(COPIES)):
+            for quarter in range(4):
+                at = small(touch_start(env, copy, gels, g, nx, ny) + (block * 4 + quarter) * LANES, 1)
+                zeros = real([keep_or(never, touch[at + lane], 0.0) for lane in range(LANES)])
+                for lane in ti.static(range(LANES)):
+                    touch[at + lane] = zeros[lane]
+
+
+@ti.func
 def gel_advance(
-    env, part, gels, nodes: ti.template(), n0: ti.template(), skin: ti.template(), touch: ti.template(),
-    lattice: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
+    env, part, gels, n0: ti.template(), skin: ti.template(), touch: ti.template(), lattice: ti.template(),
+    facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Symplectic Euler with lumped masses on this part's nodes of its gel, and their skin.
 
@@ -303,13 +350,14 @@ def gel_advance(
         for block in range(first, last):
             held += ti.select(lattice[blocks + block] > 0.0, n0[u + (6 + d) * axis + block], 0.0)
         note_sum(partial, env, slot, BACKING + d, held.sum())
-    for block in range(first, last):  # contact forces of all parts
+    top = u + layers * blocks
+    if ti.static(ON_DEVICE):
         for d in ti.static(range(3)):
-            total = real(0.0)
-            for other in ti.static(range(COPIES)):
-                total += real([touch[env, other, g, block * LANES + lane][d] for lane in range(LANES)])
-            at = u + (6 + d) * axis + layers * blocks + block
-            n0[at] = n0[at] + total
+            at = touch_start(env, 0, gels, g, nx, ny) + 4 * first + d
+            n0[top + (6 + d) * axis + first] += touch[at]
+            touch[at] = 0.0
+    else:
+        take_touch(env, gels, g, first, last, top + 6 * axis, axis, n0, touch, never, nx, ny)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
@@ -321,23 +369,22 @@ def gel_advance(
                 place = n0[x] + dt * speed
                 n0[v] = keep_or(never, n0[v], speed)
                 n0[x] = keep_or(never, n0[x], place)
-    for n in range(first * LANES, ti.min(last * LANES, count)):
-        i, j = n // row, n % row
-        for quantity in ti.static(range(2)):
-            at = vec4(0.0)
-            for d in ti.static(range(3)):
-                if ti.static(ON_DEVICE):
-                    at[d] = n0[u + (3 * quantity + d) * axis + layers * blocks + n][0]
-                else:
-                    at[d] = nodes[env, g, quantity, d, layers, n]
-            for p in range(i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)):
-                for q in range(j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)):
-                    skin[env, g, quantity, p, q] = at
-
-
-@ti.func
-def clear_touch(env, part, gels, touch: ti.template()):
-    """This part's copy of the contact forces, for all gels."""
-    for g in range(gels):
-        for n in range(touch.shape[3]):
-            touch[env, part, g, n] = vec4(0.0)
+    first_row = skin_row(env, gels, g, nx)
+    i, j = first * LANES // row, first * LANES % row
+    for block in range(first, last):
+        for lane in range(ti.min(LANES, count - block * LANES)):
+            p0, p1 = i + ti.select(i > 0, 1, 0), i + ti.select(i < nx, 2, 3)
+            q0, q1 = j + ti.select(j > 0, 1, 0), j + ti.select(j < ny, 2, 3)
+            for quantity in ti.static(range(2)):
+                at = vec4(0.0)
+                for d in ti.static(range(3)):
+                    at[d] = n0[top + (3 * quantity + d) * axis + block][lane]
+                for p in range(p0, p1):
+                    for q in range(q0, q1):
+                        to = skin_at(first_row + quantity * (nx + 3) + p, q, ny)
+                        values = vec4([keep_or(never, skin[to + c], at[c]) for c in range(4)])
+                        for c in ti.static(range(4)):
+                            skin[to + c] = values[c]
+            j += 1
+            if j == row:
+                i, j = i + 1, 0

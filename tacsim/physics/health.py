@@ -124,7 +124,7 @@ def attempt(arrays: State, launch: Callable[[], Health], where: Place) -> Health
 
 
 def copies(arrays: State) -> dict[str, NDArray[Any]]:
-    return {name: a.copy() for name, a in arrays.items()}
+    return {name: a.copy(order="K") for name, a in arrays.items()}  # as they lie: particles' numbers are rows
 
 
 def judged(arrays: State, good: State, health: Health, where: Place) -> Health:

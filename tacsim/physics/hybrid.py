@@ -21,6 +21,7 @@ from tacsim.physics.layout import (
     BODY_MASS,
     CENTRE,
     COUNTS,
+    ELEMENTS,
     FACTS,
     FORCE,
     FRICTION,
@@ -72,9 +73,10 @@ class HybridState:
         self.body = [body for body, _, _ in placed]
         self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
-        self.memory = np.zeros((len(scenes), 2, self.particles.points.shape[1], 4), np.float32)
+        self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), 4), np.float32)
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.counts[:, ELEMENTS : ELEMENTS + 2] = self.gel[0].elements[:2]
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
 
@@ -192,7 +194,6 @@ class HybridWorld(DrivenWorld):
         b, i = self._state.particles, self._index
         for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
             moving[...] = 0.0
-        b.refresh()
 
     # ------------------------------------------------------------------ state
 
@@ -210,7 +211,6 @@ class HybridWorld(DrivenWorld):
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         super().restore(state)
-        self._state.particles.refresh()
         self._speed = float(state["speed"])
 
     def truth(self) -> Truth:

@@ -8,17 +8,20 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    clear_touch,
     gel_advance,
     gel_forces,
+    skin_row,
+    touch_start,
 )
 from tacsim.physics.lanes import (
+    LANES,
     NODES,
     ON_DEVICE,
     PARTS,
     Counts,
     Facts,
     Partial,
+    copy_of,
     note_sum,
     part_range,
     slot_of,
@@ -32,26 +35,30 @@ from tacsim.physics.layout import (
     BODY_MASS,
     CAPACITY,
     CENTRE,
+    ELEMENTS,
     FORCE,
     GRAVITY,
     GRID,
     HOUSED,
+    KNOWN,
     LIGHTNESS,
     MOTION,
     ORIGIN,
     OVERLAP,
     PARTICLES,
+    PLACE,
+    PLANE,
     SPREAD,
     STEP,
     STEPS,
     STRIDE,
+    VELOCITY,
 )  # fmt: skip
 from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, shares
 from tacsim.physics.transfers import (
-    Points,
-    Rates,
-    Strains,
+    Particles,
     Strips,
+    block_range,
     clear_masses,
     grid_to_particles,
     node_sum,
@@ -66,6 +73,12 @@ ContactMemory = ti.types.ndarray(dtype=vec4, ndim=3)
 @ti.func
 def row(drive: ti.template(), env, it, g, r):
     return vec3(drive[env, it, g, r, 0], drive[env, it, g, r, 1], drive[env, it, g, r, 2])
+
+
+@ti.func
+def numbers(particles: ti.template(), at, stride):
+    """Three rows of one particle, from that at `at` on."""
+    return vec3(particles[at], particles[at + stride], particles[at + 2 * stride])
 
 
 @ti.func
@@ -133,7 +146,7 @@ def grid_update(
         for j in range(j0, j1):
             for k in range(k0, k1):
                 at = (i * ny + j) * nz + k
-                q = node_sum(env, i, at, masses, counts)
+                q = node_sum(env, i, at, masses, velocities, counts)
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
                     if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
@@ -152,9 +165,8 @@ def grid_update(
 
 @ti.func
 def touch_gel(
-    env, part, g, it, drive: ti.template(), points: ti.template(), planes: ti.template(), rates: ti.template(),
-    memory: ti.template(), skin: ti.template(), touch: ti.template(), facts: ti.template(), counts: ti.template(),
-    partial: ti.template(), highest, layers, nx, ny,
+    env, part, g, it, drive: ti.template(), particles: ti.template(), memory: ti.template(), skin: ti.template(),
+    touch: ti.template(), facts: ti.template(), counts: ti.template(), partial: ti.template(), highest, layers, nx, ny,
 ):  # fmt: skip
     """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes.
 
@@ -167,27 +179,44 @@ def touch_gel(
     spacing = 0.5 * facts[env, BODY_CELL]
     rate = facts[env, STEP] / facts[env, BODY_MASS]
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
-    origin_p = env * counts[env, STRIDE]
-    first, last = part_range(counts[env, PARTICLES], part)
-    for p in range(first, last):
-        at = points[origin_p + p]
-        arm = vec3(at[0], at[1], at[2]) - origin
+    stride, rows = counts[env, STRIDE], skin_row(env, 2, g, nx)
+    pushed = touch_start(env, copy_of(part), 2, g, nx, ny)
+    first, last = block_range(env, part, counts)
+    for p in range(first * LANES, ti.min(last * LANES, counts[env, PARTICLES])):
+        known = env * KNOWN * stride + p
+        arm = numbers(particles, known + PLACE * stride, stride) - origin
         away = outward.dot(arm) - highest  # most of the body is far away: one dot product decides
         radius = spacing  # at most
         if away < 2.5 * spacing:
-            radius = support_radius(planes[origin_p + p], spacing)
+            radius = support_radius(numbers(particles, known + PLANE * stride, stride), spacing)
         # one radius to touch, half a spacing for what the contact's memory still bridges
         if away < radius + 0.5 * spacing:
             local = back @ arm
-            moving = rates[origin_p + p, 0]
-            relative = back @ (vec3(moving[0], moving[1], moving[2]) - velocity - spin.cross(arm))
+            moving = numbers(particles, known + VELOCITY * stride, stride)
+            relative = back @ (moving - velocity - spin.cross(arm))
             touching, housed, force, kept = particle_contact(
-                env, part, g, local, relative, memory[env, g, p], radius, skin, touch, facts, layers, nx, ny, partial
+                env,
+                part,
+                g,
+                local,
+                relative,
+                memory[env, g, p],
+                radius,
+                skin,
+                rows,
+                touch,
+                pushed,
+                facts,
+                layers,
+                nx,
+                ny,
+                partial,
             )
             memory[env, g, p] = kept
             if touching:
-                push = rate * (rotate @ force)
-                rates[origin_p + p, 0] = moving + vec4(push[0], push[1], push[2], 0.0)
+                moving += rate * (rotate @ force)
+                for d in ti.static(range(3)):
+                    particles[known + (VELOCITY + d) * stride] = moving[d]
                 total -= force
                 moment -= local.cross(force)
                 if housed:
@@ -206,8 +235,7 @@ def substeps(
     team: ti.i32, drive: Drive,
     nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
     c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
-    points: Points, planes: Points, rates: Rates, strains: Strains, masses: Strips, velocities: Strips, sums: Strips,
-    memory: ContactMemory,
+    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
     facts: Facts, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
@@ -218,20 +246,20 @@ def substeps(
         for _ in range(first_in_chunk(task)):
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
-            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            layers = nodes.shape[4] - 1
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             for it in range(counts[env, STEPS]):
-                highest = ti.Vector([contact_ceiling(skin, env, 0), contact_ceiling(skin, env, 1)])
+                highest = ti.Vector([contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny) for g in range(2)])
                 for share in range(shares(member, team)):
                     part = member + share * team
                     partial[env, part, OVERLAP] = 0.0
-                    clear_touch(env, part, 2, touch)
                     for g in range(2):
                         touch_gel(
-                            env, part, g, it, drive, points, planes, rates, memory, skin, touch, facts, counts, partial,
-                            highest[g], layers, nx, ny,
+                            env, part, g, it, drive, particles, memory, skin, touch, facts, counts, partial, highest[g],
+                            layers, nx, ny,
                         )  # fmt: skip
                     clear_masses(env, part, masses, counts)
-                    particles_to_grid(env, part, points, rates, strains, masses, sums, facts, counts, partial)
+                    particles_to_grid(env, part, particles, masses, facts, counts, partial)
                     gel_forces(
                         env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,
                         layers, nx, ny,
@@ -239,11 +267,9 @@ def substeps(
                 meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(env, part, 2, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, 2, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
                 meet(sync, turn, team, 2 * it + 2)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    grid_to_particles(
-                        env, part, points, planes, rates, strains, velocities, sums, facts, counts, partial
-                    )
+                    grid_to_particles(env, part, particles, velocities, facts, counts, partial)

@@ -5,8 +5,9 @@ Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penal
 Everything is in the sensor frame [mm, MPa].
 """
 
-from tacsim.physics.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, spline, surface_node
-from tacsim.physics.lanes import ON_DEVICE, add_to, copy_of, note_most, note_sum, part_range, slot_of, vec3, vec4
+from tacsim.physics.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, skin_sum, spline, surface_node
+from tacsim.physics.gel import skin_at, skin_row, touch_start
+from tacsim.physics.lanes import ON_DEVICE, add_four, copy_of, note_most, note_sum, part_range, slot_of, vec3, vec4
 from tacsim.physics.layout import (
     FORCE,
     FRICTION,
@@ -121,6 +122,7 @@ def indent(
     back = rotate.transpose()
     total, moment = vec3(0.0), vec3(0.0)
     deepest = 0.0
+    row, pushed = skin_row(env, 1, 0, nx), touch_start(env, copy_of(part), 1, 0, nx, ny)
     first_cell, last_cell, low, high = 0, 0, 0, ny
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny
@@ -131,12 +133,12 @@ def indent(
         for cell_j in range(low, high):
             # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides. A distance
             # grows no faster than the way, and no point of the cell is farther from its middle than two elements.
-            middle = 0.25 * (
-                skin[env, 0, 0, cell_i + 1, cell_j + 1] + skin[env, 0, 0, cell_i + 2, cell_j + 1]
-                + skin[env, 0, 0, cell_i + 1, cell_j + 2] + skin[env, 0, 0, cell_i + 2, cell_j + 2]
-            )  # fmt: skip
+            middle = vec3(0.0)
+            for p, q in ti.static(ti.ndrange(2, 2)):
+                node = skin_at(row + cell_i + p + 1, cell_j + q + 1, ny)
+                middle += 0.25 * vec3(skin[node], skin[node + 1], skin[node + 2])
             at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
-            at += vec3(middle[0], middle[1], middle[2])
+            at += middle
             far, _ = signed_distance(env, kind, size, back @ (at - centre), values, nodes, grid_origin, grid_spacing)
             if far > FAR_CELL * h:
                 # Nothing passes this margin in one substep, so what is beyond has forgotten. A mesh's distances end
@@ -151,10 +153,8 @@ def indent(
                     a, b = (i + 0.5) / POINTS, (j + 0.5) / POINTS
                     first_i, wx, _dx = spline(a)
                     first_j, wy, _dy = spline(b)
-                    us, vs = vec4(0.0), vec4(0.0)
-                    for p, q in ti.static(ti.ndrange(3, 3)):
-                        us += (wx[p] * wy[q]) * skin[env, 0, 0, first_i + p + 1, first_j + q + 1]
-                        vs += (wx[p] * wy[q]) * skin[env, 0, 1, first_i + p + 1, first_j + q + 1]
+                    us = skin_sum(skin, row, first_i, first_j, wx, wy, ny)
+                    vs = skin_sum(skin, row + nx + 3, first_i, first_j, wx, wy, ny)
                     x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
                     phi, n_local = signed_distance(
                         env, kind, size, back @ (x - centre), values, nodes, grid_origin, grid_spacing
@@ -179,7 +179,7 @@ def indent(
                             push = vec4(force[0], force[1], force[2], 0.0)
                             for p, q in ti.static(ti.ndrange(3, 3)):
                                 node = surface_node(first_i + p, first_j + q, nx, ny)
-                                add_to(touch, (env, copy_of(part), 0, node), (wx[p] * wy[q]) * push)
+                                add_four(touch, pushed + 4 * node, (wx[p] * wy[q]) * push)
                     if not touching:
                         slip[env, i, j] = vec3(0.0)
                         pressure[env, i, j] = 0.0

@@ -1,9 +1,8 @@
 """Eight of everything at once: how kernels are laid out so that the CPU works on whole vectors.
 
 Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
-side by side, starting from stores to neighbouring addresses that it has seen before. Hence `real` holds one number of
-eight neighbours (particles, elements, nodes), arrays keep these eight side by side, and `keep_or` and `anchor` store in
-the way that is recognised.
+side by side, starting from stores to neighbouring addresses that it has seen before. Hence arrays keep one number of
+eight neighbours (particles, elements, nodes; `real`) side by side, and `keep_or` stores in the way that is recognised.
 
 Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
 a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
@@ -27,12 +26,12 @@ COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
 
 NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
 
+vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
 real = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
 strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
 
-SUMS = 40  # strips for each environment and part: where the body's transfers drop theirs
 Facts = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, facts)
 Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, counts)
 Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, numbers)
@@ -67,9 +66,13 @@ def opaque(never, index):
 
 
 @ti.func
-def anchor(work: ti.template(), slot: ti.template(), value, never):
-    """Where the compiler starts to merge lanes: long chains of operations need one every ten or so."""
-    work[slot] = keep_or(never, work[slot], value)
+def small(index, width: ti.template()):
+    """index, of things of `width` numbers. That it is neither negative nor large lets the compiler see which numbers
+    behind it are neighbours."""
+    if ti.static(ON_DEVICE):
+        return index
+    else:
+        return index & (2**30 // width - 1)
 
 
 @ti.func
@@ -123,6 +126,16 @@ def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
         array[at] = array[at] + value
 
 
+@ti.func
+def add_four(array: ti.template(), at, value):
+    """Adds to four neighbours of what a part scatters into."""
+    for c in ti.static(range(4)):
+        if ti.static(ON_DEVICE):
+            ti.atomic_add(array[at + c], value[c])
+        else:
+            array[at + c] = array[at + c] + value[c]
+
+
 # What a part notes in `partial`. On the CPU a slot has one writer. On a device it has many, so a sum starts from a zero
 # that the launch's kernel has put there, and what changes nothing is not written, since that would only stand in line.
 
@@ -163,12 +176,3 @@ def note_most(partial: ti.template(), env, slot, number, value):
             ti.atomic_max(partial[env, slot, number], value)
     else:
         partial[env, slot, number] = ti.max(partial[env, slot, number], value)
-
-
-# Registers of one thread on a device, where the CPU has arrays to drop values in.
-
-
-@ti.func
-def empty_strip():
-    empty = strip(0.0)
-    return empty  # noqa: RET504 - only a variable can be written to

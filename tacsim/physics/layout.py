@@ -38,7 +38,8 @@ KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
 CAPACITY = 16  # strips of grid nodes that an environment has room for, in each copy
 SHAPE_NODES = 17  # of an indenter's distance grid x, y, z
-COUNTS = 20
+ELEMENTS = 20  # of a gel along x and y
+COUNTS = 22
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements
@@ -52,3 +53,12 @@ BACKING = 18  # force of this part's gel on its backing [N], of the last substep
 MOTION = 21  # sum of the particles' velocities
 HOUSED = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
 NUMBERS = 30
+
+# rows of a body's particles, one number of all of them each: float32
+PLANE = 0  # tangent plane x, y, z [1/mm] (tacsim.physics.body_surface)
+PLACE = 3  # x, y, z [mm]
+STRAIN = 6  # elastic e = b_e - I: xx, yy, zz, xy, xz, yz
+FLOW = 12  # equivalent plastic strain
+VELOCITY = 13  # x, y, z
+AFFINE = 16  # affine velocity C, column by column [1/mm]
+KNOWN = 25

@@ -61,15 +61,24 @@ def inverse(s):
 
 
 @ti.func
+def square(s):
+    return s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + 2.0 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
+
+
+@ti.func
 def frobenius(s):
-    return ti.sqrt(s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + 2.0 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5]))
+    return ti.sqrt(square(s))
 
 
 @ti.func
 def log1p_series(z):
-    """ln(1 + x) = 2 artanh(z) with z = x / (2 + x), by its series: accurate in f32 for |x| up to 0.4, however small."""
+    """ln(1 + x) = 2 artanh(z) with z = x / (2 + x), by its series: accurate in f32 for |x| up to 0.4, however small.
+
+    By pairs of terms (Estrin), not one after the other: lanes wait for each operation before the next.
+    """
     q = z * z
-    return 2.0 * z * (1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q * (1.0 / 9.0 + q / 11.0)))))
+    q2 = q * q
+    return 2.0 * z * ((1.0 + q / 3.0) + q2 * (0.2 + q / 7.0) + q2 * q2 * (1.0 / 9.0 + q / 11.0))
 
 
 @ti.func
@@ -172,21 +181,30 @@ def after_flow(growth, shrink):
 
 
 @ti.func
+def third_root(z):
+    """t with (1 - t) / (1 + t) = (1 + x)^(-1/3) for |x| up to 0.4, where z = x / (2 + x): tanh(artanh(z) / 3) by its
+    series."""
+    q = z * z
+    q2 = q * q
+    low, high = 1.0 / 3.0 + 8.0 / 81.0 * q, 40.0 / 729.0 + 728.0 / 19683.0 * q
+    return z * (low + q2 * high + q2 * q2 * (43768.0 / 1594323.0))
+
+
+@ti.func
 def strain_near(e):
-    """log J, dev(eps) and J^(-2/3) of b_e = I + e, for elastic strain up to some 0.2, without a branch: lanes can do it
+    """log J, dev(eps) and J^(2/3) of b_e = I + e, for elastic strain up to some 0.2, without a branch: lanes can do it
     side by side.
 
     Returns also 1 where the strain is larger (and all else is wrong), else 0.
     """
     x = e[0] + e[1] + e[2] + minors(e) + determinant(e)  # det(I + e) - 1
-    log_j = 0.5 * log1p_series(x / (2.0 + x))
-    y = -2.0 / 3.0 * log_j
-    shrink = 1.0 + y * (1.0 + y * (0.5 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y / 120.0))))  # exp(y)
-    shape = volume_preserving(e, shrink)
+    z = x / (2.0 + x)
+    t = third_root(z)
+    shape = volume_preserving(e, (1.0 - t) / (1.0 + t))
     strain = 0.5 * log_pade(shape)
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    far = ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0) | ti.select(frobenius(shape) > NEAR_LOG, 1, 0)
-    return log_j, strain, shrink, far
+    far = ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0) | ti.select(square(shape) > NEAR_LOG**2, 1, 0)
+    return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), far
 
 
 @ti.func
@@ -202,16 +220,24 @@ def return_near(e, flow, mu, bulk, limit, hardening):
 
     Returns also 1 where the strain is larger (and all else is wrong), else 0.
     """
-    log_j, strain, shrink, far = strain_near(e)
-    norm = frobenius(strain)
-    now = limit + hardening * flow
+    log_j, strain, grow, far = strain_near(e)
+    strain2, i2, i3 = product(strain, strain), minors(strain), determinant(strain)
+    norm = ti.sqrt(strain2[0] + strain2[1] + strain2[2])
+    now, give = limit + hardening * flow, 1.0 / (1.0 + ROOT * hardening)
+    f = 1.0 - give * ti.max(0.0, 1.0 - now / ti.max(norm, 1e-12))  # of the strain is left
+    # exp(2 f strain) - I by `exponential_series`, of invariants 4 f^2 i2 and 8 f^3 i3
+    j2, j3 = 4.0 * f * f * i2, 8.0 * f * f * f * i3
+    first, second = 2.0 * f * (1.0 - j2 / 6.0 + j3 / 24.0), 4.0 * f * f * (0.5 - j2 / 24.0)
+    growth = plus_identity(first * strain + second * strain2, j3 / 6.0)
+    excess = j2 * j3 / 24.0 + (3.0 * j3 * j3 - 2.0 * j2 * j2 * j2) / 144.0  # det - 1 of the cut series
+    volume = (1.0 - excess / 3.0) * grow
+    returned = plus_identity(growth * volume, volume - 1.0)
     yields = norm > now
-    gamma = ti.max(0.0, norm - now) / (1.0 + ROOT * hardening)
-    strain *= ti.select(yields, (norm - gamma) / norm, 1.0)
-    returned = after_flow(exponential_series(2.0 * strain), shrink)
     elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
-    far = far | ti.select(2.0 * (norm - gamma) > NEAR_EXP, 1, 0)
-    return elastic, flow + ROOT * gamma, plus_identity(2.0 * mu * strain, bulk * log_j), far
+    far = far | ti.select(2.0 * f * norm > NEAR_EXP, 1, 0)
+    return (
+        elastic, flow + ROOT * give * ti.max(0.0, norm - now), plus_identity(2.0 * mu * f * strain, bulk * log_j), far
+    )  # fmt: skip
 
 
 @ti.func

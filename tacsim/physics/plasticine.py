@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.physics.gel import MM, MPA
-from tacsim.physics.lanes import COPIES, NODES, PARTS, SUMS, aligned_zeros
+from tacsim.physics.lanes import CACHE_LINE, COPIES, LANES, NODES, aligned_zeros, padded
 from tacsim.physics.layout import (
+    AFFINE,
     BODY_BULK,
     BODY_CELL,
     BODY_HARDENING,
@@ -20,11 +21,17 @@ from tacsim.physics.layout import (
     BODY_MU,
     BODY_VOLUME,
     CAPACITY,
+    FLOW,
     GRID,
+    KNOWN,
     ORIGIN,
     PARTICLES,
+    PLACE,
+    PLANE,
     SLAB,
+    STRAIN,
     STRIDE,
+    VELOCITY,
 )
 from tacsim.physics.material import ELASTIC
 from tacsim.scene import BodyMaterial, lame
@@ -73,11 +80,9 @@ def body_facts(material: BodyMaterial, spacing: float, volume: float | None = No
 
 
 class BodyState:
-    """Particles of all environments, in the order that kernels like; views for everybody else.
+    """Particles of all environments and the grid they move on, kept as kernels like them: whole lanes, whole lines.
 
-    points: (E, N, 4) position [mm]; planes: (E, N, 4) tangent planes of the body's surface [1/mm], body_surface.py.
-    rates: (E, N, 4, 4) velocity; and the columns of the affine velocity, its derivatives by x, y, z.
-    strains: (E, N, 8) e = b_e - I (xx, yy, zz, xy, xz, yz), equivalent plastic strain, nothing.
+    known: (E, KNOWN, W) one number of all particles a row (tacsim.physics.layout), zeros behind the last particle;
     masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part; velocities:
     (E, strips, 4 NODES). Lines of the grid have an even number of nodes where NODES is 2.
     """
@@ -85,47 +90,41 @@ class BodyState:
     def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
         """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes no particle knows a surface."""
         self.counts = [len(p) for p in points]
-        n, e = max(self.counts), len(points)
-        self.points = aligned_zeros(e, n, 4)
-        self.planes = aligned_zeros(e, n, 4)
+        self.known = aligned_zeros(len(points), KNOWN, spread(max(self.counts)))
         for index, p in enumerate(points):
-            self.points[index, : len(p), :3] = p
+            self.x(index)[...] = p
             if planes is not None:
-                self.planes[index, : len(p), :3] = planes[index]
-        self.rates = aligned_zeros(e, n, 4, 4)
-        self.strains = aligned_zeros(e, n, 8)
-        self.masses = aligned_zeros(e, COPIES, 1, 4 * NODES)
-        self.velocities = aligned_zeros(e, 1, 4 * NODES)
-        self._sums = aligned_zeros(e * PARTS * SUMS, 4 * NODES)
+                self.plane(index)[...] = planes[index]
+        self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
+        self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
+
+    def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
+        return self.known[environment, first : first + count, : self.counts[environment]]
 
     def x(self, environment: int = 0) -> np.ndarray:
         """Positions [mm], (n, 3), a view."""
-        return self.points[environment, : self.counts[environment], :3]
+        return self._rows(environment, PLACE, 3).T
 
     def plane(self, environment: int = 0) -> np.ndarray:
         """Tangent planes [1/mm], (n, 3), a view."""
-        return self.planes[environment, : self.counts[environment], :3]
+        return self._rows(environment, PLANE, 3).T
 
     def v(self, environment: int = 0) -> np.ndarray:
         """Velocities, (n, 3), a view."""
-        return self.rates[environment, : self.counts[environment], 0, :3]
+        return self._rows(environment, VELOCITY, 3).T
 
     def c(self, environment: int = 0) -> np.ndarray:
         """Affine velocities, (n, 3, 3), a view."""
-        return self.rates[environment, : self.counts[environment], 1:, :3].transpose(0, 2, 1)
+        columns: np.ndarray = self.known[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
+        return columns[..., : self.counts[environment]].T
 
     def e(self, environment: int = 0) -> np.ndarray:
         """Elastic strains b_e - I, (n, 6), a view."""
-        return self.strains[environment, : self.counts[environment], :6]
+        return self._rows(environment, STRAIN, 6).T
 
     def flow(self, environment: int = 0) -> np.ndarray:
         """Equivalent plastic strains, (n,), a view."""
-        return self.strains[environment, : self.counts[environment], 6]
-
-    def refresh(self) -> None:
-        """Zeros in the fourth numbers, which take part in sums: after somebody has written the others."""
-        for array in (self.points, self.planes, self.rates):
-            array[..., 3] = 0.0
+        return self._rows(environment, FLOW, 1).reshape(-1)
 
     def fit(self, environment: int, cell: float, margin: float, facts: np.ndarray, counts: np.ndarray) -> None:
         """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
@@ -139,7 +138,7 @@ class BodyState:
         counts[environment, GRID : GRID + 3] = shape
         counts[environment, PARTICLES] = len(x)
         for part in range(COPIES):
-            own = x[len(x) * part // COPIES : len(x) * (part + 1) // COPIES, 0]
+            own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x)), 0]
             low, high = 0, 0
             if own.size:
                 low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
@@ -151,15 +150,22 @@ class BodyState:
             strips = strips * 5 // 4  # a body that spreads asks for more again and again
             self.masses = aligned_zeros(*self.masses.shape[:2], strips, 4 * NODES)
             self.velocities = aligned_zeros(len(self.masses), strips, 4 * NODES)
-        counts[:, STRIDE], counts[:, CAPACITY] = self.points.shape[1], self.masses.shape[2]
+        counts[:, STRIDE], counts[:, CAPACITY] = self.known.shape[2], self.masses.shape[2]
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """What every kernel with a body takes, in this order."""
-        return (
-            self.points.reshape(-1, 4), self.planes.reshape(-1, 4), self.rates.reshape(-1, 4, 4),
-            self.strains.reshape(-1, 4), self.masses.reshape(-1, 4 * NODES), self.velocities.reshape(-1, 4 * NODES),
-            self._sums,
-        )  # fmt: skip
+        return self.known.reshape(-1), self.masses.reshape(-1, 4 * NODES), self.velocities.reshape(-1, 4 * NODES)
+
+
+def spread(particles: int) -> int:
+    """Room for so many particles in a row: whole cache lines and odd many, so that rows do not compete for places in
+    the cache, which holds few lines whose addresses differ by a power of two."""
+    return (-(-particles // CACHE_LINE) | 1) * CACHE_LINE
+
+
+def first_particle(part: int, particles: int) -> int:
+    """Where a part of the particles begins: at a block of lanes (tacsim.physics.transfers.block_range)."""
+    return min(padded(particles) // LANES * part // COPIES * LANES, particles)
 
 
 def bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

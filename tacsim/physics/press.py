@@ -18,7 +18,6 @@ from tacsim.physics.gel import (
     Nodes,
     Skin,
     Touch,
-    clear_touch,
     gel_advance,
     gel_facts,
     gel_forces,
@@ -43,6 +42,7 @@ from tacsim.physics.lanes import ON_DEVICE, PARTS, Counts, Facts, Partial
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
+    ELEMENTS,
     FACTS,
     FORCE,
     FRICTION,
@@ -83,11 +83,11 @@ def press_substeps(
         for _ in range(first_in_chunk(task)):
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
-            layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+            layers = nodes.shape[4] - 1
+            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    clear_touch(env, part, 1, touch)
                     indent(env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
                     gel_forces(
                         env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,
@@ -96,7 +96,7 @@ def press_substeps(
                 meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(env, part, 1, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, 1, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                 meet(sync, turn, team, 2 * it + 2)
 
 
@@ -130,6 +130,7 @@ class PressState:
         self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # multiplier of the normal contact [MPa]
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.counts[:, ELEMENTS : ELEMENTS + 2] = nx, ny
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
         self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])

@@ -101,7 +101,7 @@ class World(Protocol):
 
 def taken(arrays: Mapping[str, NDArray[Any]], poses: Mapping[str, Pose]) -> dict[str, NDArray[Any]]:
     """A snapshot: copies of a world's arrays, and the poses of its driven frames."""
-    state = {name: a.copy() for name, a in arrays.items()}
+    state = {name: a.copy(order="K") for name, a in arrays.items()}
     state["poses"] = np.array([[*p.position, *p.quaternion] for p in poses.values()])
     return state
 

@@ -160,13 +160,13 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 
 @pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
-    arrays = fresh._state.particles.points, fresh._state.memory, fresh._state.gels.nodes
+    arrays = fresh._state.particles.known, fresh._state.memory, fresh._state.gels.nodes
     nodes = fresh._state.particles.masses.shape[2]
     fresh.worlds[0]._arrays()["position"][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
-        arrays, (fresh._state.particles.points, fresh._state.memory, fresh._state.gels.nodes), strict=True
+        arrays, (fresh._state.particles.known, fresh._state.memory, fresh._state.gels.nodes), strict=True
     ))  # fmt: skip
     alone = HybridWorld(SCENES[1])
     assert alone.move(closed(alone, 0.4e-3)) == stats

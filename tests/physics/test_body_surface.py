@@ -10,7 +10,8 @@ from robot.bench.roughness import print_roughness
 from tacsim.interface import Pose
 from tacsim.physics.body_surface import surface_points, tangent_planes
 from tacsim.physics.hybrid import CLEARANCE, HybridWorld
-from tacsim.physics.transfers import Points, moved_plane
+from tacsim.physics.lanes import vec3
+from tacsim.physics.transfers import moved_plane
 from tacsim.runtime import start, ti
 from tacsim.sampling import body_points
 from tacsim.scene import Body, BodyMaterial, Box, Mesh, Scene, Sphere
@@ -47,6 +48,9 @@ def test_a_mesh_knows_its_surface_like_the_shape_it_describes(tmp_path: Path) ->
     assert of_mesh == pytest.approx(tangent_planes(CUBE, points, SPACING), rel=1e-6, abs=1e-3)
 
 
+Points = ti.types.ndarray(dtype=vec3, ndim=1)
+
+
 @ti.kernel
 def flow(n: ti.i32, planes: Points, columns: Points, dt: ti.f32):
     """columns: of C, its derivatives by x, y, z."""
@@ -64,10 +68,8 @@ def test_planes_go_with_the_material() -> None:
     steps = 2000
     planes = rng.normal(size=(20, 3)).astype(np.float32)
     planes[7] = 0.0
-    four, columns = np.zeros((20, 4), np.float32), np.zeros((3, 4), np.float32)
-    four[:, :3], columns[:, :3] = planes, rate.T
-    flow(steps, four, columns, 1.0 / steps)
-    moved = four[:, :3]
+    moved = planes.copy()
+    flow(steps, moved, np.ascontiguousarray(rate.T, np.float32), 1.0 / steps)
     f = np.linalg.matrix_power(np.eye(3) + rate / steps, steps)
     assert moved == pytest.approx(planes @ np.linalg.inv(f), abs=2e-3)
     assert not moved[7].any()

@@ -21,7 +21,7 @@ from tacsim.physics.gel import (
     gel_forces,
 )
 from tacsim.physics.lanes import PARTS, Counts, Facts, Partial
-from tacsim.physics.layout import BACKING, COUNTS, FACTS, GEL_DAMPING, NUMBERS, SMALLEST_VOLUME, STEP
+from tacsim.physics.layout import BACKING, COUNTS, ELEMENTS, FACTS, GEL_DAMPING, NUMBERS, SMALLEST_VOLUME, STEP
 from tacsim.runtime import start, ti
 from tacsim.scene import Gel, GelMaterial
 
@@ -37,13 +37,14 @@ def substep(
 ):  # fmt: skip
     ti.loop_config(serialize=True)
     for env in range(nodes.shape[0]):
-        layers, nx, ny = nodes.shape[4] - 1, skin.shape[3] - 3, skin.shape[4] - 3
+        layers = nodes.shape[4] - 1
+        nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
         for part in range(PARTS):
             gel_forces(
                 env, part, gels, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny
             )
         for part in range(PARTS * advance):
-            gel_advance(env, part, gels, nodes, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+            gel_advance(env, part, gels, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
 
 
 GEL = Gel(size=(6e-3, 5e-3, 4e-3), material=GelMaterial(poisson_ratio=0.48))
@@ -59,6 +60,7 @@ def launch(state: GelState, advance: bool, element: float = 1e-3, gel: Gel = GEL
     for index, value in {**facts.facts(), STEP: DT, GEL_DAMPING: DAMPING}.items():
         numbers[:, index] = value
     counts = np.zeros((environments, COUNTS), np.int32)
+    counts[:, ELEMENTS : ELEMENTS + 2] = facts.elements[:2]
     partial = np.full((environments, PARTS, NUMBERS), 1e9, np.float32)
     state.refresh()
     substep(gels, int(advance), *state.arguments(), numbers, counts, partial)
@@ -107,7 +109,9 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
     state.u[..., 1:, :] = u = rng.normal(scale=0.05, size=state.u[..., 1:, :].shape)
     state.v[..., 1:, :] = v = rng.normal(scale=0.01, size=u.shape)
     state.touch[..., :count, :3] = rng.normal(scale=0.01, size=state.touch[..., :count, :3].shape)
+    touch = state.touch.copy()
     partial = launch(state, advance=True)
+    assert not state.touch.any()  # zero for the next substep
     share = np.full(state.u.shape[2:5], 1.0)
     share[[0, -1]] *= 0.5
     share[:, [0, -1]] *= 0.5
@@ -118,7 +122,7 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
         force = reference.gel_forces(whole, facts.spacing, facts.mu, facts.lam, HOURGLASS)
         held = partial[0].reshape(2, -1, NUMBERS)[gel, :, BACKING : BACKING + 3].sum(axis=0)
         assert held == pytest.approx(force[:, :, 0].sum(axis=(0, 1)), abs=1e-5 * np.abs(force).max())
-        contact = state.touch[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
+        contact = touch[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
         force[:, :, -1] += contact
         velocity = (1 - DAMPING * DT) * v[0, gel] + DT * force[:, :, 1:] / mass
         assert np.abs(state.v[0, gel, :, :, 1:] - velocity).max() < 1e-5 * np.abs(velocity).max()

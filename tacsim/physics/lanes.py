@@ -76,6 +76,21 @@ def small(index, width: ti.template()):
 
 
 @ti.func
+def lanes_at(array: ti.template(), at):
+    """LANES neighbours, from any place on."""
+    start = small(at, 1)
+    return real([array[start + lane] for lane in range(LANES)])
+
+
+@ti.func
+def put_lanes(array: ti.template(), at, values, never):
+    start = small(at, 1)
+    kept = real([keep_or(never, array[start + lane], values[lane]) for lane in range(LANES)])
+    for lane in ti.static(range(LANES)):
+        array[start + lane] = kept[lane]
+
+
+@ti.func
 def least_lane(rows: ti.template(), row: ti.template()):
     """Smallest number of a row of lanes."""
     least = rows[row, 0]

@@ -16,7 +16,7 @@ ROWS = 26
 
 
 @ti.func
-def fill(rows: ti.template(), row: ti.template(), values):
+def fill(rows: ti.template(), row, values):
     """One number of all lanes."""
     for lane in ti.static(range(LANES)):
         rows[row, lane] = values[lane]
@@ -34,7 +34,7 @@ def element_block(
     """
     h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
     quarter = 0.25 / h
-    for d in ti.static(range(3)):
+    for d in range(3):  # not unrolled here: kernels of more statements compile for much longer
         for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
             at = u + d * axis + k * layer + j * across_j + i * across_i
             fill(rows, 8 * d + 4 * i + 2 * j + k, lanes_at(nodes, at))
@@ -79,5 +79,5 @@ def element_block(
             for k in ti.static(range(4)):
                 rows[3 * k + d, lane] = yz[k] + odd[k]
                 rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
-    for r in ti.static(range(24)):
+    for r in range(24):
         put_lanes(corners, to + r * row, real([rows[r, lane] for lane in range(LANES)]), never)

@@ -278,7 +278,7 @@ def gel_forces(
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for block in range(first, last):
             i, j = here + block * LANES, before + block * LANES
-            for d in ti.static(range(3)):
+            for d in range(3):
                 to = u + (6 + d) * axis + k * layer + block * LANES
                 node_block(to, i + d * row, j + d * row, below, above, row, nodes, corners, 1, ny + 1, never)
     note_least(partial, env, part, SMALLEST_VOLUME, least_lane(rows, SMALLEST))
@@ -350,7 +350,7 @@ def gel_advance(
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
             share = lattice[opaque(never, blocks + block)] * scale
-            for d in ti.static(range(3)):
+            for d in range(3):
                 x = u + d * axis + k * layer + block * LANES
                 v, f = x + 3 * axis, x + 6 * axis
                 speed = keep * lanes_at(nodes, v) + share * lanes_at(nodes, f)

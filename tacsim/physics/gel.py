@@ -16,6 +16,7 @@ from tacsim.physics.lanes import (
     LANES,
     ON_DEVICE,
     PARTS,
+    aligned_zeros,
     first_of,
     keep_or,
     lanes_at,
@@ -197,7 +198,7 @@ class GelState:
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Zeros with `margin` more before and behind: the whole memory, and the array in its middle."""
     margin = padded(margin)
-    memory = np.zeros(math.prod(shape) + 2 * margin, np.float32)
+    memory = aligned_zeros(math.prod(shape) + 2 * margin)
     return memory, memory[margin:-margin].reshape(shape)
 
 

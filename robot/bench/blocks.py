@@ -9,14 +9,14 @@ from tacsim.physics.gel import (
     GelFacts,
     GelState,
     Lattice,
-    NodeLanes,
     Nodes,
     Skin,
     Touch,
     gel_advance,
     gel_forces,
+    margin,
 )
-from tacsim.physics.lanes import NODES, PARTS, Counts, Facts, Partial, strip, vec3
+from tacsim.physics.lanes import LANES, NODES, PARTS, Counts, Facts, Partial, strip, vec3
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
@@ -86,30 +86,30 @@ def body_substeps(
 
 @ti.kernel
 def gel_substeps(
-    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
-    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
     facts: Facts, counts: Counts, partial: Partial,
     keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32,
 ):  # fmt: skip
     """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
     ti.loop_config(serialize=True)
     for _ in range(counts[0, STEPS]):
-        layers = nodes.shape[4] - 1
-        nx, ny = counts[0, ELEMENTS], counts[0, ELEMENTS + 1]
+        nx, ny, layers = counts[0, ELEMENTS], counts[0, ELEMENTS + 1], counts[0, ELEMENTS + 2]
         for part in range(PARTS):
-            gel_forces(0, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny)
+            gel_forces(0, part, 1, nodes, corners, lattice, facts, counts, partial, layers, nx, ny)
         for part in range(PARTS):
-            gel_advance(0, part, 1, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+            gel_advance(0, part, 1, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+        layer = ((nx + 1) * (ny + 1) + LANES - 1) // LANES * LANES
         dt, keep = facts[0, STEP], vec3(keep_x, keep_y, keep_z)
         for d in ti.static(range(3)):
             for k in range(1, layers + 1):
                 for n in range((nx + 1) * (ny + 1)):
-                    before = nodes[0, 0, 1, d, k, n]
+                    v = margin(ny) + ((3 + d) * (layers + 1) + k) * layer + n
+                    before = nodes[v]
                     after = keep[d] * before
                     if driven == 1 and k == layers and d == 2:
                         after = speed
-                    nodes[0, 0, 1, d, k, n] = after
-                    nodes[0, 0, 0, d, k, n] = nodes[0, 0, 0, d, k, n] + dt * (after - before)
+                    nodes[v] = after
+                    nodes[v - 3 * (layers + 1) * layer] += dt * (after - before)
 
 
 @ti.kernel
@@ -167,7 +167,7 @@ class GelBlock(Block):
     def __init__(self, facts: GelFacts, dt: float, damping: float) -> None:
         super().__init__({**facts.facts(), GEL_DAMPING: damping}, dt)
         self.state = GelState(facts, 1, 1)
-        self.counts[:, ELEMENTS : ELEMENTS + 2] = facts.elements[:2]
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = facts.elements
         self._arguments = (*self.state.arguments(), self.facts, self.counts, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:

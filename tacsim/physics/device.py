@@ -17,10 +17,11 @@ from tacsim.physics.gel import (
     Corners,
     GelState,
     Lattice,
-    NodeLanes,
+    Nodes,
     Skin,
     Touch,
     gel_advance,
+    margin,
     node_block,
     skin_at,
     skin_row,
@@ -85,14 +86,12 @@ def element(
 ):  # fmt: skip
     """Forces of one element on its corners; gel: counted over all environments."""
     blocks = (nx + 1) * (ny + 1)
-    axis, row, margin = (layers + 1) * blocks, blocks + ny + 2, ny + 2
-    u = margin + gel * 9 * axis + k * blocks + block
-    to = margin + (gel * layers + k) * 24 * row + ny + 2 + block
+    axis, row = (layers + 1) * blocks, blocks + ny + 2
+    u = margin(ny) + gel * 9 * axis + k * blocks + block
+    to = margin(ny) + (gel * layers + k) * 24 * row + ny + 2 + block
     rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
     rows[SMALLEST, 0] = 1e9
-    element_block(
-        env, u, axis, blocks, to, row, block, nodes, nodes, nodes, nodes, 1, ny + 1, corners, lattice, facts, rows, 0
-    )
+    element_block(env, u, axis, blocks, to, row, block, nodes, 1, ny + 1, corners, lattice, facts, rows, 0)
     note_least(partial, env, block % PARTS, SMALLEST_VOLUME, least_lane(rows, SMALLEST))
 
 
@@ -103,15 +102,15 @@ def column(
 ):  # fmt: skip
     """Forces on one column of nodes of gel g, from its backing to its surface, and its motion."""
     gel, blocks = env * gels + g, (nx + 1) * (ny + 1)
-    axis, row, margin = (layers + 1) * blocks, blocks + ny + 2, ny + 2
+    axis, row = (layers + 1) * blocks, blocks + ny + 2
     for k in range(layers + 1):
-        i = margin + (gel * layers + ti.min(k, layers - 1)) * 24 * row + ny + 2 + block
-        j = margin + (gel * layers + ti.max(k - 1, 0)) * 24 * row + ny + 2 + block
+        i = margin(ny) + (gel * layers + ti.min(k, layers - 1)) * 24 * row + ny + 2 + block
+        j = margin(ny) + (gel * layers + ti.max(k - 1, 0)) * 24 * row + ny + 2 + block
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for d in ti.static(range(3)):
             node_block(
-                margin + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
-                nodes, corners, corners, corners, corners, 1, ny + 1, 0,
+                margin(ny) + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
+                nodes, corners, 1, ny + 1, 0,
             )  # fmt: skip
     gel_advance(env, g * blocks + block, gels, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
 
@@ -119,7 +118,7 @@ def column(
 @ti.kernel
 def press_substep(
     it: ti.i32, drive: Drive,
-    nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values, facts: Facts, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.press.press_substeps`."""
@@ -146,7 +145,7 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    it: ti.i32, nodes: NodeLanes, skin: Skin, corners: Corners, lattice: Lattice, masses: Strips,
+    it: ti.i32, nodes: Nodes, skin: Skin, corners: Corners, lattice: Lattice, masses: Strips,
     facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body (`tacsim.physics.hybrid_kernels.substeps`):
@@ -175,7 +174,7 @@ def elements_of_hybrid(
 @ti.kernel
 def scatter_of_hybrid(
     it: ti.i32, drive: Drive,
-    nodes: NodeLanes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
     particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
     facts: Facts, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, room: ti.i32, most: ti.i32,
 ):  # fmt: skip
@@ -244,11 +243,11 @@ class Mirror:
 
     def send_gels(self, gels: GelState) -> tuple[Any, ...]:
         """What every kernel with gels takes."""
-        nodes, skin, touch, corners, lattice = gels.memory()
+        nodes, skin, touch, corners, lattice = gels.arguments()
         return (
-            self.sent("nodes", nodes[:, None], real), self.sent("skin", skin, ti.f32),
-            self.room("touch", ti.f32, touch.shape), self.room("corners", real, corners.shape),
-            self.sent("lattice", lattice.reshape(-1, 1), real),
+            self.sent("nodes", nodes, ti.f32), self.sent("skin", skin, ti.f32),
+            self.room("touch", ti.f32, touch.shape), self.room("corners", ti.f32, corners.shape),
+            self.sent("lattice", lattice, real),
         )  # fmt: skip
 
 
@@ -265,7 +264,7 @@ def run_press(
     )  # fmt: skip
     for it in range(drive.shape[1]):
         press_substep(it, *arguments, gels.nodes.shape[4] - 1)
-    mirror.bring(nodes=gels.memory()[0], slip=slip, pressure=pressure, partial=partial)
+    mirror.bring(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=partial)
 
 
 def run_hybrid(
@@ -294,4 +293,4 @@ def run_hybrid(
             layers, room, most,
         )  # fmt: skip
         gather_of_hybrid(it, particles, velocity, *numbers, room)
-    mirror.bring(nodes=gels.memory()[0], known=known, memory=memory, partial=partial)
+    mirror.bring(nodes=gels.arguments()[0], known=known, memory=memory, partial=partial)

@@ -1,7 +1,7 @@
 """The gel's element: a trilinear hexahedron with one-point quadrature and hourglass stiffness (Flanagan & Belytschko
 1981), neo-Hookean. LANES neighbours at once, laid out as in tacsim/physics/transfers.py."""
 
-from tacsim.physics.lanes import LANES, keep_or, opaque, real, vec3
+from tacsim.physics.lanes import LANES, lanes_at, opaque, put_lanes, real, vec3
 from tacsim.physics.layout import GEL_LAMBDA, GEL_MU, GEL_SPACING
 from tacsim.physics.material import lanes_log1p
 from tacsim.runtime import ti
@@ -16,7 +16,7 @@ ROWS = 26
 
 
 @ti.func
-def fill(rows: ti.template(), row: ti.template(), values):
+def fill(rows: ti.template(), row, values):
     """One number of all lanes."""
     for lane in ti.static(range(LANES)):
         rows[row, lane] = values[lane]
@@ -24,28 +24,20 @@ def fill(rows: ti.template(), row: ti.template(), values):
 
 @ti.func
 def element_block(
-    env, u, axis, layer, to, row, block, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(),
-    sj: ti.template(), si: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(),
-    rows: ti.template(), never,
+    env, u, axis, layer, to, row, block, nodes: ti.template(), across_j, across_i, corners: ti.template(),
+    lattice: ti.template(), facts: ti.template(), rows: ti.template(), never,
 ):  # fmt: skip
     """Forces of LANES elements on their corners; notes the smallest det F of each lane in row SMALLEST.
 
     u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
-    where the forces go, `row` the way to the next corner or axis; sj, si: how much further on nodes across j and i
-    stand, 0 in views that are shifted in memory.
+    where the forces go, `row` the way to the next corner or axis; across_j, across_i: the way to the next node.
     """
     h, mu, lam = facts[env, GEL_SPACING], facts[env, GEL_MU], facts[env, GEL_LAMBDA]
     quarter = 0.25 / h
-    for d in ti.static(range(3)):
-        low, high = u + d * axis, u + d * axis + layer
-        fill(rows, 8 * d, n0[opaque(never, low)])
-        fill(rows, 8 * d + 1, n0[opaque(never, high)])
-        fill(rows, 8 * d + 2, nj[opaque(never, low + sj)])
-        fill(rows, 8 * d + 3, nj[opaque(never, high + sj)])
-        fill(rows, 8 * d + 4, ni[opaque(never, low + si)])
-        fill(rows, 8 * d + 5, ni[opaque(never, high + si)])
-        fill(rows, 8 * d + 6, nij[opaque(never, low + si + sj)])
-        fill(rows, 8 * d + 7, nij[opaque(never, high + si + sj)])
+    for d in range(3):  # not unrolled here: kernels of more statements compile for much longer
+        for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
+            at = u + d * axis + k * layer + j * across_j + i * across_i
+            fill(rows, 8 * d + 4 * i + 2 * j + k, lanes_at(nodes, at))
     fill(rows, WHOLE, lattice[opaque(never, block)])
     for lane in range(LANES):
         whole = rows[WHOLE, lane]
@@ -87,6 +79,5 @@ def element_block(
             for k in ti.static(range(4)):
                 rows[3 * k + d, lane] = yz[k] + odd[k]
                 rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
-    for r in ti.static(range(24)):
-        at = opaque(never, to + r * row)
-        corners[at] = keep_or(never, corners[at], real([rows[r, lane] for lane in range(LANES)]))
+    for r in range(24):
+        put_lanes(corners, to + r * row, real([rows[r, lane] for lane in range(LANES)]), never)

@@ -16,13 +16,16 @@ from tacsim.physics.lanes import (
     LANES,
     ON_DEVICE,
     PARTS,
+    aligned_zeros,
     first_of,
     keep_or,
+    lanes_at,
     least_lane,
     note_least,
     note_sum,
     opaque,
     padded,
+    put_lanes,
     real,
     small,
     vec4,
@@ -44,12 +47,11 @@ from tacsim.scene import Gel, GelSurface, lame
 MM = 1e3  # millimetres in a metre
 MPA = 1e-6  # megapascals in a pascal
 
-Nodes = ti.types.ndarray(dtype=ti.f32, ndim=6)
-# Lanes have one axis: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
-NodeLanes = ti.types.ndarray(dtype=real, ndim=1)
+# One axis each: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
+Nodes = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Skin = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Touch = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Corners = ti.types.ndarray(dtype=real, ndim=1)
+Corners = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Lattice = ti.types.ndarray(dtype=real, ndim=1)
 
 
@@ -134,8 +136,7 @@ class GelState:
         halo = -(-(row + 1) // LANES)
         longest = -(-blocks // pieces)
         self._row = row
-        # Elements and nodes meet at offsets 0, 1, row and row + 1. Lanes start at multiples of LANES, so each offset
-        # has a view of its own, shifted in memory.
+        # Elements and nodes meet at offsets 0, 1, row and row + 1, so kernels read that far beyond both ends.
         self._nodes, self.nodes = shiftable((environments, gels, 3, 3, nz + 1, width), row + 1)
         self.skin = np.zeros((environments, gels, 2, nx + 3, ny + 3, 4), np.float32)
         self.touch = np.zeros((environments, COPIES, gels, width, 4), np.float32)
@@ -188,32 +189,17 @@ class GelState:
             skin[:, :, :, [0, -1]] = skin[:, :, :, [1, -2]]
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """What every kernel with gels takes, in this order; arrays of lanes are the same memory once more."""
-        shifts = (0, 1, self._row, self._row + 1)
+        """What every kernel with gels takes, in this order: nodes and corners with the margins round them."""
         return (
-            self.nodes, *(shifted(self._nodes, self.nodes, shift) for shift in shifts), *self._surface(),
-            *(shifted(self._corners, self.corners, -shift) for shift in shifts), self.lattice.reshape(-1, LANES),
+            self._nodes, self.skin.reshape(-1), self.touch.reshape(-1), self._corners, self.lattice.reshape(-1, LANES)
         )  # fmt: skip
-
-    def memory(self) -> tuple[np.ndarray, ...]:
-        """What a device takes: nodes with the margin round them, skin, touch, corners with theirs, lattice."""
-        return self._nodes, *self._surface(), self._corners, self.lattice
-
-    def _surface(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.skin.reshape(-1), self.touch.reshape(-1)
 
 
 def shiftable(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Zeros with `margin` more before and behind: the whole memory, and the array in its middle."""
     margin = padded(margin)
-    memory = np.zeros(math.prod(shape) + 2 * margin, np.float32)
+    memory = aligned_zeros(math.prod(shape) + 2 * margin)
     return memory, memory[margin:-margin].reshape(shape)
-
-
-def shifted(memory: np.ndarray, array: np.ndarray, shift: int) -> np.ndarray:
-    """Lanes of what stands `shift` numbers further on, for every entry of `array`."""
-    start = (memory.size - array.size) // 2 + shift
-    return memory[start : start + array.size].reshape(-1, LANES)
 
 
 def gel_surface(facts: GelFacts, state: GelState, environment: int, gel: int) -> GelSurface:
@@ -241,26 +227,30 @@ def touch_start(env, copy, gels, g, nx, ny):
 
 
 @ti.func
+def margin(ny):
+    """Numbers before the first of `nodes` and `corners`."""
+    return (ny + 2 + LANES - 1) // LANES * LANES
+
+
+@ti.func
 def node_block(
-    to, i, j, below, above, row, n0: ti.template(), c0: ti.template(), cj: ti.template(), ci: ti.template(),
-    cij: ti.template(), sj: ti.template(), si: ti.template(), never,
+    to, i, j, below, above, row, nodes: ti.template(), corners: ti.template(), across_j, across_i, never
 ):  # fmt: skip
     """Internal force on LANES nodes along one axis, from the elements above them, at i in `corners`, and below, at j.
 
-    below, above: 1 or 0, whether there are any; row, sj, si: as for `element_block`.
+    below, above: 1 or 0, whether there are any; row, across_j, across_i: as for `element_block`.
     """
-    under = c0[opaque(never, i)] + cj[opaque(never, i + 6 * row - sj)]
-    under += ci[opaque(never, i + 12 * row - si)] + cij[opaque(never, i + 18 * row - si - sj)]
-    over = c0[opaque(never, j + 3 * row)] + cj[opaque(never, j + 9 * row - sj)]
-    over += ci[opaque(never, j + 15 * row - si)] + cij[opaque(never, j + 21 * row - si - sj)]
-    at = opaque(never, to)
-    n0[at] = keep_or(never, n0[at], below * under + above * over)
+    under, over = real(0.0), real(0.0)
+    for p, q in ti.static(ti.ndrange(2, 2)):  # of the element that has these nodes as its corners p, q
+        way = (12 * p + 6 * q) * row - p * across_i - q * across_j
+        under += lanes_at(corners, i + way)
+        over += lanes_at(corners, j + 3 * row + way)
+    put_lanes(nodes, to, below * under + above * over, never)
 
 
 @ti.func
 def gel_forces(
-    env, part, gels, n0: ti.template(), nj: ti.template(), ni: ti.template(), nij: ti.template(), c0: ti.template(),
-    cj: ti.template(), ci: ti.template(), cij: ti.template(), lattice: ti.template(), facts: ti.template(),
+    env, part, gels, nodes: ti.template(), corners: ti.template(), lattice: ti.template(), facts: ti.template(),
     counts: ti.template(), partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Internal forces on this part's nodes of its gel. A layer of elements, then the nodes below it, and so on up."""
@@ -270,34 +260,35 @@ def gel_forces(
     blocks = ((nx + 1) * (ny + 1) + LANES - 1) // LANES
     first, last = first_of(blocks, piece, pieces), first_of(blocks, piece + 1, pieces)
     halo = (ny + 1 + LANES) // LANES  # blocks before `first` whose elements reach into it
-    row = (blocks + pieces - 1) // pieces + halo  # of corners
-    axis = (layers + 1) * blocks
-    u, f = (env * gels + g) * 9 * axis, ((env * gels + g) * 9 + 6) * axis
+    row = ((blocks + pieces - 1) // pieces + halo) * LANES  # of corners
+    layer = blocks * LANES
+    axis = (layers + 1) * layer
+    u = margin(ny) + (env * gels + g) * 9 * axis
     rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
     for lane in range(LANES):
         rows[SMALLEST, lane] = 1e9
     for k in range(layers + 1):
-        here = (2 * (env * PARTS + part) + k % 2) * 24 * row
-        before = (2 * (env * PARTS + part) + (k + 1) % 2) * 24 * row
+        here = margin(ny) + (2 * (env * PARTS + part) + k % 2) * 24 * row + (halo - first) * LANES
+        before = margin(ny) + (2 * (env * PARTS + part) + (k + 1) % 2) * 24 * row + (halo - first) * LANES
         if k < layers:
             for block in range(ti.max(first - halo, 0), last):
                 element_block(
-                    env, u + k * blocks + block, axis, blocks, here + block - first + halo, row, block, n0, nj, ni,
-                    nij, 0, 0, c0, lattice, facts, rows, never,
+                    env, u + k * layer + block * LANES, axis, layer, here + block * LANES, row, block, nodes, 1, ny + 1,
+                    corners, lattice, facts, rows, never,
                 )  # fmt: skip
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for block in range(first, last):
-            i, j = here + block - first + halo, before + block - first + halo
-            for d in ti.static(range(3)):
-                to = f + d * axis + k * blocks + block
-                node_block(to, i + d * row, j + d * row, below, above, row, n0, c0, cj, ci, cij, 0, 0, never)
+            i, j = here + block * LANES, before + block * LANES
+            for d in range(3):
+                to = u + (6 + d) * axis + k * layer + block * LANES
+                node_block(to, i + d * row, j + d * row, below, above, row, nodes, corners, 1, ny + 1, never)
     note_least(partial, env, part, SMALLEST_VOLUME, least_lane(rows, SMALLEST))
 
 
 @ti.func
-def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch: ti.template(), never, nx, ny):
+def take_touch(env, gels, g, first, last, forces, axis, nodes: ti.template(), touch: ti.template(), never, nx, ny):
     """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
-    zeros for the next substep. forces: where the blocks' forces along x begin, `axis` the way to y and z."""
+    zeros for the next substep. forces: where those along x begin, `axis` the way to y and z."""
     push = ti.Matrix.zero(ti.f32, 4 * LANES, 1)
     turned = ti.Matrix.zero(ti.f32, 4, LANES)
     for block in range(first, last):
@@ -310,19 +301,17 @@ def take_touch(env, gels, g, first, last, forces, axis, n0: ti.template(), touch
             for d in ti.static(range(4)):
                 turned[d, lane] = push[4 * lane + d, 0]
         for d in ti.static(range(3)):
-            at = opaque(never, forces + d * axis + block)
-            n0[at] = keep_or(never, n0[at], n0[at] + real([turned[d, lane] for lane in range(LANES)]))
+            at = forces + d * axis + block * LANES
+            put_lanes(nodes, at, lanes_at(nodes, at) + real([turned[d, lane] for lane in range(LANES)]), never)
         for copy in ti.static(range(COPIES)):
             for quarter in range(4):
-                at = small(touch_start(env, copy, gels, g, nx, ny) + (block * 4 + quarter) * LANES, 1)
-                zeros = real([keep_or(never, touch[at + lane], 0.0) for lane in range(LANES)])
-                for lane in ti.static(range(LANES)):
-                    touch[at + lane] = zeros[lane]
+                at = touch_start(env, copy, gels, g, nx, ny) + (block * 4 + quarter) * LANES
+                put_lanes(touch, at, real(0.0), never)
 
 
 @ti.func
 def gel_advance(
-    env, part, gels, n0: ti.template(), skin: ti.template(), touch: ti.template(), lattice: ti.template(),
+    env, part, gels, nodes: ti.template(), skin: ti.template(), touch: ti.template(), lattice: ti.template(),
     facts: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
 ):  # fmt: skip
     """Symplectic Euler with lumped masses on this part's nodes of its gel, and their skin.
@@ -339,36 +328,36 @@ def gel_advance(
     if ti.static(ON_DEVICE):
         g, first = part // blocks, part % blocks
         slot, last = g * pieces + first % pieces, first + 1
-    axis = (layers + 1) * blocks
-    u = (env * gels + g) * 9 * axis
-    if ti.static(ON_DEVICE):
-        u += ny + 2  # the margin, see GelState.memory
+    layer = blocks * LANES
+    axis = (layers + 1) * layer
+    u = margin(ny) + (env * gels + g) * 9 * axis
     keep = 1.0 - facts[env, GEL_DAMPING] * dt
     rate = dt / (facts[env, GEL_DENSITY] * h * h * h)
     for d in ti.static(range(3)):
         held = real(0.0)
         for block in range(first, last):
-            held += ti.select(lattice[blocks + block] > 0.0, n0[u + (6 + d) * axis + block], 0.0)
+            force = lanes_at(nodes, u + (6 + d) * axis + block * LANES)
+            held += ti.select(lattice[blocks + block] > 0.0, force, 0.0)
         note_sum(partial, env, slot, BACKING + d, held.sum())
-    top = u + layers * blocks
+    top = u + layers * layer
     if ti.static(ON_DEVICE):
         for d in ti.static(range(3)):
             at = touch_start(env, 0, gels, g, nx, ny) + 4 * first + d
-            n0[top + (6 + d) * axis + first] += touch[at]
+            nodes[top + (6 + d) * axis + first] += touch[at]
             touch[at] = 0.0
     else:
-        take_touch(env, gels, g, first, last, top + 6 * axis, axis, n0, touch, never, nx, ny)
+        take_touch(env, gels, g, first, last, top + 6 * axis, axis, nodes, touch, never, nx, ny)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
             share = lattice[opaque(never, blocks + block)] * scale
-            for d in ti.static(range(3)):
-                at = u + d * axis + k * blocks + block
-                x, v, f = opaque(never, at), opaque(never, at + 3 * axis), opaque(never, at + 6 * axis)
-                speed = keep * n0[v] + share * n0[f]
-                place = n0[x] + dt * speed
-                n0[v] = keep_or(never, n0[v], speed)
-                n0[x] = keep_or(never, n0[x], place)
+            for d in range(3):
+                x = u + d * axis + k * layer + block * LANES
+                v, f = x + 3 * axis, x + 6 * axis
+                speed = keep * lanes_at(nodes, v) + share * lanes_at(nodes, f)
+                place = lanes_at(nodes, x) + dt * speed
+                put_lanes(nodes, v, speed, never)
+                put_lanes(nodes, x, place, never)
     first_row = skin_row(env, gels, g, nx)
     i, j = first * LANES // row, first * LANES % row
     for block in range(first, last):
@@ -378,7 +367,7 @@ def gel_advance(
             for quantity in ti.static(range(2)):
                 at = vec4(0.0)
                 for d in ti.static(range(3)):
-                    at[d] = n0[top + (3 * quantity + d) * axis + block][lane]
+                    at[d] = nodes[top + (3 * quantity + d) * axis + block * LANES + lane]
                 for p in range(p0, p1):
                     for q in range(q0, q1):
                         to = skin_at(first_row + quantity * (nx + 3) + p, q, ny)

@@ -76,7 +76,7 @@ class HybridState:
         self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), 4), np.float32)
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
-        self.counts[:, ELEMENTS : ELEMENTS + 2] = self.gel[0].elements[:2]
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
 

@@ -4,7 +4,6 @@ from tacsim.physics.contact import contact_ceiling, particle_contact, support_ra
 from tacsim.physics.gel import (
     Corners,
     Lattice,
-    NodeLanes,
     Nodes,
     Skin,
     Touch,
@@ -233,8 +232,7 @@ def touch_gel(
 @ti.kernel
 def substeps(
     team: ti.i32, drive: Drive,
-    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
-    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
     particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
     facts: Facts, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
@@ -246,8 +244,7 @@ def substeps(
         for _ in range(first_in_chunk(task)):
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
-            layers = nodes.shape[4] - 1
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
+            nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
             for it in range(counts[env, STEPS]):
                 highest = ti.Vector([contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny) for g in range(2)])
                 for share in range(shares(member, team)):
@@ -261,13 +258,13 @@ def substeps(
                     clear_masses(env, part, masses, counts)
                     particles_to_grid(env, part, particles, masses, facts, counts, partial)
                     gel_forces(
-                        env, part, 2, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,
+                        env, part, 2, nodes, corners, lattice, facts, counts, partial,
                         layers, nx, ny,
                     )  # fmt: skip
                 meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(env, part, 2, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, 2, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, facts, counts, partial)
                 meet(sync, turn, team, 2 * it + 2)
                 for share in range(shares(member, team)):

@@ -22,6 +22,7 @@ ON_DEVICE = DEVICE != "cpu"
 LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
 PARTS = 4  # of an environment's work on the CPU; of its sums everywhere
 CACHE_LINE = 16  # floats
+MOST = 2**30  # numbers in an array that kernels take
 COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
 
 NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
@@ -43,8 +44,13 @@ def padded(n: int) -> int:
 
 
 def aligned_zeros(*shape: int) -> np.ndarray:
-    """float32 zeros that begin at a cache line, so that no vector register's worth of them lies across two."""
+    """float32 zeros that begin at a cache line, so that no vector register's worth of them lies across two.
+
+    Raises MemoryError for more than kernels can count (see `small`): 4 GB.
+    """
     count = math.prod(shape)
+    if count > MOST:
+        raise MemoryError(f"an array of {count} numbers; kernels count to {MOST}")
     memory = np.zeros(count + CACHE_LINE, np.float32)
     start = -memory.ctypes.data // 4 % CACHE_LINE
     return memory[start : start + count].reshape(shape)
@@ -72,7 +78,22 @@ def small(index, width: ti.template()):
     if ti.static(ON_DEVICE):
         return index
     else:
-        return index & (2**30 // width - 1)
+        return index & (MOST // width - 1)
+
+
+@ti.func
+def lanes_at(array: ti.template(), at):
+    """LANES neighbours, from any place on."""
+    start = small(at, 1)
+    return real([array[start + lane] for lane in range(LANES)])
+
+
+@ti.func
+def put_lanes(array: ti.template(), at, values, never):
+    start = small(at, 1)
+    kept = real([keep_or(never, array[start + lane], values[lane]) for lane in range(LANES)])
+    for lane in ti.static(range(LANES)):
+        array[start + lane] = kept[lane]
 
 
 @ti.func

@@ -38,8 +38,8 @@ KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
 CAPACITY = 16  # strips of grid nodes that an environment has room for, in each copy
 SHAPE_NODES = 17  # of an indenter's distance grid x, y, z
-ELEMENTS = 20  # of a gel along x and y
-COUNTS = 22
+ELEMENTS = 20  # of a gel along x, y, z
+COUNTS = 23
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements

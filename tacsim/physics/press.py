@@ -14,7 +14,6 @@ from tacsim.physics.gel import (
     Corners,
     GelState,
     Lattice,
-    NodeLanes,
     Nodes,
     Skin,
     Touch,
@@ -73,8 +72,7 @@ REACH = 3e-3  # of a mesh's distance grid, up from its tip [m]
 @ti.kernel
 def press_substeps(
     team: ti.i32, drive: Drive,
-    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
-    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values,
     facts: Facts, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
@@ -83,20 +81,19 @@ def press_substeps(
         for _ in range(first_in_chunk(task)):
             turn, member = task // CHUNK // team, task // CHUNK % team
             env = sync[turn, WHO]
-            layers = nodes.shape[4] - 1
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
+            nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
             for it in range(counts[env, STEPS]):
                 for share in range(shares(member, team)):
                     part = member + share * team
                     indent(env, part, it, drive, skin, touch, slip, pressure, values, facts, counts, partial, nx, ny)
                     gel_forces(
-                        env, part, 1, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial,
+                        env, part, 1, nodes, corners, lattice, facts, counts, partial,
                         layers, nx, ny,
                     )  # fmt: skip
                 meet(sync, turn, team, 2 * it + 1)
                 for share in range(shares(member, team)):
                     part = member + share * team
-                    gel_advance(env, part, 1, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, 1, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
                 meet(sync, turn, team, 2 * it + 2)
 
 
@@ -130,7 +127,7 @@ class PressState:
         self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # multiplier of the normal contact [MPa]
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
-        self.counts[:, ELEMENTS : ELEMENTS + 2] = nx, ny
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
         self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])

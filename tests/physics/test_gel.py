@@ -12,7 +12,6 @@ from tacsim.physics.gel import (
     Corners,
     GelState,
     Lattice,
-    NodeLanes,
     Nodes,
     Skin,
     Touch,
@@ -31,20 +30,16 @@ pytestmark = pytest.mark.cpu
 @ti.kernel
 def substep(
     gels: ti.i32, advance: ti.i32,
-    nodes: Nodes, n0: NodeLanes, nj: NodeLanes, ni: NodeLanes, nij: NodeLanes, skin: Skin, touch: Touch,
-    c0: Corners, cj: Corners, ci: Corners, cij: Corners, lattice: Lattice,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
     facts: Facts, counts: Counts, partial: Partial,
 ):  # fmt: skip
     ti.loop_config(serialize=True)
-    for env in range(nodes.shape[0]):
-        layers = nodes.shape[4] - 1
-        nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
+    for env in range(counts.shape[0]):
+        nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
         for part in range(PARTS):
-            gel_forces(
-                env, part, gels, n0, nj, ni, nij, c0, cj, ci, cij, lattice, facts, counts, partial, layers, nx, ny
-            )
+            gel_forces(env, part, gels, nodes, corners, lattice, facts, counts, partial, layers, nx, ny)
         for part in range(PARTS * advance):
-            gel_advance(env, part, gels, n0, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
+            gel_advance(env, part, gels, nodes, skin, touch, lattice, facts, counts, partial, layers, nx, ny)
 
 
 GEL = Gel(size=(6e-3, 5e-3, 4e-3), material=GelMaterial(poisson_ratio=0.48))
@@ -60,7 +55,7 @@ def launch(state: GelState, advance: bool, element: float = 1e-3, gel: Gel = GEL
     for index, value in {**facts.facts(), STEP: DT, GEL_DAMPING: DAMPING}.items():
         numbers[:, index] = value
     counts = np.zeros((environments, COUNTS), np.int32)
-    counts[:, ELEMENTS : ELEMENTS + 2] = facts.elements[:2]
+    counts[:, ELEMENTS : ELEMENTS + 3] = facts.elements
     partial = np.full((environments, PARTS, NUMBERS), 1e9, np.float32)
     state.refresh()
     substep(gels, int(advance), *state.arguments(), numbers, counts, partial)

@@ -62,7 +62,7 @@ class DrivenWorld:
 
     # ---------------------------------------------------- what a world adds
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
         """Views of all that changes in a motion, by name."""
         raise NotImplementedError
 
@@ -81,13 +81,13 @@ class DrivenWorld:
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        state = taken(self._arrays(), self._poses)
+        state = taken(self.arrays(), self._poses)
         state["true_inertia"] = np.array(float(self._inertia.true))
         state["rates"] = self._rates.copy()
         return state
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        poses = put_back({**self._arrays(), "rates": self._rates}, list(self._poses), state)
+        poses = put_back({**self.arrays(), "rates": self._rates}, list(self._poses), state)
         self._poses = poses
         self._take(self._true if state["true_inertia"] else self._scaled)
 

@@ -159,6 +159,10 @@ class Driven(Protocol):
     scene: Scene
 
     def pose(self, name: str) -> Pose: ...
+    def arrays(self) -> State:
+        """Views of all that changes in a motion, by name."""
+        ...
+
     def snapshot(self) -> Mapping[str, NDArray[Any]]: ...
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
 
@@ -202,7 +206,7 @@ def retried(
 
 def _require_upright(world: Driven, targets: Mapping[str, Pose]) -> None:
     """Raises SimulationDiverged if a motion ended with a gel element inside out."""
-    state, thickness = world.snapshot(), world.scene.gel.size[2] * 1e3
+    state, thickness = world.arrays(), world.scene.gel.size[2] * 1e3
     if "gel_displacement" not in state or diagnosis.nearly_at_rest(state, thickness):
         return
     corners = diagnosis.corner_volumes(state, thickness)
@@ -210,7 +214,7 @@ def _require_upright(world: Driven, targets: Mapping[str, Pose]) -> None:
         words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
         end = Place("at the end of the motion and its hold", {**_poses(world), **targets})
         failure = SimulationDiverged(words, str(end))
-        failure.quantity, failure.failed, failure.poses = "corner", state, end.poses
+        failure.quantity, failure.failed, failure.poses = "corner", copies(state), end.poses
         raise failure
 
 

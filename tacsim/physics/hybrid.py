@@ -197,7 +197,7 @@ class HybridWorld(DrivenWorld):
 
     # ------------------------------------------------------------------ state
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         b = state.particles
         return {
@@ -234,7 +234,7 @@ class HybridWorld(DrivenWorld):
         low, high = bounds(x)
         require_room(low - margin, high + margin, self._body.cell, where)
         state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
-        good = copies(self._arrays())
+        good = copies(self.arrays())
         state.facts[index, STEP] = path.step
         state.facts[index, CENTRE : CENTRE + 3] = [column.mean(dtype=np.float64) for column in x.T]
         self._answer(launch)
@@ -244,7 +244,7 @@ class HybridWorld(DrivenWorld):
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
-        health = judged(self._arrays(), prepared.good, Health.read(partial), prepared.where)
+        health = judged(self.arrays(), prepared.good, Health.read(partial), prepared.where)
         self._speed = health.fastest
         rotations = prepared.drive[-1, :, :3]
         sums = partial.astype(np.float64)

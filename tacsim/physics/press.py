@@ -197,7 +197,7 @@ class PressWorld(DrivenWorld):
     def _stop(self) -> None:
         self._state.gels.v[self._index] = 0.0
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         return {
             "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "slip": state.slip[i],
@@ -211,7 +211,7 @@ class PressWorld(DrivenWorld):
         """Sets this environment's numbers for a launch."""
         path = launch.path
         where = path.place(self._poses, launch.first, launch.last)
-        good = copies(self._arrays())
+        good = copies(self.arrays())
         both = path.drive(launch.first, launch.last)
         self._state.facts[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
@@ -220,7 +220,7 @@ class PressWorld(DrivenWorld):
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
-        health = judged(self._arrays(), prepared.good, Health.read(partial), prepared.where)
+        health = judged(self.arrays(), prepared.good, Health.read(partial), prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]

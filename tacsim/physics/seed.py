@@ -131,7 +131,7 @@ class SeedWorld:
 
     # ------------------------------------------------------------------ state
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
         return {
             "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "deformation_gradient": self._f,
             "stress": self._stress, "aside": self._aside, "body_motion": self._motion,
@@ -139,13 +139,13 @@ class SeedWorld:
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        state = {name: a.copy() for name, a in self._arrays().items()}
+        state = {name: a.copy() for name, a in self.arrays().items()}
         state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
         return state
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Raises ValueError if `state` is no snapshot of such a world."""
-        self._poses = put_back(self._arrays(), self.sensors, state)
+        self._poses = put_back(self.arrays(), self.sensors, state)
 
     def pose(self, name: str) -> Pose:
         return self._poses[name]
@@ -253,7 +253,7 @@ class SeedWorld:
             self._launch(path.drive(first, last), path.step, x0, y0, health[0])
             return Health.read(health)
 
-        attempt(self._arrays(), launch, where)
+        attempt(self.arrays(), launch, where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):

@@ -130,7 +130,7 @@ def test_one_that_diverges_is_taken_back_while_others_go_on(
         if world is fresh.worlds[1]:
             launches = launches + 1 if launch.first or not launch.path.substeps else 1
             if launches == 3 and launch.path.refine < 2**fails:
-                world._arrays()["velocity"][5, 1] = np.nan
+                world.arrays()["velocity"][5, 1] = np.nan
         return prepare(world, launch)
 
     monkeypatch.setattr(HybridWorld, "prepare", poisoned)
@@ -152,7 +152,7 @@ def test_one_that_diverges_is_taken_back_while_others_go_on(
 
 
 def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
-    fresh.worlds[2]._arrays()["position"][0] = np.nan
+    fresh.worlds[2].arrays()["position"][0] = np.nan
     ends = fresh.move([closed(fresh.worlds[0], 0.3e-3), None, STAY])
     assert isinstance(ends[0], MoveStats)
     assert isinstance(ends[2], SimulationDiverged) and "before the motion began" in str(ends[2])
@@ -162,7 +162,7 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
     arrays = fresh._state.particles.known, fresh._state.memory, fresh._state.gels.nodes
     nodes = fresh._state.particles.masses.shape[2]
-    fresh.worlds[0]._arrays()["position"][-1] += [0.0, 60.0, 0.0]
+    fresh.worlds[0].arrays()["position"][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(

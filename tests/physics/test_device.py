@@ -81,7 +81,7 @@ def all_outcomes() -> dict[str, Any]:
     last = (1, -1, -1, -1, 2)  # node of the upper gel, in the surface
     for name, array, entry, value in (("race", "velocity", (-1, 2), 5.0), ("invert", "gel_displacement", last, -6.0)):
         before = first.snapshot()
-        first._arrays()[array][entry] += value
+        first.arrays()[array][entry] += value
         here = list(first._poses.values())
         prepared = first.prepare(Launch(first.plan(here, here), 0, 1))
         first._state.advance({0: prepared.drive})

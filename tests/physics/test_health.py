@@ -35,24 +35,27 @@ class Particles:
 
     def __init__(self) -> None:
         self.scene = Scene()
-        self.arrays = {"position": np.ones((4, 3), np.float32), "velocity": np.zeros((4, 3), np.float32)}
+        self.state = {"position": np.ones((4, 3), np.float32), "velocity": np.zeros((4, 3), np.float32)}
 
     def pose(self, name: str) -> Pose:
         return Pose()
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        return self.state
+
     def snapshot(self) -> dict[str, np.ndarray]:
-        return {name: a.copy() for name, a in self.arrays.items()}
+        return {name: a.copy() for name, a in self.state.items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        for name, a in self.arrays.items():
+        for name, a in self.state.items():
             a[...] = state[name]
 
     def launch(self, change: Callable[[dict[str, np.ndarray]], Any], seen: Health = WELL) -> Health:
         def kernels() -> Health:
-            change(self.arrays)
+            change(self.state)
             return seen
 
-        return attempt(self.arrays, kernels, HERE)
+        return attempt(self.state, kernels, HERE)
 
 
 def set_to(name: str, index: tuple[int, ...], value: float) -> Callable[[dict[str, np.ndarray]], None]:
@@ -93,11 +96,11 @@ def test_the_cause_names_array_index_and_how_many() -> None:
 
 def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
     world = Particles()
-    world.arrays["gel_velocity"] = np.zeros((1, 2, 2, 2, 3), np.float32)
+    world.state["gel_velocity"] = np.zeros((1, 2, 2, 2, 3), np.float32)
     with pytest.raises(SimulationDiverged, match=r"gel node moves at 0\.6 of the wave speed"):
         world.launch(set_to("gel_velocity", (0, 1, 1, 1, 2), -0.6))
     world = Particles()
-    world.arrays["strain"] = np.zeros((4, 6), np.float32)
+    world.state["strain"] = np.zeros((4, 6), np.float32)
     with pytest.raises(SimulationDiverged, match=r"a particle is crushed \(elastic volume ratio 0\.0316\)"):
         world.launch(set_to("strain", (3, 2), -0.999))
 
@@ -106,14 +109,14 @@ def test_a_motion_starts_again_from_the_state_before_it() -> None:
     world, seen = Particles(), []
 
     def advance(path: Path, first: int, last: int) -> Reading:
-        seen.append((path.refine, float(world.arrays["position"][0, 0])))
-        world.arrays["position"] += 1.0
+        seen.append((path.refine, float(world.state["position"][0, 0])))
+        world.state["position"] += 1.0
         world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
         return REST
 
     stats = run(retried(world, Order({}), one_launch), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
-    assert stats.retries == 1 and world.arrays["position"][0, 0] == 2.0
+    assert stats.retries == 1 and world.state["position"][0, 0] == 2.0
 
 
 def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
@@ -129,7 +132,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
     with pytest.raises(SimulationDiverged) as caught:
         run(retried(world, Order({}), one_launch), advance)
     assert steps == [2**retry for retry in range(RETRIES + 1)]
-    assert all(world.arrays[name].tobytes() == before[name].tobytes() for name in before)
+    assert all(world.state[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
     assert "velocity[1, 0] is inf at particle 1, (1.000, 1.000, 1.000) mm in the world" in text
     assert f"even with 1/{2**RETRIES} of the time step" in text and "move less far" in text
@@ -141,14 +144,14 @@ def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
     good, bad = Particles(), Particles()
     motions = [retried(good, Order({}), one_launch), retried(bad, Order({}), one_launch)]
     launches = [next(motion) for motion in motions]
-    good.arrays["position"] += 1.0
-    bad.arrays["position"] += 1.0
+    good.state["position"] += 1.0
+    bad.state["position"] += 1.0
     with pytest.raises(StopIteration) as ended:
         motions[0].send(REST)
     again = motions[1].throw(SimulationDiverged("too fast", "here"))
     assert ended.value.value == STATS
     assert (launches[1].path.refine, again.path.refine) == (1, 2)
-    assert good.arrays["position"].max() == 2.0 and bad.arrays["position"].max() == 1.0
+    assert good.state["position"].max() == 2.0 and bad.state["position"].max() == 1.0
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
@@ -156,17 +159,17 @@ def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None
     world = Particles()
 
     def advance(path: Path, first: int, last: int) -> Reading:
-        world.arrays["position"] += 1.0
+        world.state["position"] += 1.0
         raise error
 
     with pytest.raises(error):
         run(retried(world, Order({}), one_launch), advance)
-    assert world.arrays["position"].max() == 1.0
+    assert world.state["position"].max() == 1.0
 
 
 def test_a_broken_state_is_told_before_anything_moves() -> None:
     world = Particles()
-    world.arrays["position"][3, 0] = np.nan
+    world.state["position"][3, 0] = np.nan
     with pytest.raises(
         SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
     ):

@@ -217,10 +217,10 @@ def test_nothing_is_recompiled_for_a_second_scene() -> None:
 def test_a_nan_is_reported_and_rolled_back() -> None:
     w = world()
     squeeze(w, 0.2e-3)
-    w._arrays()["position"][7] = np.nan
+    w.arrays()["position"][7] = np.nan
     with pytest.raises(SimulationDiverged, match=r"position\[7, 0\] is nan"):
         w.move(shift(w, "upper", (0, 0, -0.1e-3)))
-    assert np.isnan(w._arrays()["position"]).sum() == 3  # as it was: nothing spread
+    assert np.isnan(w.arrays()["position"]).sum() == 3  # as it was: nothing spread
 
 
 def test_an_impossible_motion_ends_in_an_error_or_a_finite_state() -> None:

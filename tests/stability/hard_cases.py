@@ -251,7 +251,7 @@ def poison(name: str, value: float = math.nan) -> Motions:
     def motions(world: World) -> Iterator[Targets]:
         frame = "indenter" if world.truth() is None else "upper"
         yield by(world, frame, z=-0.5e-3)
-        array = world._arrays()[name]  # type: ignore[attr-defined]
+        array = world.arrays()[name]  # type: ignore[attr-defined]
         array[(0,) * array.ndim] = value
         yield by(world, frame, z=-0.1e-3)
 
@@ -260,7 +260,7 @@ def poison(name: str, value: float = math.nan) -> Motions:
 
 def escape(world: World) -> Iterator[Targets]:
     """A particle 100 m away: no grid can follow."""
-    world._arrays()["position"][-1] = [1e5, 1e5, 0.0]  # type: ignore[attr-defined]
+    world.arrays()["position"][-1] = [1e5, 1e5, 0.0]  # type: ignore[attr-defined]
     yield {}
 
 

@@ -139,7 +139,7 @@ class DrivenWorld:
         timed = None
         if order.duration is not None:
             timed = plan_in_time(a, b, order.duration, self._true, max(self._gel.half))
-        onward, stop = self._plan_on(a, b), self._plan_on(a, a)
+        onward = self._plan_on(a, b if order.flow else a)  # or to where they are: a stop
 
         def after_stop(refine: int) -> Motion:
             self._change(self._scaled if timed is None else self._true)
@@ -156,7 +156,7 @@ class DrivenWorld:
                 self._change(self._scaled)
                 return move_on(replace(onward, refine=refine), self.scene.settling, balanced=self.balanced)
             if self._rates.any():
-                return come_to_rest(replace(stop, refine=refine), after_stop(refine))
+                return come_to_rest(replace(onward, refine=refine), after_stop(refine))
             return after_stop(refine)
 
         stats = yield from retried(self, order, tried)

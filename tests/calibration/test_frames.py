@@ -142,6 +142,9 @@ def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) ->
         def now(self) -> float:
             return 0.0
 
+        def diagnostics(self) -> dict[str, float]:
+            return {}
+
         def surface(self, frame: str) -> object:
             return flat()
 

@@ -9,6 +9,7 @@ from tacsim import shapes
 from tacsim.interface import Pose
 from tacsim.physics.layer import layer_contact
 from tacsim.physics.press import PressWorld
+from tacsim.physics.world import Order
 from tacsim.scene import Box, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
 
 
@@ -173,7 +174,7 @@ def test_a_motion_driven_launch_by_launch_is_the_move() -> None:
     together = [world(Sphere(radius=4e-3)) for _ in range(2)]
     targets = [{"indenter": Pose(np.array([0, 0, 3.9e-3 - deep]))} for deep in (0.2e-3, 0.5e-3)]
     stats = [w.move(target) for w, target in zip(alone, targets, strict=True)]
-    motions = [w.motion(target) for w, target in zip(together, targets, strict=True)]
+    motions = [w.motion(Order(target)) for w, target in zip(together, targets, strict=True)]
     ends = {}
     wanted = {index: next(motion) for index, motion in enumerate(motions)}
     while wanted:
@@ -195,7 +196,7 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     w = world(Sphere(radius=4e-3))
     assert w.truth() is None
     assert set(w.snapshot()) == {
-        "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses", "true_inertia",
+        "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses", "rates", "true_inertia",
     }  # fmt: skip
 
 

@@ -153,7 +153,7 @@ def write(
         versions=_versions(),
     )
     arrays = {
-        f"{moment}.{name}": np.ascontiguousarray(a)  # copies of particles lie as the kernels have them
+        f"{moment}.{name}": np.asarray(a, order="C")  # copies of particles lie as the kernels have them
         for moment, state in zip(MOMENTS, (before, failure.good, failure.failed), strict=True)
         for name, a in state.items()
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol
@@ -44,7 +45,7 @@ class DrivenState(Protocol):
     def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None: ...
 
 
-class DrivenWorld:
+class DrivenWorld(ABC):
     """One environment of a state whose gels are layers of finite elements in their sensors' frames."""
 
     sensors: tuple[str, ...]
@@ -62,21 +63,21 @@ class DrivenWorld:
 
     # ---------------------------------------------------- what a world adds
 
+    @abstractmethod
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Views of all that changes in a motion, by name."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _stop(self) -> None:
         """Sets the speed of everything to zero."""
-        raise NotImplementedError
 
+    @abstractmethod
     def prepare(self, launch: Launch) -> Prepared:
         """Sets this environment's numbers for a launch. Raises SimulationDiverged if that cannot be done."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
-        raise NotImplementedError
 
     # ------------------------------------------------------------------ state
 

@@ -73,7 +73,7 @@ def test_equal_steps_make_a_steady_motion() -> None:
 
 
 def test_forces_of_a_steady_squeeze_are_near_those_of_rest() -> None:
-    """And the body's sideways motion is its own: the same squeeze beside the sensors' axis."""
+    """And the body stays in the middle."""
     flowing, settled = squeezed(), squeezed()
     for _ in range(8):
         flowing.move(nearer(flowing), flow=True)

@@ -66,7 +66,7 @@ class Servo:
         self.orders, self.frames = orders, frames_of(orders)
         self.kinematics = Kinematics(orders.model)  # type: ignore[arg-type]  # a Model, from JSON
         self.region = region(orders.lower, orders.upper, [(point, normal) for point, normal in orders.planes])
-        self.status = ArmStatus.HOLD
+        self.status = ArmStatus.CONNECTING  # until `watch` has looked once: nobody may take the arm for well before
         self.motion: Motion | None = None  # of the servo target; None: nothing is sent, the controller holds
         self.taken, self.rejected, self.shortened, self.zero_asked = taken, 0, 0, False
         self.close_asked = False
@@ -107,7 +107,7 @@ class Servo:
                 self.status, self._goal = ArmStatus.WAITING, None
             else:
                 self.fault(ArmStatus.PARTNER_STOPPED, now)
-        elif self.status == ArmStatus.WAITING:
+        elif self.status in (ArmStatus.CONNECTING, ArmStatus.WAITING):
             self.status = ArmStatus.HOLD
         for partner, other in zip(orders.partners, partners, strict=True):
             if other is not None and float(np.linalg.norm(here - other["position"])) < partner.distance - BARRIER:

@@ -363,6 +363,17 @@ def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
         assert (bench.at.position[2] < here - 0.12**2 / (2 * HARD) - 1e-4) == (not stops)
 
 
+def test_an_arm_is_not_called_well_before_it_was_looked_at() -> None:
+    """What the first look finds is the first that anybody hears: the worker publishes `status` before it too."""
+    for changes, found in (({}, ArmStatus.HOLD), ({"lower": [2.0] * 3, "upper": [3.0] * 3}, ArmStatus.WORKSPACE_LIMIT)):
+        bench = Bench(**changes)
+        assert bench.servo.status == ArmStatus.CONNECTING
+        bench.servo.look(1, touch(0.0, 0.0, 0.0), bench.now)
+        assert bench.servo.status == ArmStatus.CONNECTING
+        bench.servo.watch(bench.now, bench.partners)
+        assert bench.servo.status == found
+
+
 def test_what_was_shown_to_a_worker_before_is_not_held_against_this_one() -> None:
     servo = Servo(orders(depth=1e-3), touches=7)
     bench = Bench()

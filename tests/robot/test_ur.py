@@ -347,7 +347,7 @@ def test_limits_have_no_default_workspace() -> None:
 def test_an_arm_outside_its_workspace_does_not_connect(mock: MockUR) -> None:
     elsewhere = {"workspace": Workspace(lower=(2.0, 2.0, 2.0), upper=(3.0, 3.0, 3.0))}
     with pytest.raises(SafetyViolation, match=r"outside its workspace.*mm beyond the workspace's lower"):
-        URArm(facts(limits=elsewhere), "left")
+        URArm(facts(limits=elsewhere), "left").close()
     assert leftovers("left") == []
 
 
@@ -488,7 +488,7 @@ def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
             until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
             begun = time.monotonic()
             with pytest.raises(DeviceError):
-                URArm(facts(OTHER), "nobody", timeout=2.0)
+                URArm(facts(OTHER), "nobody", timeout=2.0).close()
             assert time.monotonic() - begun < PATIENCE
         finally:
             os.kill(mock.pid, signal.SIGCONT)
@@ -589,14 +589,14 @@ def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> Non
 def test_connecting_to_a_stopped_arm_says_so(mock: MockUR) -> None:
     mock.door.protective_stop()
     with pytest.raises(ProtectiveStop, match="arm 'left': protective stop"):
-        URArm(facts(), "left")
+        URArm(facts(), "left").close()
     mock.door.estop()
     with pytest.raises(EmergencyStop, match="person must release it"):
-        URArm(facts(), "left")
+        URArm(facts(), "left").close()
     mock.door.reset()
     mock.door.remote_control(False)
     with pytest.raises(DeviceError, match="remote control"):
-        URArm(facts(), "left")
+        URArm(facts(), "left").close()
     mock.door.remote_control(True)
     assert leftovers("left") == []
 
@@ -694,19 +694,19 @@ def test_a_second_driver_is_refused_and_the_first_goes_on(arm: URArm, mock: Mock
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.1))
     with pytest.raises(DeviceBusyError, match="controlled by another program"):
-        URArm(facts(), "second")
+        URArm(facts(), "second").close()
     assert leftovers("second") == []
     assert arm.status() == ArmStatus.OK
     go(arm, start)
     with pytest.raises(DeviceAlreadyConnectedError, match="open already"):
-        URArm(facts(), "left")
+        URArm(facts(), "left").close()
     go(arm, moved(start, x=0.01))
 
 
 def test_a_field_bus_that_holds_the_registers_is_busy_too(mock: MockUR) -> None:
     mock.door.claim(["input_int_register_0"])
     with pytest.raises(DeviceBusyError):
-        URArm(facts(), "left")
+        URArm(facts(), "left").close()
 
 
 # -- connecting ------------------------------------------------------------------------------------------------------
@@ -746,7 +746,7 @@ def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
         host = OTHER  # nobody listens there
     begun = time.monotonic()
     with pytest.raises(DeviceNotConnectedError):
-        URArm(facts(host), "left", timeout=3.0)
+        URArm(facts(host), "left", timeout=3.0).close()
     assert time.monotonic() - begun < 3.0 + PATIENCE
     assert longest_gap() < 1.0  # the library would have blocked them until the end
     assert leftovers("left") == []
@@ -757,19 +757,19 @@ def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
 
 def test_the_wrong_model_does_not_connect(mock: MockUR) -> None:
     with pytest.raises(DeviceNotConnectedError, match="arm 'left' is a UR5, but its file says model: ur10e"):
-        URArm(facts().model_copy(update={"model": "ur10e"}), "left")
+        URArm(facts().model_copy(update={"model": "ur10e"}), "left").close()
 
 
 def test_mock_and_real_are_never_mistaken(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DeviceNotConnectedError, match="outside this machine"):
-        URArm(facts("192.0.2.7"), "left")
+        URArm(facts("192.0.2.7"), "left").close()
     for host in (HOST, "localhost", "127.0.0.1", "::1"):
         with pytest.raises(DeviceNotConnectedError, match="is this machine"):
-            URArm(facts(host, mock=None), "left")
+            URArm(facts(host, mock=None), "left").close()
     assert MOCK_SERIAL  # a mock that is reached under another address gives itself away
     monkeypatch.setattr(ur, "_check_host", lambda *_: None)
     with pytest.raises(DeviceNotConnectedError, match="is a mock controller"):
-        URArm(facts(mock=None), "left")
+        URArm(facts(mock=None), "left").close()
 
 
 # -- closing ---------------------------------------------------------------------------------------------------------
@@ -847,7 +847,7 @@ def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(URArm, "_start", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        URArm(facts(), "left", timeout=PATIENCE)
+        URArm(facts(), "left", timeout=PATIENCE).close()
     assert workers[0].poll() is not None
     assert leftovers("left") == []
 

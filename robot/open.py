@@ -138,6 +138,7 @@ def _open_sim(facts: RigFacts) -> Rig:
     from calibration.normaliser import for_simulated
     from tacsim.physics.world import make_world
     from tacsim.sensor import SimArm, SimClock, SimStart
+    from tacsim.threads import at_once
 
     scene = facts.scene
     if scene is None:
@@ -172,6 +173,7 @@ def _open_sim(facts: RigFacts) -> Rig:
         start=SimStart(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
+        gather=at_once,
         watch=_gel_watch(facts, sensors),
     )
 

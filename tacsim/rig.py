@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Protocol, Self
 
 from tacsim.interface import (
@@ -22,6 +23,7 @@ from tacsim.interface import (
     Truth,
 )
 from tacsim.limits import check_action
+from tacsim.threads import one_by_one
 
 
 class Start(Protocol):
@@ -47,6 +49,7 @@ class Rig:
         truth: the body as only a simulation knows it; None on rigs without.
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
         read_timeout: how long to wait for a frame [s].
+        gather: how the sensors are read: one by one, or all at once where that is faster (tacsim.threads).
         beside: closes what the rig needs besides sensors and arms, after them.
         watch: looks at what is touched before anybody acts on it, and raises what ends the episode.
     """
@@ -63,6 +66,7 @@ class Rig:
         truth: Callable[[], Truth | None] | None = None,
         diagnostics: Callable[[], Mapping[str, float]] = dict,
         read_timeout: float = 1.0,
+        gather: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = one_by_one,
         beside: Callable[[], None] | None = None,
         watch: Callable[[Mapping[str, TactileObservation]], None] | None = None,
     ) -> None:
@@ -72,7 +76,7 @@ class Rig:
         self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
         self._normalisers, self._start, self._truth = dict(normalisers), start, truth
         self._diagnostics, self._timeout, self._beside = diagnostics, read_timeout, beside
-        self._watch = watch
+        self._gather, self._watch = gather, watch
         self._frames: Mapping[str, TactileFrame] = {}
         self._references: Mapping[str, TactileFrame] = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
@@ -125,7 +129,8 @@ class Rig:
 
         Raises TimeoutError without a frame, EndOfEpisode after a recording.
         """
-        frames = {name: sensor.read(self._timeout) for name, sensor in self._sensors.items()}
+        reads = [partial(sensor.read, self._timeout) for sensor in self._sensors.values()]
+        frames = dict(zip(self._sensors, self._gather(reads), strict=True))
         exposed = {self._sensors[name].spec.arm: frame.time for name, frame in frames.items()}
         arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self._arms.items()}
         now = self._clock.now()

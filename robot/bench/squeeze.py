@@ -14,6 +14,7 @@ from robot.bench.runner import Case
 from tacsim.interface import Pose
 from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.scene import Scene
+from tacsim.threads import at_once
 
 if TYPE_CHECKING:
     from tacsim.interface import FloatArray
@@ -149,8 +150,7 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
     def run() -> MoveStats:
         world.restore(begin)
         stats = close(world, STEP, flow=flow)
-        for name in world.sensors:
-            camera(world.surface(name))
+        at_once([partial(camera, world.surface(name)) for name in world.sensors])
         return stats
 
     timing, stats = timed(run, repeat)

@@ -94,7 +94,7 @@ class SurfaceTable:
         if block > 1:
             points = _fine(points, block, grid.shape)
             inside = np.ones(grid.shape, dtype=np.bool_) if inside.all() else self._on_gel(points)
-        seen = _look_up(values, points)
+        seen = look_up(values, points)
         if not inside.all():
             seen[~inside] = 0.0
         return seen, inside
@@ -104,7 +104,7 @@ class SurfaceTable:
         seen = _table_coordinates(self._surface.origin, self._pitch, grid)
         points, change = seen, seen
         for _ in range(FIXED_POINT_STEPS):
-            moved = seen - _look_up(self._lateral, points)
+            moved = seen - look_up(self._lateral, points)
             change = np.abs(moved - points)
             points = moved
             if float(change.max()) <= CONVERGED:
@@ -243,7 +243,7 @@ def _fine(coarse: Float32, block: int, shape: tuple[int, int]) -> Float32:
     return np.asarray(fine[block : block + shape[0], block : block + shape[1]], dtype=np.float32)
 
 
-def _look_up(field: Float32, points: Float32) -> Float32:
+def look_up(field: Float32, points: Float32) -> Float32:
     """`field` (rows, columns, n <= 4) at fractional columns and rows `points` (H, W, 2), linear between entries; beyond
     the border as on it. OpenCV rounds `points` to 1/32."""
     import cv2

@@ -6,7 +6,6 @@ that do not run. What comes out is the same bits with any team, hence its size i
 was faster lately.
 """
 
-import os
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 
 from tacsim.physics.lanes import PARTS
 from tacsim.runtime import ti
+from tacsim.threads import threads
 
 CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
 PROBE = 25  # launches between two tries of a size that may be slower
@@ -50,11 +50,6 @@ def shares(member, team):
     return (PARTS - member + team - 1) // team
 
 
-def cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class _Pace:
     """Seconds per unit of work of each team size, of late."""
 
@@ -85,11 +80,7 @@ def team_sizes(environments: int) -> tuple[int, ...]:
 
     Never more members in all than threads: one would wait for another that has none to run on.
     """
-    wanted = os.environ.get("TACSIM_THREADS", str(cores()))
-    if not wanted.isdecimal() or int(wanted) < 1:
-        raise ValueError(f"TACSIM_THREADS must be a whole number from 1 on, found '{wanted}'")
-    most = min(int(wanted), cores())
-    largest = max(1, min(most // environments, PARTS))
+    largest = max(1, min(threads() // environments, PARTS))
     return tuple(size for size in (1, 2, 4) if size <= largest)
 
 

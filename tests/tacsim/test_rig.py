@@ -115,6 +115,25 @@ def test_reset_takes_references_before_contact_and_observes_after() -> None:
     assert observation.tactile["finger"].image is rig.frames["finger"].image
 
 
+def test_sensors_are_read_the_way_they_are_gathered() -> None:
+    """Each sensor's frame stands under its own name, however the reads come about."""
+    upper, lower, seen = Parts(), Parts(), []
+
+    def last_first(reads: Any) -> Any:
+        seen.append(len(reads))
+        return [read() for read in reversed(reads)][::-1]
+
+    def dark(timeout: float) -> TactileFrame:
+        return lower.frame(3)
+
+    lower.read = dark  # type: ignore[method-assign]
+    rig = make_rig(upper, gather=last_first)
+    rig._sensors["thumb"], rig._normalisers["thumb"] = lower, lower
+    rig.observe()
+    assert seen == [2]
+    assert [rig.frames[name].image.max() for name in ("finger", "thumb")] == [7, 3]
+
+
 def test_step_commands_then_ticks_then_observes() -> None:
     parts = Parts()
     rig = make_rig(parts)

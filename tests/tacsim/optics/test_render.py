@@ -7,8 +7,16 @@ from pydantic import ValidationError
 
 from tacsim.optics.geometry import Light, Lighting, SensorGeometry, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid
-from tacsim.optics.render import Renderer, shade, texture_gradient
-from tacsim.optics.surface import sample_surface
+from tacsim.optics.render import (
+    STEEPEST,
+    Renderer,
+    light_at,
+    light_table,
+    shade,
+    texture_gradient,
+    unlit_image,
+)
+from tacsim.optics.surface import SurfaceTable, sample_surface
 from tests.tacsim.optics.surfaces import dent, flat
 
 GEL = (20e-3, 20e-3)
@@ -64,6 +72,31 @@ def test_shading_is_phongs_formula() -> None:
             mirrored = max((2 * lit * normal - towards) @ view, 0.0)
             expected += np.array(light.colour) * (light.diffuse * lit + light.specular * mirrored**lighting.shininess)
         np.testing.assert_allclose(colour, expected, atol=2e-6)
+
+
+def test_light_that_is_looked_up_is_within_half_a_grey_level() -> None:
+    slopes = np.random.default_rng(2).uniform(-STEEPEST, STEEPEST, (300, 300, 2)).astype(np.float32)
+    slopes[0, :4] = [(STEEPEST, STEEPEST), (-STEEPEST, STEEPEST), (STEEPEST, -STEEPEST), (-STEEPEST, -STEEPEST)]
+    slopes[1:100] *= 0.05
+    for lighting in (SMOOTH.lighting, Lighting(lights=SMOOTH.lighting.lights[:1], shininess=40.0)):
+        table = light_table(lighting)
+        assert table is not None
+        error = light_at(table, slopes) - shade(slopes, lighting, white=255.0)
+        assert np.abs(error).max() < 0.6  # half a level, and the look-up's own rounding
+        assert np.sqrt(np.mean(error**2)) < 0.05
+
+
+@pytest.mark.parametrize(("shininess", "depth"), [(10.0, 5e-3), (900.0, 0.8e-3)])
+def test_steep_flanks_and_narrow_highlights_are_shaded_pixel_by_pixel(shininess: float, depth: float) -> None:
+    model = SMOOTH.model_copy(update={"lighting": Lighting(shininess=shininess)})
+    surface = dent(depth=depth)
+    steepest = np.abs(sample_surface(surface, image_grid(model.geometry)).gradient).max()
+    assert (steepest > STEEPEST) != (light_table(model.lighting) is None)  # one reason at a time
+    table = SurfaceTable(surface)
+    slopes, _ = table.seen(table.fields[..., 1:], image_grid(model.geometry), fine=False)
+    exact = 255.0 * unlit_image(model.lighting, slopes.shape[:2]) + shade(slopes, model.lighting, white=255.0)
+    image = Renderer(model, GEL)(surface)
+    assert np.abs(image - exact.clip(0.0, 255.0)).max() < 0.5 + 1e-3
 
 
 def test_order_of_lights_changes_no_bit() -> None:

@@ -6,7 +6,9 @@ that do not run. What comes out is the same bits with any team, hence its size i
 was faster lately.
 """
 
+import math
 import time
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,8 +19,8 @@ from tacsim.runtime import ti
 from tacsim.threads import threads
 
 CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
-PROBE = 25  # launches between two tries of a size that may be slower
-SMOOTH = 0.5  # weight of the newest time
+PROBE = 25  # most launches between two tries of a size that was slower
+LATELY = 2  # launches of one size, of which the faster counts: what disturbs a launch only makes it slower
 
 WHO = 1  # column of `sync`: the environment whose turn it is
 
@@ -51,25 +53,40 @@ def shares(member, team):
 
 
 class _Pace:
-    """Seconds per unit of work of each team size, of late."""
+    """Seconds per unit of work of each team size, of late.
+
+    A size that was slower is tried again after 1, 2, 4 ... launches: its tries may have met a moment in which another
+    program had the other processor, and then a size that is twice as fast should not wait long.
+    """
 
     def __init__(self, sizes: tuple[int, ...]) -> None:
         self.sizes = sizes
-        self.seconds: dict[int, float] = {}
+        self._lately = {size: deque[float](maxlen=LATELY) for size in sizes}
         self.launches = 0
+        self._pause = dict.fromkeys(sizes, 1)  # launches until the next try, should this one be slower
+        self._due = dict.fromkeys(sizes, 0)  # launch of the next try
 
     def choose(self) -> int:
-        """The first launch compiles and says nothing; then each size has its turn, twice; later the slower ones do."""
+        """The first launch compiles and says nothing; then each size has its turn, twice."""
         self.launches += 1
-        if self.launches <= 1 + 2 * len(self.sizes) or self.launches % PROBE == 0:
-            turn = self.launches if self.launches < PROBE else self.launches // PROBE
-            return self.sizes[turn % len(self.sizes)]
-        return min(self.sizes, key=lambda size: self.seconds[size])
+        if self.launches <= 1 + 2 * len(self.sizes):
+            return self.sizes[self.launches % len(self.sizes)]
+        fastest = self._fastest()
+        due = (size for size in self.sizes if size != fastest and self._due[size] <= self.launches)
+        return next(due, fastest)
 
     def note(self, size: int, seconds: float) -> None:
-        if self.launches > 1:
-            old = self.seconds.get(size, seconds)
-            self.seconds[size] = (1 - SMOOTH) * old + SMOOTH * seconds
+        if self.launches <= 1:
+            return
+        self._lately[size].append(seconds)
+        if size == self._fastest():
+            self._pause[size] = 1
+        else:
+            self._due[size] = self.launches + 1 + self._pause[size]
+            self._pause[size] = min(2 * self._pause[size], PROBE)
+
+    def _fastest(self) -> int:
+        return min(self.sizes, key=lambda size: min(self._lately[size], default=math.inf))
 
 
 _paces: dict[Any, _Pace] = {}

@@ -50,8 +50,30 @@ def test_the_launch_that_compiles_says_nothing_about_pace() -> None:
     for seconds in (100.0, 2.0, 1.0, 2.0, 1.0):
         size = pace.choose()
         pace.note(size, seconds if seconds == 100.0 else {1: 2.0, 2: 1.0}[size])
-    assert pace.choose() == 2
-    assert set(pace.seconds) == {1, 2} and max(pace.seconds.values()) < 3.0
+    assert run_paced(pace, {1: 2.0, 2: 1.0}, 20).count(2) >= 16
+
+
+def run_paced(pace: team._Pace, seconds: dict[int, float], launches: int) -> list[int]:
+    """Sizes of the next launches, which take so long."""
+    chosen = []
+    for _ in range(launches):
+        chosen.append(pace.choose())
+        pace.note(chosen[-1], seconds[chosen[-1]])
+    return chosen
+
+
+def test_a_size_that_was_slow_once_is_back_at_once() -> None:
+    pace = team._Pace((1, 2))
+    run_paced(pace, {1: 2.0, 2: 1.0}, 200)
+    run_paced(pace, {1: 2.0, 2: 8.0}, 5)  # another program had the other processor
+    assert run_paced(pace, {1: 2.0, 2: 1.0}, 20).count(2) >= 14
+
+
+def test_a_size_that_is_slow_is_tried_less_and_less_and_never_given_up() -> None:
+    pace = team._Pace((1, 2))
+    early, late = run_paced(pace, {1: 1.0, 2: 10.0}, 60), run_paced(pace, {1: 1.0, 2: 10.0}, 260)
+    assert early.count(2) < 10 and late.count(2) == 10
+    assert run_paced(pace, {1: 1.0, 2: 0.5}, 300)[-20:].count(2) >= 19  # the machine is free again
 
 
 def test_teams_fit_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,6 +25,7 @@ from tacsim.scene import Settling
 MM = 1e3
 PEAK = 1.875  # peak slope of the ramp over its mean
 RAMP = 2.0  # shortest motion, in times of the pressure wave through the gel
+SHORT = 0.5  # ways shorter than so many gel thicknesses go slower than they may, if what is pressed yields
 PIECE = 20  # substeps of one launch on the way
 FLOW = 1.25  # shortest step that flows, in the same times; longer by as much as its speed changes
 LOOK = 1.0  # time of the hold between two looks at the forces, in the same times
@@ -138,13 +139,22 @@ def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> flo
     return longest(np.array([way_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
 
 
-def plan(start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float) -> Path:
+def plan(
+    start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
+    yields: bool = False,
+) -> Path:  # fmt: skip
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than RAMP gel thicknesses [mm], since a
-    shorter jolt mostly makes the gel ring, and reaches its full speed within half of that."""
+    shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
+
+    What the stop writes into a body that `yields` grows with how hard it brakes, so short ways go slower: with the root
+    of their length, which is the same braking for all.
+    """
     look = math.ceil(LOOK * thickness / dt)
     length = longest_way(start, end, lever)
     if length == 0:
         return Path(start, end, 0, dt, look=look)
+    if yields:
+        mach *= min(1.0, math.sqrt(length / (SHORT * thickness)))
     lasting = max(PEAK * length / mach, RAMP * thickness)
     return Path(start, end, math.ceil(lasting / dt), dt, look=look, rise=RAMP * thickness / 2 / lasting)
 

@@ -50,6 +50,7 @@ class DrivenWorld(ABC):
 
     sensors: tuple[str, ...]
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
+    yields: bool  # what is pressed keeps what a hurried motion does to it
 
     scene: Scene
     _state: DrivenState
@@ -168,7 +169,7 @@ class DrivenWorld(ABC):
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
         mach, gel = self.scene.settling.mach, self._gel
-        return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness)
+        return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness, yields=self.yields)
 
     def _plan_on(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.settling.flow_mach, self._gel

@@ -130,6 +130,7 @@ class HybridWorld(DrivenWorld):
         self._state: HybridState = HybridState([scene]) if state is None else state
         self._index = index
         self._gel, self._body = self._state.gel[index], self._state.body[index]
+        self.yields = math.isfinite(scene.body.material.elastic_limit)
         height = float(extent(scene.body.geometry)[2])
         self._poses = {
             "lower": Pose(),

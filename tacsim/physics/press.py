@@ -170,6 +170,7 @@ class PressWorld(DrivenWorld):
 
     sensors = ("lower",)
     balanced = False
+    yields = False
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
         """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""

@@ -40,6 +40,22 @@ def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
     assert drive[:, 0, 4].sum(axis=0) * 0.4 == pytest.approx(end.position * 1e3, abs=1e-5)
 
 
+def test_short_ways_of_what_yields_brake_no_harder_than_long_ones() -> None:
+    """Half a gel thickness at full speed, and less the slower, with the same braking; the rest is not held back."""
+
+    def braking(millimetres: float, yields: bool) -> float:
+        end = Pose(np.array([0, 0, millimetres * 1e-3]))
+        path = plan([Pose()], [end], mach=0.05, dt=0.01, lever=10.0, thickness=4.0, yields=yields)
+        speed = path.drive(0, path.substeps)[:, 0, 4, 2].astype(float)
+        assert speed.max() <= 0.05 * 1.001
+        return speed.max() / (path.substeps * path.dt)
+
+    assert braking(2.0, yields=True) == pytest.approx(braking(2.0, yields=False))
+    for short in (0.1, 0.5, 1.0):
+        assert braking(short, yields=True) == pytest.approx(braking(2.0, yields=True), rel=1e-2)
+        assert braking(short, yields=False) > 1.9 * braking(short, yields=True)
+
+
 def test_refining_cuts_the_same_path_finer() -> None:
     path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     coarse, fine = path.drive(5, 9), replace(path, refine=4).drive(5, 9)

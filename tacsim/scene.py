@@ -144,7 +144,7 @@ class Indenter(Facts):
 class Settling(Facts):
     """The quasi-static controller: how fast motion is driven and when a state counts as settled."""
 
-    mach: Annotated[float, Field(gt=0, le=0.3)] = 0.03  # peak speed of driven motion / wave speed
+    mach: Annotated[float, Field(gt=0, le=0.3)] = 0.03  # peak speed of driven motion / wave speed; short ways: slower
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance and change of force per check, relative
     max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
     flow_mach: Annotated[float, Field(gt=0, le=0.3)] = 0.01  # speed of motions that flow into one another / wave speed

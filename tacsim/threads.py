@@ -32,7 +32,8 @@ def one_by_one(calls: Sequence[Callable[[], Result]]) -> list[Result]:
 
 def at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
     """The same, each call on a thread of its own as far as there are some: for long calculations outside the
-    interpreter's lock. When one fails the others are waited for, then the first failure, in their order, is raised."""
+    interpreter's lock, which don't come here themselves (they would wait for their own threads). When one fails the
+    others are waited for, then the first failure, in their order, is raised."""
     if len(calls) < 2 or threads() < 2:
         return one_by_one(calls)
     pool = _pool(os.getpid())

@@ -14,16 +14,12 @@ from tacsim.interface import Pose
 from tacsim.physics.controller import (
     Launch,
     Motion,
-    Path,
     Prepared,
     Reading,
     come_to_rest,
-    merged,
     move_and_settle,
     move_in_time,
     move_on,
-    plan,
-    plan_on,
     run,
 )
 from tacsim.physics.gel import MM, GelFacts, GelState, gel_surface
@@ -31,6 +27,7 @@ from tacsim.physics.health import retried
 from tacsim.physics.inertia import Inertia, plan_in_time
 from tacsim.physics.layout import FORCE
 from tacsim.physics.load import keep_loads, require_loads
+from tacsim.physics.path import Path, merged, plan, plan_on
 from tacsim.physics.world import MoveStats, Order, put_back, taken
 from tacsim.scene import GelSurface, Scene
 

@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import PEAK, Launch, Path, longest_way
+from tacsim.physics.controller import Launch
 from tacsim.physics.gel import MM, MPA, GelFacts
+from tacsim.physics.path import PEAK, Path, longest_way
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 

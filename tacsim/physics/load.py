@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import Launch, Motion, Path, Reading, move_and_settle
+from tacsim.physics.controller import Launch, Motion, Reading, move_and_settle
+from tacsim.physics.path import Path
 from tacsim.physics.world import MoveStats
 from tacsim.scene import Scene
 

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.controller import MM, Motion, Path, Reading, merged, move_and_settle, plan, run
+from tacsim.physics.controller import Motion, Reading, move_and_settle, run
 from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, require_room, retried
 from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
+from tacsim.physics.path import MM, Path, merged, plan
 from tacsim.physics.world import MoveStats, Order, put_back
 from tacsim.runtime import start
 from tacsim.sampling import body_points

@@ -20,7 +20,7 @@ Scalars = ti.types.ndarray(dtype=f32, ndim=1)
 Vectors = ti.types.ndarray(dtype=Vec3, ndim=1)
 Matrices = ti.types.ndarray(dtype=Mat3, ndim=1)
 Grid = ti.types.ndarray(dtype=Vec4, ndim=3)  # momentum, then velocity; mass
-Drive = ti.types.ndarray(dtype=f32, ndim=4)  # [substep, sensor, row, xyz] of tacsim.physics.controller.Path
+Drive = ti.types.ndarray(dtype=f32, ndim=4)  # [substep, sensor, row, xyz] of tacsim.physics.path.Path
 Table = ti.types.ndarray(dtype=f32, ndim=2)
 
 PAD = 2  # node planes behind each backing plane

@@ -11,8 +11,9 @@ import pytest
 
 from tacsim.interface import Pose
 from tacsim.physics import diagnosis, press
-from tacsim.physics.controller import Launch, Motion, Path, Reading, run
+from tacsim.physics.controller import Launch, Motion, Reading, run
 from tacsim.physics.health import RETRIES, Health, Place, SimulationDiverged, attempt, require_room, retried
+from tacsim.physics.path import Path
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import MoveStats, Order
 from tacsim.scene import Gel, Indenter, Scene, Sphere

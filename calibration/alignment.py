@@ -65,7 +65,8 @@ class Alignment:
             flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        return np.clip(np.asarray(seen, dtype=np.float32), 0.0, 255.0)  # it overshoots at edges
+        clipped: Float32 = np.clip(np.asarray(seen, dtype=np.float32), 0.0, 255.0)  # it overshoots at edges
+        return clipped
 
     def shifted(self, shift: tuple[float, float], said: str) -> Alignment:
         """The same, with A's pictures taken `shift` [px of B] farther on."""

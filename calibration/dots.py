@@ -78,7 +78,7 @@ class DotFinder:
         large[0] = False  # what is no blob
         good = large & compact
         where = np.flatnonzero(mask)
-        label = labels.ravel()[where]
+        label = labels.ravel()[where].astype(np.intp)
         weight = taken.ravel()[where].astype(np.float64) - level
         rows, columns = np.divmod(where, mask.shape[1])
         total = np.maximum(np.bincount(label, weight, count), 1e-12)

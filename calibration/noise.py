@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from tacsim.optics.geometry import CameraNoise
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Entry = TypeVar("Entry", bound=np.generic)
 
 TILE = 32  # pixels, each way; what is wider is drift, not noise
 DARK = 2  # at or below, a channel has lost its noise [grey levels]
@@ -76,16 +78,16 @@ def _tiles(one: Image, other: Image) -> Float64:
     lost = np.asarray((most >= SATURATED) | (least <= DARK))
     level = np.maximum(one.mean(axis=(0, 1)), 1.0)
     change = other.astype(np.float32) - one
-    planes = np.ascontiguousarray(np.moveaxis(change / level.astype(np.float32), -1, 0))
+    planes = np.ascontiguousarray(np.moveaxis(change / level.astype(np.float32), -1, 0), dtype=np.float32)
     find = DriftFinder((one.shape[0], one.shape[1]))
     find.remove(planes, find(planes, lost))
-    change = np.moveaxis(planes, 0, -1) * level
+    still = np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64)
     size = min(TILE, *one.shape[:2])
-    tiles = _cut(change, size)[~_cut(lost[..., None], size).any(axis=(1, 2, 3))]
+    tiles = _cut(still, size)[~_cut(lost[..., None], size).any(axis=(1, 2, 3))]
     return np.asarray(tiles - tiles.mean(axis=(1, 2), keepdims=True), dtype=np.float64)
 
 
-def _cut(picture: NDArray[np.generic], size: int) -> NDArray[np.generic]:
+def _cut(picture: NDArray[Entry], size: int) -> NDArray[Entry]:
     """(n, size, size, channels) of (H, W, channels); what is left over at the right and lower border is dropped."""
     rows, columns, channels = picture.shape[0] // size, picture.shape[1] // size, picture.shape[2]
     whole = picture[: rows * size, : columns * size].reshape(rows, size, columns, size, channels)

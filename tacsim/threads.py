@@ -26,14 +26,14 @@ def threads() -> int:
 
 
 def one_by_one(calls: Sequence[Callable[[], Result]]) -> list[Result]:
-    """What the calls return."""
+    """What the calls return; the first that fails is the last that is called."""
     return [call() for call in calls]
 
 
 def at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
-    """The same, each call on a thread of its own as far as there are some: for long calculations outside the
-    interpreter's lock, which don't come here themselves (they would wait for their own threads). When one fails the
-    others are waited for, then the first failure, in their order, is raised."""
+    """What the calls return, each called on a thread of its own as far as there are some: for long calculations that
+    release the interpreter's lock. None of them may call this itself: it could wait for its own thread for ever. When
+    one fails the others are waited for, then the first failure, in their order, is raised."""
     if len(calls) < 2 or threads() < 2:
         return one_by_one(calls)
     pool = _pool(os.getpid())

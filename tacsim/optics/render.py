@@ -7,7 +7,7 @@ Camera and lights stand behind the gel, on its -z side. There a surface pressed 
 
 and shows ``ambient + sum over lights of colour * (diffuse * n.l + specular * (r.v)^shininess)`` with the light's
 direction l, the mirrored ray r = 2 (n.l) n - l and the view v = (0, 0, -1); no shadows. Light follows from the slope
-alone, so pictures look it up in a table over slopes: in half the time, and less than half a grey level off. A dent is a
+alone, so pictures look it up in a table over slopes: in half the time, and half a grey level off at most. A dent is a
 bump to this camera: its right flank (dh/dx < 0) faces a light on the right (+x) and takes that colour.
 """
 

@@ -20,6 +20,9 @@ PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
 # particle spacing and gel element size [m] of each preset
 PRESETS = {"draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3)}
+# Peak Mach number of motions between states of rest: what a tolerance asks for and what the elastic strain at yield
+# allows, within bounds (docs/decisions/0002).
+MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST, FASTEST = 3.0, 1.5, 0.001, 0.03
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
@@ -142,10 +145,10 @@ class Indenter(Facts):
 
 
 class Settling(Facts):
-    """The quasi-static controller: how fast motion is driven and when a state counts as settled."""
+    """The quasi-static controller: how exact a state of rest is wanted, and how long it may take."""
 
-    mach: Annotated[float, Field(gt=0, le=0.3)] = 0.03  # peak speed of driven motion / wave speed; short ways: slower
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance and change of force per check, relative
+    mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # peak speed / wave speed; None: see Scene.peak_mach
     max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
     flow_mach: Annotated[float, Field(gt=0, le=0.3)] = 0.01  # speed of motions that flow into one another / wave speed
 
@@ -204,6 +207,22 @@ class Scene(Facts):
     @property
     def sensors(self) -> tuple[str, ...]:
         return ("lower", "upper") if self.indenter is None else ("lower",)
+
+    @property
+    def peak_mach(self) -> float:
+        """Peak speed of a motion between states of rest, over the wave speed; short ways go slower (physics.path).
+
+        A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
+        tolerance, and with the body's elastic strain at yield: its density is scaled with its stiffness, and so is what
+        a motion costs in stress. Elastic scenes come to the same rest from any speed.
+        """
+        settling = self.settling
+        if settling.mach is not None:
+            return settling.mach
+        limit = math.inf if self.body is None else self.body.material.elastic_limit
+        if not math.isfinite(limit):
+            return FASTEST
+        return min(max(min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRAIN * limit), SLOWEST), FASTEST)
 
     @property
     def spacing(self) -> float:

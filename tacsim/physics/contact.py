@@ -7,15 +7,16 @@ holds nothing.
 """
 
 from tacsim.physics.gel import skin_at
-from tacsim.physics.lanes import ON_DEVICE, add_four, note_more, note_most, slot_of, vec3, vec4
+from tacsim.physics.lanes import ON_DEVICE, add_four, note_more, note_most, slot_of, vec2, vec3, vec4
 from tacsim.physics.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
 from tacsim.runtime import ti
 
-vec2 = ti.types.vector(2, ti.f32)
+Kept = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
 
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
 MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
+SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
 
 
 @ti.func
@@ -52,22 +53,43 @@ def skin_sum(skin: ti.template(), row, i, j, wx, wy, ny):
 
 
 @ti.func
-def displacement_at(skin: ti.template(), row, a, ny):
-    i, wx, _ = spline(a[0])
-    j, wy, _ = spline(a[1])
-    return skin_sum(skin, row, i, j, wx, wy, ny)
+def skin_sums(skin: ti.template(), row, i, j, wx, wy, dx, dy, ny):
+    """The same sum, with the weights' derivatives by x, and by y."""
+    if ti.static(ON_DEVICE):
+        return (
+            skin_sum(skin, row, i, j, wx, wy, ny),
+            skin_sum(skin, row, i, j, dx, wy, ny),
+            skin_sum(skin, row, i, j, wx, dy, ny),
+        )
+    else:
+        sums = ti.Matrix.zero(ti.f32, 3, 4)
+        for c in range(4):
+            value, by_x, by_y = 0.0, 0.0, 0.0
+            for p in ti.static(range(3)):
+                first, second, third = [skin[skin_at(row + i + p + 1, j + q + 1, ny) + c] for q in range(3)]
+                line = wy[0] * first + wy[1] * second + wy[2] * third
+                value += wx[p] * line
+                by_x += dx[p] * line
+                by_y += wx[p] * (dy[0] * first + dy[1] * second + dy[2] * third)
+            sums[0, c], sums[1, c], sums[2, c] = value, by_x, by_y
+        return (
+            vec4([sums[0, c] for c in range(4)]),
+            vec4([sums[1, c] for c in range(4)]),
+            vec4([sums[2, c] for c in range(4)]),
+        )
 
 
 @ti.func
-def material_point(skin: ti.template(), row, x, h, nx, ny):
-    """Lattice coordinates a of the surface point now under (x, y): three fixed-point steps of a h + u(a) = x."""
-    start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)
-    a = start
-    us = vec4(0.0)
-    for _ in range(3):
-        us = displacement_at(skin, row, vec2(ti.max(0.0, ti.min(a[0], nx)), ti.max(0.0, ti.min(a[1], ny))), ny)
-        a = start - vec2(us[0], us[1]) / h
-    return a, us
+def newton_step(t1, t2, miss):
+    """Way in lattice coordinates to where the surface lies under a point; miss: how far it is away in them, unmoved.
+
+    t1, t2: tangents of the surface. One that is folded has no inverse: then the step is that of an unmoved surface.
+    """
+    det = t1[0] * t2[1] - t1[1] * t2[0]
+    step = miss
+    if det > SMALLEST_AREA:
+        step = vec2(t2[1] * miss[0] - t2[0] * miss[1], t1[0] * miss[1] - t1[1] * miss[0]) / det
+    return step
 
 
 @ti.func
@@ -132,19 +154,26 @@ def particle_contact(
     force = vec3(0.0)
     slip = vec3(memory[0], memory[1], memory[2])
     taken = memory[3]
+    moved = vec2(0.0)
     overlap = 0.0
     reach = 2.2 * 0.5 * h
     c_n = CONTACT_DAMPING * k_n * dt
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
-        a, us = material_point(skin, row, x, h, nx, ny)
+        start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved
+        last = start - vec2(memory[4], memory[5]) / h
+        a = vec2(ti.max(0.0, ti.min(last[0], nx)), ti.max(0.0, ti.min(last[1], ny)))
+        i, wx, dx = spline(a[0])
+        j, wy, dy = spline(a[1])
+        us, t1, t2 = skin_sums(skin, row, i, j, wx, wy, dx / h, dy / h, ny)
+        t1[0] += 1.0
+        t2[1] += 1.0
+        step = newton_step(t1, t2, start - a - vec2(us[0], us[1]) / h)
+        a += step
+        moved = h * (start - a)
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
-            depth = us[2] + radius - x[2]
+            depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
             if depth + taken > 0.0:
-                i, wx, dx = spline(a[0])
-                j, wy, dy = spline(a[1])
-                t1 = vec4(1.0, 0.0, 0.0, 0.0) + skin_sum(skin, row, i, j, dx / h, wy, ny)
-                t2 = vec4(0.0, 1.0, 0.0, 0.0) + skin_sum(skin, row, i, j, wx, dy / h, ny)
                 vs = skin_sum(skin, row + nx + 3, i, j, wx, wy, ny)
                 n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
@@ -176,8 +205,8 @@ def particle_contact(
                 force = fn * n + ft
                 touching, housed = True, True
                 overlap = gap
-    kept = vec4(0.0)
+    kept = Kept([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
     if touching:
-        kept = vec4(slip[0], slip[1], slip[2], taken)
+        kept = Kept([slip[0], slip[1], slip[2], taken, moved[0], moved[1]])
         note_most(partial, env, slot_of(part), OVERLAP, overlap)
     return touching, housed, force, kept

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tacsim.physics.contact import Kept
 from tacsim.physics.element import ROWS, SMALLEST, element_block
 from tacsim.physics.gel import (
     Corners,
@@ -278,7 +279,7 @@ def run_hybrid(
     particles = mirror.sent("known", known, ti.f32)
     mass = mirror.room("masses", strip, masses.shape[:-1])
     velocity = mirror.room("velocities", strip, velocities.shape[:-1])
-    kept = mirror.sent("memory", memory, vec4)
+    kept = mirror.sent("memory", memory, Kept)
     numbers = (
         mirror.sent("facts", facts, ti.f32), mirror.sent("counts", counts, ti.i32),
         mirror.sent("partial", partial, ti.f32),

@@ -165,7 +165,7 @@ class DrivenWorld(ABC):
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
-        mach, gel = self.scene.settling.mach, self._gel
+        mach, gel = self.scene.peak_mach, self._gel
         return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness, yields=self.yields)
 
     def _plan_on(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:

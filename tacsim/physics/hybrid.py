@@ -7,6 +7,7 @@ import numpy as np
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.body_surface import surface_points, tangent_planes
+from tacsim.physics.contact import Kept
 from tacsim.physics.controller import Launch, Prepared, Reading, force_floor
 from tacsim.physics.device import Mirror, run_hybrid
 from tacsim.physics.driven import DrivenWorld
@@ -73,7 +74,7 @@ class HybridState:
         self.body = [body for body, _, _ in placed]
         self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
-        self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), 4), np.float32)
+        self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), Kept.n), np.float32)
         self.facts = np.zeros((len(scenes), FACTS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
@@ -138,7 +139,8 @@ class HybridWorld(DrivenWorld):
         }
         self._rates = np.zeros((2, 6))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
-        self._speed = scene.settling.mach  # fastest particle seen in the last launch
+        self._mach = scene.peak_mach
+        self._speed = self._mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
         self._pull = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
@@ -228,7 +230,7 @@ class HybridWorld(DrivenWorld):
         weight = float(np.linalg.norm(state.facts[index, GRAVITY : GRAVITY + 3]))
         fall = float(state.facts[index, LIGHTNESS]) * weight * span
         drive = path.drive(launch.first, launch.last)
-        driven = max(self.scene.settling.mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
+        driven = max(self._mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
         margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
         where = path.place(self._poses, launch.first, launch.last)
         x = state.particles.x(index)

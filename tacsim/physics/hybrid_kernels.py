@@ -1,6 +1,6 @@
 """Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
 
-from tacsim.physics.contact import contact_ceiling, particle_contact, support_radius
+from tacsim.physics.contact import Kept, contact_ceiling, particle_contact, support_radius
 from tacsim.physics.gel import (
     Corners,
     Lattice,
@@ -26,7 +26,6 @@ from tacsim.physics.lanes import (
     slot_of,
     strip,
     vec3,
-    vec4,
 )
 from tacsim.physics.layout import (
     BODY_CELL,
@@ -66,7 +65,7 @@ from tacsim.physics.transfers import (
 from tacsim.runtime import ti
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
-ContactMemory = ti.types.ndarray(dtype=vec4, ndim=3)
+ContactMemory = ti.types.ndarray(dtype=Kept, ndim=3)
 
 
 @ti.func
@@ -221,7 +220,7 @@ def touch_gel(
                 if housed:
                     on_housing -= force
         elif away < 2.5 * spacing:  # nothing passes this margin in one substep, so what is beyond has forgotten
-            memory[env, g, p] = vec4(0.0)
+            memory[env, g, p] = Kept(0.0)
     slot = slot_of(part)
     for d in ti.static(range(3)):
         note_sum(partial, env, slot, FORCE + 6 * g + d, total[d])

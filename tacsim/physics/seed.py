@@ -95,6 +95,7 @@ class SeedWorld:
             raise ValueError("physics 'seed' has no gravity (use 'hybrid', or set gravity to [0, 0, 0])")
         start(cpu_only="physics 'seed'")
         self.scene = scene
+        self._mach = scene.peak_mach
         h = scene.spacing * MM
         self._dx, self._dt = CELL * h, COURANT * CELL * h
         self._lattice = gel_lattice(scene.gel, scene.spacing)
@@ -215,7 +216,7 @@ class SeedWorld:
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
-        path = plan(start, end, self.scene.settling.mach, self._dt, lever, self.scene.gel.size[2] * MM)
+        path = plan(start, end, self._mach, self._dt, lever, self.scene.gel.size[2] * MM)
         return replace(path, substeps=max(path.substeps, GENTLE) if path.substeps else 0, look=LOOK)
 
     def _upright(self, name: str, pose: Pose) -> Pose:
@@ -286,7 +287,7 @@ class SeedWorld:
         if len(body):
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
-        margin = MARGIN * self._dx + 2 * self.scene.settling.mach * (last - first) * self._dt
+        margin = MARGIN * self._dx + 2 * self._mach * (last - first) * self._dt
         room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
         require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
         layers = self._fit_layers(faces)

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from tacsim.optics.geometry import CanonicalGrid
-from tacsim.scene import Body, BodyMaterial, Box, GelMaterial, Indenter, Scene, Sphere
+from tacsim.scene import Body, BodyMaterial, Box, GelMaterial, Indenter, Scene, Settling, Sphere
 
 
 @pytest.mark.parametrize(
@@ -94,3 +94,26 @@ def test_gravity_is_read_with_its_unit_and_needs_a_body_that_can_fall() -> None:
         Scene(body=None, indenter=Indenter(), gravity=(0.0, 0.0, -9.81))
     with pytest.raises(ValidationError, match="gravity"):
         Scene(gravity=(0.0, 0.0, -1e9))
+
+
+def clay(modulus: float, yield_stress: float | None = 30e3) -> Body:
+    return Body(material=BodyMaterial(youngs_modulus=modulus, yield_stress=yield_stress))
+
+
+def test_a_smaller_tolerance_goes_slower_within_bounds() -> None:
+    speeds = [Scene(body=clay(0.5e6), settling=Settling(tolerance=t)).peak_mach for t in (1e-1, 1e-2, 3e-3, 1e-5)]
+    assert speeds == pytest.approx([0.03, 0.03, 0.009, 0.001])
+
+
+def test_what_yields_at_a_small_strain_goes_slower() -> None:
+    soft, stiff = clay(0.5e6), clay(10e6)
+    assert Scene(body=soft).peak_mach == 0.03
+    assert Scene(body=stiff).peak_mach == pytest.approx(1.5 * stiff.material.elastic_limit)
+    assert Scene(body=clay(1e12)).peak_mach == 0.001
+
+
+def test_what_keeps_nothing_of_its_way_is_never_slowed_down_nor_is_who_gives_a_speed() -> None:
+    exact = Settling(tolerance=1e-4)
+    assert Scene(body=clay(1e9, None), settling=exact).peak_mach == 0.03
+    assert Scene(body=None, indenter=Indenter(geometry=Sphere(radius=1e-3)), settling=exact).peak_mach == 0.03
+    assert Scene(body=clay(1e9), settling=Settling(mach=0.05)).peak_mach == 0.05

@@ -35,6 +35,7 @@ class Reading:
 
     moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
     load: external force on the body besides contact, world axes; None is none.
+    torque: of all contact on a free body about its centre, world axes, over half the gel's width [N].
     """
 
     contact: NDArray[np.float64]  # (gels, 3)
@@ -44,12 +45,14 @@ class Reading:
     guard_hits: int
     moment: NDArray[np.float64] | None = None  # (gels, 3)
     load: NDArray[np.float64] | None = None  # (3,) of the body from elsewhere: its weight
+    torque: NDArray[np.float64] | None = None  # (3,)
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
-    """Largest force imbalance, or change of force or moment since `before`, relative to the largest force [-].
+    """Largest imbalance of forces or moments, or their change since `before`, relative to the largest force [-].
 
-    `balanced`: the contact forces on all gels must add up to the body's load: zero without weight (a free body).
+    `balanced`: the contact forces on all gels must add up to the body's load, zero without weight (a free body), and
+    turn it nowhere.
     """
     scale = max(float(np.abs(now.contact).max()), now.floor)
     parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
@@ -58,6 +61,8 @@ def residual(now: Reading, before: Reading, balanced: bool) -> float:
     if balanced:
         load = 0.0 if now.load is None else now.load
         parts.append(np.abs(now.contact.sum(axis=0) - load).max())
+        if now.torque is not None:
+            parts.append(np.abs(now.torque).max())
     return float(max(parts)) / scale
 
 

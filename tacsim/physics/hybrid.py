@@ -249,13 +249,16 @@ class HybridWorld(DrivenWorld):
         partial = self._state.partial[self._index]
         health = judged(self.arrays(), prepared.good, Health.read(partial), prepared.where)
         self._speed = health.fastest
-        rotations = prepared.drive[-1, :, :3]
+        rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
         backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)  # which holds the housing too
         backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
+        centre = np.mean(self._state.particles.x(self._index), axis=0, dtype=np.float64)
+        torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
+        lever = max(self._gel.half)
         return Reading(
-            contact, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half), self._weight
+            contact, backing, self._floor, health.overlap, health.capped, moment / lever, self._weight, torque / lever
         )

@@ -88,6 +88,17 @@ def test_a_smaller_tolerance_makes_the_whole_path_more_exact() -> None:
     assert abs(forces[1] - 2.588) < 0.5 * abs(forces[0] - 2.588)
 
 
+def test_a_twist_rests_only_once_both_sensors_feel_the_same_torque() -> None:
+    w = world()
+    squeeze(w, 1.0e-3)
+    turned = Rotation.from_rotvec([0, 0, np.radians(15)]) * Rotation.from_quat(w.pose("upper").quaternion)
+    stats = w.move({"upper": Pose(w.pose("upper").position, turned.as_quat())})
+    assert stats.settled
+    about = [w.wrench("lower")[5], w.wrench("upper")[5]]  # the upper one's z axis points down
+    assert abs(about[0]) > 1e-4
+    assert abs(about[0] - about[1]) <= w.scene.settling.tolerance * -w.wrench("lower")[2] * 0.01  # half the gel's width
+
+
 def test_a_stiff_body_is_not_flattened_by_its_scaled_inertia() -> None:
     """The stiffer, the heavier it is scaled, at the same yield stress; 3.79 mm at Mach 0.001, 3.67 at 0.03."""
     stiff = CLAY.model_copy(update={"youngs_modulus": 10e6})

@@ -40,7 +40,6 @@ SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a part
 FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
 MARGIN = 3  # [cells] of grid round the particles
 TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
-ELASTIC = 1e30  # elastic limit of a body that does not yield
 HALF_TURN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of the upper sensor at yaw 0
 
 MPA = 1e-6  # Pa -> MPa
@@ -70,6 +69,7 @@ def gel_lattice(gel: Gel, spacing: float) -> Lattice:
 
 def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
     """Kernel constants of a material for particles of `volume` [mm^3]; density lambda + 2 mu makes the wave speed 1."""
+    from tacsim.physics.material import ELASTIC
     from tacsim.physics.seed_kernels import Solid
 
     mu, lam = (modulus * MPA for modulus in lame(material))

@@ -7,6 +7,7 @@ Units: mm, N, MPa; densities are scaled so that the pressure wave speed is 1, he
 All particles lie in one array: lower gel, upper gel, body. Loops are serial and adds are plain: bitwise repeatable.
 """
 
+from tacsim.physics.material import ELASTIC, full, stress_near, vec6
 from tacsim.runtime import ti
 
 f32 = ti.f32
@@ -35,7 +36,7 @@ class Solid:
     volume: f32
     mu: f32
     lam: f32
-    limit: f32  # |dev e|_F at yield, sigma_y / (2 mu); huge for an elastic body
+    limit: f32  # |dev e|_F at yield, sigma_y / (2 mu); ELASTIC for a body that never yields
 
 
 @ti.dataclass
@@ -156,6 +157,31 @@ def return_mapping(F, solid):
 
 
 @ti.func
+def finger_strain(F):
+    """F F^T - I as 6 numbers, from F - I: small strains keep their digits."""
+    d = F
+    for a in ti.static(range(3)):
+        d[a, a] -= 1.0
+    e = d + d.transpose() + d @ d.transpose()
+    return vec6(e[0, 0], e[1, 1], e[2, 2], e[0, 1], e[0, 2], e[1, 2])
+
+
+@ti.func
+def body_law(F, solid):
+    """Elastic F and Kirchhoff stress of the body; one that never yields needs no return, and up to a strain of some 0.2
+    no singular values either (tacsim.physics.material)."""
+    elastic = F
+    tau = Mat3(0.0)
+    far = 1
+    if solid.limit >= ELASTIC:
+        near, far = stress_near(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
+        tau = full(near)
+    if far != 0:
+        elastic, tau = return_mapping(F, solid)
+    return elastic, tau
+
+
+@ti.func
 def neo_hookean(F, solid):
     """Kirchhoff stress of the gel, mu (F F^T - I) + lambda ln J I."""
     tau = solid.mu * (F @ F.transpose())
@@ -264,7 +290,7 @@ def grid_to_particle(
                 stress[p] = neo_hookean(trial, gel)
                 health[0] = ti.min(health[0], trial.determinant())
             else:
-                elastic, tau = return_mapping(trial, body)
+                elastic, tau = body_law(trial, body)
                 F[p] = elastic
                 stress[p] = tau
             health[2] = ti.min(health[2], update.determinant())
@@ -353,9 +379,9 @@ def advance(
 
 @ti.kernel
 def map_back(F: Matrices, stress: Matrices, body: Solid):
-    """The return mapping alone: trial F -> elastic F and Kirchhoff stress."""
+    """The body's law alone: trial F -> elastic F and Kirchhoff stress."""
     ti.loop_config(serialize=True)
     for p in range(F.shape[0]):
-        elastic, tau = return_mapping(F[p], body)
+        elastic, tau = body_law(F[p], body)
         F[p] = elastic
         stress[p] = tau

@@ -7,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from tacsim.interface import Pose
 from tacsim.physics import seed
 from tacsim.physics.health import SimulationDiverged
-from tacsim.physics.seed import HALF_TURN, SeedWorld, solid
+from tacsim.physics.seed import HALF_TURN, SeedWorld
 from tacsim.physics.world import World
-from tacsim.runtime import start
 from tacsim.scene import Body, BodyMaterial, Box, Gel, Scene, Settling
 
 pytestmark = pytest.mark.cpu
@@ -53,35 +52,6 @@ def pressed(squeezed):
     world, state = squeezed
     world.restore(state)
     return world
-
-
-def test_return_mapping_is_that_of_a_float64_svd():
-    start()
-    from tacsim.physics.seed_kernels import map_back
-
-    rng, n = np.random.default_rng(0), 2000
-    u, v = (Rotation.random(n, random_state=seed_).as_matrix() for seed_ in (1, 2))
-    trial = (u * np.exp(rng.normal(size=(n, 1, 3)) * rng.choice([1e-3, 0.02, 0.1, 0.4], (n, 1, 1)))) @ v
-    law = solid(CLAY, 1.0)
-    f, tau = trial.astype(np.float32), np.zeros((n, 3, 3), np.float32)
-    map_back(f, tau, law)
-
-    u, s, vt = np.linalg.svd(trial)
-    e = np.log(s)
-    mean = e.mean(axis=1, keepdims=True)
-    dev = e - mean
-    norm = np.linalg.norm(dev, axis=1, keepdims=True)
-    returned = dev * np.minimum(1, CLAY.elastic_limit / norm)
-    stress = 2 * law.mu * returned + (2 * law.mu + 3 * law.lam) * mean
-    np.testing.assert_allclose(f, (u * np.exp(returned + mean)[:, None]) @ vt, atol=1e-5)
-    np.testing.assert_allclose(tau, (u * stress[:, None]) @ u.swapaxes(1, 2), atol=1e-5)
-    yields = norm[:, 0] > CLAY.elastic_limit
-    assert 0.2 < yields.mean() < 0.8
-    deviator = tau - np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
-    np.testing.assert_allclose(
-        np.linalg.norm(deviator[yields], axis=(1, 2)), 2 * law.mu * CLAY.elastic_limit, rtol=1e-3
-    )
-    np.testing.assert_allclose(f[~yields], trial[~yields], atol=1e-7)
 
 
 def test_a_free_body_keeps_its_momentum(monkeypatch):

@@ -5,6 +5,7 @@ Where physics has a known weakness, the test says so and asserts what comes out 
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,6 +41,17 @@ def keeps(least: float, most: float) -> Callable[[Facts], bool]:
 
 def still(f: Facts) -> bool:
     return f["drift"] == 0.0 and f["force"] == 0.0 and f["residual"] == 0.0
+
+
+def released(f: Facts, force: float, dent: float) -> bool:
+    """After the third move sensors are free of force, up to `force` [N], and gels flat, up to `dent` [m]."""
+    return f["force 3"] <= force and f["dent 3"] <= dent
+
+
+def sliding_torque(force: float, friction: float, side: float) -> float:
+    """mu F times the mean distance of a square's points from its middle, (sqrt 2 + asinh 1) / 6 of its side: what an
+    even pressure bears when all of a face slides [N m]."""
+    return friction * force * side * (math.sqrt(2) + math.asinh(1)) / 6
 
 
 # What must come out, by case and physics: a judgement of the facts of a finite end, or a text of the error.
@@ -105,9 +117,29 @@ EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
     "indenter through the gel": {"press": "of the wave speed"},
     "body over the rim": {"hybrid": balanced, "seed": balanced},
     "body over the rim, no housing": {"hybrid": balanced},
-    "release and grasp again": {"hybrid": balanced, "seed": balanced},
-    "twist": {"hybrid": balanced, "seed": balanced},
-    "twist, press": {"press": lambda f: f["settled"] == 1 and f["overlap"] < 50e-6},
+    # In between, nothing is left of the first grasp but what has flown; then it is met again.
+    "release and grasp again": {
+        "hybrid": lambda f: (
+            balanced(f) and released(f, 0.0, 1e-6) and f["force"] == pytest.approx(f["force 2"], rel=0.015)
+        ),
+        # Known weakness: a third more, after the grid has got other layers while the sensors parted.
+        "seed": lambda f: balanced(f) and released(f, 1e-3, 20e-6) and 1.0 < f["force"] / f["force 2"] < 1.5,
+    },
+    # 60 degrees: it slides, and bears what friction can.
+    "twist": {
+        "hybrid": lambda f: (
+            balanced(f)
+            and f["torque"] == pytest.approx(sliding_torque(f["force"], 0.6, 4e-3), rel=0.1)
+            and f["upper torque"] == pytest.approx(f["torque"], rel=0.02)  # opposite in world, and so are the z axes
+        ),
+        "seed": lambda f: balanced(f) and f["torque"] > 1e-4,  # it knows no friction: the gels stick
+    },
+    # More than a flat face bears: edges and corners plough.
+    "twist, press": {
+        "press": lambda f: (
+            f["settled"] == 1 and f["overlap"] < 50e-6 and 1 < f["torque"] / sliding_torque(f["force"], 0.6, 4e-3) < 2
+        )
+    },
     "unstressed rest": {"hybrid": still},
     "unstressed rest, short": {"seed": still},
     "unstressed rest, press": {"press": still},

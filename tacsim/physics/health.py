@@ -27,11 +27,12 @@ SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned
 SMALLEST_STEP_VOLUME = 0.1  # det(I + dt C) of a particle in one substep
 FASTEST = 0.5  # speed of a particle or gel node / wave speed
 RETRIES = 2  # each halves the time step
-LARGEST_GRID = 20_000_000  # nodes, 16 bytes each
+LARGEST_GRID = 20_000_000  # nodes of one environment; 80 bytes each on a CPU, in four copies
 
 State = Mapping[str, NDArray[Any]]
 ADVICE = "move less far or slower, or use a finer preset"
 NEW_WORLD = "restore a snapshot, or make a new world"
+NO_ROOM = "restore a snapshot in which its particles are together; worlds of a smaller batch have more room each"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,13 +238,15 @@ def _dump(world: Driven, order: Order, before: State, failure: SimulationDiverge
         failure.no_dump = f"no dump could be written to {folder}: {error}"
 
 
-def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place) -> None:
-    """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] that would have too many nodes."""
+def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place, most: int = LARGEST_GRID) -> None:
+    """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] with more nodes than `most`, what there is
+    memory for, or LARGEST_GRID."""
+    most = min(most, LARGEST_GRID)
     counts = (np.asarray(high, np.float64) - np.asarray(low, np.float64)) / cell + 1
-    if not float(np.prod(counts)) <= LARGEST_GRID:
+    if not float(np.prod(counts)) <= most:
         size = " x ".join(f"{length:.4g}" for length in (counts - 1) * cell)
         raise SimulationDiverged(
-            f"particles spread over {size} mm, which needs a grid of {np.prod(counts):.3g} nodes "
-            f"(limit {LARGEST_GRID:.3g})",
+            f"particles spread over {size} mm, which needs a grid of {np.prod(counts):.3g} nodes (limit {most:.3g})",
             str(where),
+            NO_ROOM,
         )

@@ -11,7 +11,7 @@ from tacsim.physics.controller import Launch, Prepared, Reading, force_floor
 from tacsim.physics.device import Mirror, run_hybrid
 from tacsim.physics.driven import DrivenWorld
 from tacsim.physics.gel import MM, MPA, GelState, gel_facts, one_lattice
-from tacsim.physics.health import Health, copies, judged, require_room
+from tacsim.physics.health import NO_ROOM, Health, SimulationDiverged, copies, judged, require_room
 from tacsim.physics.hybrid_kernels import substeps
 from tacsim.physics.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.lanes import ON_DEVICE, PARTS
@@ -38,6 +38,7 @@ from tacsim.physics.layout import (
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.plasticine import (
+    BORDER,
     BodyFacts,
     BodyState,
     body_facts,
@@ -233,8 +234,14 @@ class HybridWorld(DrivenWorld):
         where = path.place(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
         low, high = bounds(x)
-        require_room(low - margin, high + margin, self._body.cell, where)
-        state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
+        reach = margin + BORDER / 2 * self._body.cell
+        require_room(low - reach, high + reach, self._body.cell, where, state.particles.most)
+        try:
+            state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
+        except MemoryError as error:
+            raise SimulationDiverged(
+                f"no memory for the grid round the particles ({error})", str(where), NO_ROOM
+            ) from None
         good = copies(self.arrays())
         state.facts[index, STEP] = path.step
         state.facts[index, CENTRE : CENTRE + 3] = [column.mean(dtype=np.float64) for column in x.T]

@@ -128,9 +128,10 @@ class DrivenWorld(ABC):
         Edges along their directions at rest are quickly looked at; only should they be too short, elements are.
         """
         step = float(self._state.facts[self._index, STEP])
-        shortest = self._state.gels.shortest(self._index, self._gel.spacing)
-        if shortest * LARGEST_COURANT < step:
-            shortest = shortest_element(self.arrays(), self._gel.thickness)
+        with np.errstate(all="ignore"):  # what is not finite is told by others
+            shortest = self._state.gels.shortest(self._index, self._gel.spacing)
+            if shortest * LARGEST_COURANT < step:
+                shortest = shortest_element(self.arrays(), self._gel.thickness)
         return step / max(shortest, 1e-6 * self._gel.spacing)
 
     def _damping(self) -> float:

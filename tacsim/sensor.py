@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -92,19 +92,12 @@ class SimClock:
         self.version += 1
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How the last move went (see tacsim.physics.world.MoveStats), and how many targets the limits shortened."""
+        """How the last move went, all of tacsim.physics.world.MoveStats, and how many targets the limits shortened."""
         stats = self.stats
         if stats is None:
             return {}
-        return {
-            "substeps": float(stats.substeps),
-            "residual": stats.residual,
-            "settled": float(stats.settled),
-            "overlap": stats.overlap,
-            "guard_hits": float(stats.guard_hits),
-            "retries": float(stats.retries),
-            "shortened": float(sum(self._limited.values())),
-        }
+        told = {name: float(value) for name, value in asdict(stats).items()}
+        return told | {"shortened": float(sum(self._limited.values()))}
 
 
 class SimArm:

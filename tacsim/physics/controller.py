@@ -30,6 +30,15 @@ def force_floor(modulus: float, thickness: float) -> float:
 
 
 @dataclass(frozen=True)
+class Scheme:
+    """By which numbers a launch was advanced."""
+
+    step: float = 0.0  # time step [mm, wave speed 1]
+    damping: float = 0.0  # of the gel: its rate times the wave's time through it [-]
+    courant: float = 0.0  # see tacsim.physics.health.Health
+
+
+@dataclass(frozen=True)
 class Reading:
     """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
 
@@ -46,6 +55,8 @@ class Reading:
     moment: NDArray[np.float64] | None = None  # (gels, 3)
     load: NDArray[np.float64] | None = None  # (3,) of the body from elsewhere: its weight
     torque: NDArray[np.float64] | None = None  # (3,)
+    scheme: Scheme = Scheme()
+    gel_overlap: float = 0.0  # of the gels with one another [mm]
 
 
 def residual(now: Reading, before: Reading, balanced: bool) -> float:
@@ -209,4 +220,10 @@ def _driven(path: Path) -> Generator[Launch, Reading, list[Reading]]:
 def _stats(seen: Sequence[Reading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
     overlap = seen[-1].overlap / MM if seen else 0.0
     hits = sum(reading.guard_hits for reading in seen)
-    return MoveStats(substeps + held, held, worst, worst <= settling.tolerance, overlap, hits)
+    last = seen[-1].scheme if seen else Scheme()
+    return MoveStats(
+        substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
+        time_step=last.step / MM, damping=last.damping,
+        courant=max((reading.scheme.courant for reading in seen), default=0.0),
+        gel_overlap=seen[-1].gel_overlap / MM if seen else 0.0,
+    )  # fmt: skip

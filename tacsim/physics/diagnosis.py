@@ -86,19 +86,30 @@ def element_volumes(state: State, thickness: float) -> Floats | None:
     """(gels, nx, ny, nz) volume ratio at the centres of the gels' elements; `thickness` of a gel [mm]."""
     if "gel_displacement" not in state:
         return None
+    with np.errstate(all="ignore"):
+        return _determinant(_element_gradients(state, thickness))
+
+
+def shortest_element(state: State, thickness: float) -> float:
+    """The shortest gel element, along x, y or z of the lattice through its centre [mm]; `thickness` of a gel [mm]."""
+    h = thickness / (state["gel_displacement"].shape[3] - 1)
+    return float(h * np.sqrt((_element_gradients(state, thickness) ** 2).sum(axis=0)).min())
+
+
+def _element_gradients(state: State, thickness: float) -> Floats:
+    """(3, 3, gels, nx, ny, nz) deformation gradients at the elements' centres."""
     u = state["gel_displacement"].astype(np.float64)
     h = thickness / (u.shape[3] - 1)
-    with np.errstate(all="ignore"):
-        columns = []
-        for axis in (1, 2, 3):
-            step = np.diff(u, axis=axis) / h
-            for other in (1, 2, 3):
-                if other != axis:
-                    first, last = (np.take(step, range(a, step.shape[other] - 1 + a), axis=other) for a in (0, 1))
-                    step = (first + last) / 2
-            columns.append(step)
-        f = np.moveaxis(np.stack(columns, axis=-1), (-2, -1), (0, 1)) + np.eye(3)[:, :, None, None, None, None]
-        return _determinant(f)
+    columns = []
+    for axis in (1, 2, 3):
+        step = np.diff(u, axis=axis) / h
+        for other in (1, 2, 3):
+            if other != axis:
+                first, last = (np.take(step, range(a, step.shape[other] - 1 + a), axis=other) for a in (0, 1))
+                step = (first + last) / 2
+        columns.append(step)
+    f: Floats = np.moveaxis(np.stack(columns, axis=-1), (-2, -1), (0, 1)) + np.eye(3)[:, :, None, None, None, None]
+    return f
 
 
 def _determinant(f: Floats | tuple[Floats, Floats, Floats]) -> Floats:

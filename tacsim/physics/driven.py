@@ -22,10 +22,11 @@ from tacsim.physics.controller import (
     move_on,
     run,
 )
+from tacsim.physics.diagnosis import shortest_element
 from tacsim.physics.gel import MM, GelFacts, GelState, gel_surface
-from tacsim.physics.health import retried
+from tacsim.physics.health import LARGEST_COURANT, retried
 from tacsim.physics.inertia import Inertia, plan_in_time
-from tacsim.physics.layout import FORCE
+from tacsim.physics.layout import FORCE, GEL_DAMPING, STEP
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import Path, merged, plan, plan_on
 from tacsim.physics.world import MoveStats, Order, put_back, taken
@@ -120,6 +121,22 @@ class DrivenWorld(ABC):
         if inertia is not self._inertia:
             self._stop()
             self._take(inertia)
+
+    def _courant(self) -> float:
+        """The time step over the time of the pressure wave through the most squeezed gel element [-].
+
+        Edges along their directions at rest are quickly looked at; only should they be too short, elements are.
+        """
+        step = float(self._state.facts[self._index, STEP])
+        with np.errstate(all="ignore"):  # what is not finite is told by others
+            shortest = self._state.gels.shortest(self._index, self._gel.spacing)
+            if shortest * LARGEST_COURANT < step:
+                shortest = shortest_element(self.arrays(), self._gel.thickness)
+        return step / max(shortest, 1e-6 * self._gel.spacing)
+
+    def _damping(self) -> float:
+        """Of the gel in the last launch: its rate times the wave's time through it [-]."""
+        return float(self._state.facts[self._index, GEL_DAMPING]) * self._gel.thickness
 
     # ----------------------------------------------------------------- motion
 

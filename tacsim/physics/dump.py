@@ -32,7 +32,7 @@ from tacsim.scene import Mesh, Scene, Shape
 if TYPE_CHECKING:
     from tacsim.physics.health import SimulationDiverged
 
-FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it
+FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it, or where it is empty
 MOST_DUMPS = 20  # in one folder; training that diverges again and again must not fill the disk
 MOST_JSON = 1_000_000  # bytes
 MOST_ARRAYS = 100
@@ -110,11 +110,14 @@ def dumps_in(folder: Path) -> Iterator[None]:
 @contextmanager
 def no_dumps() -> Iterator[None]:
     """No motion is dumped, whatever TACSIM_DUMPS says."""
-    given = os.environ.pop(FOLDER, None)
+    given = os.environ.get(FOLDER)
+    os.environ[FOLDER] = ""
     try:
         yield
     finally:
-        if given is not None:
+        if given is None:
+            del os.environ[FOLDER]
+        else:
             os.environ[FOLDER] = given
 
 

@@ -174,6 +174,14 @@ class GelState:
         """Force on the nodes in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
         return self._view(2)
 
+    def shortest(self, environment: int, spacing: float) -> float:
+        """The shortest edge of an element [mm], each along its direction at rest, so one that has turned seems shorter
+        than it is; NaN if a displacement is."""
+        nx1, ny1 = self._shape
+        flat = self.nodes[environment, :, 0, :, :, : nx1 * ny1]
+        u = flat.reshape(*flat.shape[:-1], nx1, ny1)  # gel, axis, layer, i, j
+        return spacing + min(float(np.diff(u[:, axis], axis=along).min()) for axis, along in ((0, 2), (1, 3), (2, 1)))
+
     def refresh(self) -> None:
         """The skin from the nodes, and zeros behind the last node: before a launch, since nodes may have been written.
 

@@ -26,12 +26,14 @@ SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element, elastic volume ratio of 
 SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned inside out
 SMALLEST_STEP_VOLUME = 0.1  # det(I + dt C) of a particle in one substep
 FASTEST = 0.5  # speed of a particle or gel node / wave speed
+LARGEST_COURANT = 1.0  # time step / time of the pressure wave through the smallest cell or most squeezed element
 RETRIES = 2  # each halves the time step
-LARGEST_GRID = 20_000_000  # nodes, 16 bytes each
+LARGEST_GRID = 20_000_000  # nodes of one environment; 80 bytes each on a CPU, in four copies
 
 State = Mapping[str, NDArray[Any]]
 ADVICE = "move less far or slower, or use a finer preset"
 NEW_WORLD = "restore a snapshot, or make a new world"
+NO_ROOM = "restore a snapshot in which its particles are together; worlds of a smaller batch have more room each"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +55,10 @@ class SimulationDiverged(RuntimeError):
     its kernels saw. `dump`: the folder that `tacsim debug` reads, if one was written.
     """
 
-    def __init__(self, cause: str, where: str, advice: str = ADVICE) -> None:
+    def __init__(self, cause: str, where: str, advice: str = ADVICE, *, retry: bool = True) -> None:
+        """retry: a smaller time step might do better."""
         super().__init__(cause, where, advice)
+        self.retry = retry
         self.cause, self.where, self.advice = cause, where, advice
         self.place = ""  # of the worst entry: which particle or node, where [mm]
         self.quantity: diagnosis.Quantity = "not finite"  # by which the worst entry is found
@@ -64,7 +68,7 @@ class SimulationDiverged(RuntimeError):
         self.health: Health | None = None
         self.refine = 1  # the step was cut into so many at the last attempt
         self.dump: Path | None = None
-        self.no_dump = ""  # why there is none, though one was asked for
+        self.no_dump = ""  # why there is none
 
     def __str__(self) -> str:
         steps = f"even with 1/{self.refine} of the time step; " if self.refine > 1 else ""
@@ -85,6 +89,7 @@ class Health:
     fastest: float  # particles
     capped: int  # contact overlaps cut to the largest allowed
     overlap: float  # of the last substep [mm]
+    courant: float = 0.0  # time step / time of the pressure wave through the most squeezed element or grid cell [-]
 
     @staticmethod
     def clear(partial: NDArray[np.float32]) -> None:
@@ -93,13 +98,13 @@ class Health:
         partial[..., [layout.OFF_GRID, layout.FASTEST, layout.CAPPED, layout.OVERLAP]] = 0.0
 
     @classmethod
-    def read(cls, partial: NDArray[np.float32]) -> Health:
+    def read(cls, partial: NDArray[np.float32], courant: float = 0.0) -> Health:
         """Of all parts of one environment (PARTS, NUMBERS); NaN in any of them stays NaN."""
         least, most, total = partial.min(axis=0), partial.max(axis=0), partial.sum(axis=0)
         counts = [int(total[i]) if math.isfinite(total[i]) else -1 for i in (layout.OFF_GRID, layout.CAPPED)]
         return cls(
             float(least[layout.SMALLEST_VOLUME]), counts[0], float(least[layout.SMALLEST_STEP_VOLUME]),
-            float(most[layout.FASTEST]), counts[1], float(most[layout.OVERLAP]),
+            float(most[layout.FASTEST]), counts[1], float(most[layout.OVERLAP]), courant,
         )  # fmt: skip
 
     def complaint(self) -> tuple[str, diagnosis.Quantity] | None:
@@ -112,6 +117,11 @@ class Health:
             return f"a particle moves at {self.fastest:.3g} of the wave speed (limit {FASTEST})", "speed"
         if self.off_grid:
             return f"particles left the grid ({self.off_grid} particle substeps)", "speed"
+        if self.courant > LARGEST_COURANT:
+            words = (
+                f"the time step is {self.courant:.3g} of what the pressure wave takes through the most squeezed element"
+            )
+            return f"{words} (limit {LARGEST_COURANT:g})", "corner"
         return None
 
 
@@ -196,6 +206,8 @@ def retried(
             except SimulationDiverged as diverged:
                 failure, failure.refine = diverged, 2**retry
                 world.restore(before)
+                if not diverged.retry:
+                    break
             except BaseException:
                 world.restore(before)
                 raise
@@ -227,6 +239,8 @@ def _poses(world: Driven) -> dict[str, Pose]:
 def _dump(world: Driven, order: Order, before: State, failure: SimulationDiverged) -> None:
     """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
     folder = os.environ.get("TACSIM_DUMPS")
+    if folder is None:
+        failure.no_dump = "set TACSIM_DUMPS to a folder to keep a replayable state"
     if not folder:
         return
     from tacsim.physics import dump
@@ -237,13 +251,15 @@ def _dump(world: Driven, order: Order, before: State, failure: SimulationDiverge
         failure.no_dump = f"no dump could be written to {folder}: {error}"
 
 
-def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place) -> None:
-    """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] that would have too many nodes."""
+def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place, most: int = LARGEST_GRID) -> None:
+    """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] with more nodes than `most`, what there is
+    memory for, or LARGEST_GRID."""
+    most = min(most, LARGEST_GRID)
     counts = (np.asarray(high, np.float64) - np.asarray(low, np.float64)) / cell + 1
-    if not float(np.prod(counts)) <= LARGEST_GRID:
+    if not float(np.prod(counts)) <= most:
         size = " x ".join(f"{length:.4g}" for length in (counts - 1) * cell)
         raise SimulationDiverged(
-            f"particles spread over {size} mm, which needs a grid of {np.prod(counts):.3g} nodes "
-            f"(limit {LARGEST_GRID:.3g})",
+            f"particles spread over {size} mm, which needs a grid of {np.prod(counts):.3g} nodes (limit {most:.3g})",
             str(where),
+            NO_ROOM,
         )

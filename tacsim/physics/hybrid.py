@@ -8,11 +8,12 @@ import numpy as np
 from tacsim.interface import Pose, Truth
 from tacsim.physics.body_surface import surface_points, tangent_planes
 from tacsim.physics.contact import Kept
-from tacsim.physics.controller import Launch, Prepared, Reading, force_floor
+from tacsim.physics.controller import Launch, Prepared, Reading, Scheme, force_floor
 from tacsim.physics.device import Mirror, run_hybrid
 from tacsim.physics.driven import DrivenWorld
+from tacsim.physics.facing import gel_overlap
 from tacsim.physics.gel import MM, MPA, GelState, gel_facts, one_lattice
-from tacsim.physics.health import Health, copies, judged, require_room
+from tacsim.physics.health import NO_ROOM, Health, SimulationDiverged, copies, judged, require_room
 from tacsim.physics.hybrid_kernels import substeps
 from tacsim.physics.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.lanes import ON_DEVICE, PARTS
@@ -39,6 +40,7 @@ from tacsim.physics.layout import (
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.plasticine import (
+    BORDER,
     BodyFacts,
     BodyState,
     body_facts,
@@ -56,6 +58,7 @@ COURANT = 0.5
 # Damping on the way falsifies the path, since the gels give way and the body spreads; damping of the hold does not.
 ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0  # zeta in alpha = zeta c / thickness, while anything is driven and while held
 ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
+GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
 
@@ -198,6 +201,12 @@ class HybridWorld(DrivenWorld):
         for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
             moving[...] = 0.0
 
+    def _courant(self) -> float:
+        """Of gels and body; the body's grid does not shrink with it."""
+        facts = self._state.facts[self._index]
+        wave = math.sqrt(self._body.particle_mass / facts[BODY_MASS])  # the speed of the body's pressure wave
+        return max(super()._courant(), float(facts[STEP]) * wave / self._body.cell)
+
     # ------------------------------------------------------------------ state
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -235,8 +244,14 @@ class HybridWorld(DrivenWorld):
         where = path.place(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
         low, high = bounds(x)
-        require_room(low - margin, high + margin, self._body.cell, where)
-        state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
+        reach = margin + BORDER / 2 * self._body.cell
+        require_room(low - reach, high + reach, self._body.cell, where, state.particles.most)
+        try:
+            state.particles.fit(index, self._body.cell, margin, state.facts, state.counts)
+        except MemoryError as error:
+            raise SimulationDiverged(
+                f"no memory for the grid round the particles ({error})", str(where), NO_ROOM
+            ) from None
         good = copies(self.arrays())
         state.facts[index, STEP] = path.step
         state.facts[index, CENTRE : CENTRE + 3] = [column.mean(dtype=np.float64) for column in x.T]
@@ -247,7 +262,7 @@ class HybridWorld(DrivenWorld):
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
-        health = judged(self.arrays(), prepared.good, Health.read(partial), prepared.where)
+        health = judged(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
         self._speed = health.fastest
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
@@ -259,6 +274,23 @@ class HybridWorld(DrivenWorld):
         centre = np.mean(self._state.particles.x(self._index), axis=0, dtype=np.float64)
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
+        meeting = self._gel_overlap(prepared)
         return Reading(
-            contact, backing, self._floor, health.overlap, health.capped, moment / lever, self._weight, torque / lever
-        )
+            contact, backing, self._floor, health.overlap, health.capped + (meeting > 0.0),
+            moment / lever, self._weight, torque / lever,
+            Scheme(prepared.launch.path.step, self._damping(), health.courant), meeting,
+        )  # fmt: skip
+
+    def _gel_overlap(self, prepared: Prepared) -> float:
+        """Of the two gels with one another, which they do not feel [mm]. Raises SimulationDiverged for too much."""
+        last = prepared.drive[-1].astype(np.float64)
+        found = gel_overlap(self._gel, self._state.gels.u[self._index, :, :, :, -1], last[:, :3], last[:, 3])
+        most = GEL_OVERLAP * self._gel.thickness
+        if found > most:
+            failure = SimulationDiverged(
+                f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",
+                str(prepared.where), "keep the sensors further apart, or use physics 'seed'", retry=False,
+            )  # fmt: skip
+            failure.good, failure.failed, failure.poses = prepared.good, copies(self.arrays()), prepared.where.poses
+            raise failure
+        return found

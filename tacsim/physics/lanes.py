@@ -50,7 +50,9 @@ def aligned_zeros(*shape: int) -> np.ndarray:
     """
     count = math.prod(shape)
     if count > MOST:
-        raise MemoryError(f"an array of {count} numbers; kernels count to {MOST}")
+        raise MemoryError(
+            f"an array of {count:,} numbers, kernels count to {MOST:,}: use a coarser preset, or fewer worlds a batch"
+        )
     memory = np.zeros(count + CACHE_LINE, np.float32)
     start = -memory.ctypes.data // 4 % CACHE_LINE
     return memory[start : start + count].reshape(shape)

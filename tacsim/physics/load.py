@@ -135,9 +135,9 @@ def keep_loads(
         yield from go(piece / pieces)
     off = yield from correct(1.0)
     last = done[-1]
-    return MoveStats(
-        sum(s.substeps for s in done), sum(s.hold for s in done), last.residual, last.settled, last.overlap,
-        sum(s.guard_hits for s in done), load_error=off,
+    return replace(
+        last, substeps=sum(s.substeps for s in done), hold=sum(s.hold for s in done),
+        guard_hits=sum(s.guard_hits for s in done), load_error=off, courant=max(s.courant for s in done),
     )  # fmt: skip
 
 

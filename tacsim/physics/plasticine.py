@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.physics.gel import MM, MPA
-from tacsim.physics.lanes import CACHE_LINE, COPIES, LANES, NODES, aligned_zeros, padded
+from tacsim.physics.lanes import CACHE_LINE, COPIES, LANES, MOST, NODES, aligned_zeros, padded
 from tacsim.physics.layout import (
     AFFINE,
     BODY_BULK,
@@ -35,6 +35,8 @@ from tacsim.physics.layout import (
 )
 from tacsim.physics.material import ELASTIC
 from tacsim.scene import BodyMaterial, lame
+
+BORDER = 8  # [cells] that a grid is longer than its particles and their margin reach, at most
 
 
 @dataclass(frozen=True)
@@ -126,11 +128,19 @@ class BodyState:
         """Equivalent plastic strains, (n,), a view."""
         return self._rows(environment, FLOW, 1).reshape(-1)
 
+    @property
+    def most(self) -> int:
+        """Grid nodes that each environment may have: its share of what kernels can count, in all copies."""
+        return MOST // (4 * COPIES * len(self.known))
+
     def fit(self, environment: int, cell: float, margin: float, facts: np.ndarray, counts: np.ndarray) -> None:
         """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
 
         margin [mm]: what they may move during the launch. Writes origin, node counts and the parts' slabs of node
         planes into `facts` and `counts` (tacsim.physics.layout).
+
+        The memory of all environments grows if this one needs more; what stands in it lasts no longer than a substep.
+        Raises MemoryError, with that memory as it was, where there is none.
         """
         x = self.x(environment)
         origin, shape = fit_grid(x, cell, margin)
@@ -147,9 +157,10 @@ class BodyState:
         # three planes for what particles off the grid would add
         strips = (shape[0] + 3) * shape[1] * shape[2] // NODES
         if self.masses.shape[2] < strips:
-            strips = strips * 5 // 4  # a body that spreads asks for more again and again
-            self.masses = aligned_zeros(*self.masses.shape[:2], strips, 4 * NODES)
-            self.velocities = aligned_zeros(len(self.masses), strips, 4 * NODES)
+            # a body that spreads asks for more again and again
+            room = max(strips, min(strips * 5 // 4, self.most // NODES))
+            masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
+            self.masses, self.velocities = masses, aligned_zeros(len(masses), room, 4 * NODES)
         counts[:, STRIDE], counts[:, CAPACITY] = self.known.shape[2], self.masses.shape[2]
 
     def arguments(self) -> tuple[np.ndarray, ...]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tacsim.interface import Pose
-from tacsim.physics.controller import Launch, Prepared, Reading, force_floor
+from tacsim.physics.controller import Launch, Prepared, Reading, Scheme, force_floor
 from tacsim.physics.device import Mirror, run_press
 from tacsim.physics.driven import DrivenWorld
 from tacsim.physics.gel import (
@@ -221,11 +221,14 @@ class PressWorld(DrivenWorld):
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
-        health = judged(self.arrays(), prepared.good, Health.read(partial), prepared.where)
+        health = judged(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
-        return Reading(force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))
+        return Reading(
+            force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
+            scheme=Scheme(prepared.launch.path.step, self._damping(), health.courant),
+        )  # fmt: skip
 
 
 def _distance_facts(scene: Scene) -> tuple[int, tuple[float, ...], np.ndarray, tuple[float, ...], float]:

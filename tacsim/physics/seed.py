@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
-from tacsim.physics.controller import Motion, Reading, move_and_settle, run
+from tacsim.physics.controller import Motion, Reading, Scheme, move_and_settle, run
 from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, require_room, retried
 from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
@@ -252,15 +252,18 @@ class SeedWorld:
         def launch() -> Health:
             health = np.zeros((1, NUMBERS), np.float32)
             Health.clear(health)
-            self._launch(path.drive(first, last), path.step, x0, y0, health[0])
-            return Health.read(health)
+            drive = path.drive(first, last)
+            self._launch(drive, path.step, x0, y0, health[0])
+            return Health.read(health, path.step / self._smallest_cell(drive))
 
-        attempt(self.arrays(), launch, where)
+        health = attempt(self.arrays(), launch, where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
             raise SimulationDiverged("every particle of the body left the grid", str(where), "move slower, or less far")
-        return Reading(backing + self._gain, backing, self._floor, self._overlap(path, last), left)
+        scheme = Scheme(path.step, GEL_DAMPING, health.courant)
+        overlap = self._overlap(path, last)
+        return Reading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
 
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance
@@ -313,6 +316,11 @@ class SeedWorld:
                 self._layers[:] = max(round(float(room[-1])), 1), 1.0
             self._layers[1] = min(self._layers[1], room[-1] / self._layers[0])
         return int(self._layers[0])
+
+    def _smallest_cell(self, drive: Float32) -> float:
+        """Shortest edge of a grid cell in a launch along `drive` [mm]: the grid is squeezed with what lies in it."""
+        room = float((drive[:, 1, 3, 2] - drive[:, 0, 3, 2]).min()) + 2 * self.scene.gel.size[2] * MM
+        return min(self._dx, room / float(self._layers[0]))
 
     def _overlap(self, path: Path, last: int) -> float:
         """Deepest body particle below the nearest column of a gel; half a spacing lies outside the particles [mm]."""

@@ -22,9 +22,13 @@ class MoveStats:
     residual: float  # largest relative force imbalance or force change at the end [-]
     settled: bool  # residual <= the scene's tolerance
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
-    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped)
+    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped) or met gels in one another
     retries: int = 0  # times the motion was begun anew with half the time step
     load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
+    time_step: float = 0.0  # as the way of the gel's pressure wave in it; of the last substep [m]
+    damping: float = 0.0  # of the gel in the last substep: its rate times the wave's time through the gel [-]
+    gel_overlap: float = 0.0  # deepest overlap of the two gels with one another at the end, which they do not feel [m]
+    courant: float = 0.0  # largest time step / time of the wave through the most squeezed element or grid cell [-]
 
 
 @dataclass(frozen=True, slots=True)

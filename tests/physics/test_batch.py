@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
+from tacsim.physics import plasticine
 from tacsim.physics.batch import Batch
-from tacsim.physics.health import RETRIES, SimulationDiverged
+from tacsim.physics.health import LARGEST_GRID, RETRIES, SimulationDiverged
 from tacsim.physics.hybrid import HybridWorld
+from tacsim.physics.lanes import COPIES, MOST
 from tacsim.physics.load import LoadNotReached
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import MoveStats, World, make_world
@@ -171,6 +173,53 @@ def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
     alone = HybridWorld(SCENES[1])
     assert alone.move(closed(alone, 0.4e-3)) == stats
     assert_same([fresh.worlds[1]], [alone])
+
+
+def out_of_room(ends: Sequence[Any], batch: Batch, before: list[dict[str, bytes]], lost: int) -> SimulationDiverged:
+    """The failure of environment `lost`, which is as before; all others end as worlds alone, to the bit."""
+    for index, (world, scene) in enumerate(zip(batch.worlds, [SCENES[0]] * 4, strict=True)):
+        if index == lost:
+            assert state(world) == before[index]
+        else:
+            alone = HybridWorld(scene)
+            assert ends[index] == alone.move(closed(alone, 0.3e-3))
+            assert_same([world], [alone])
+    failure = ends[lost]
+    assert isinstance(failure, SimulationDiverged), failure
+    return failure
+
+
+@pytest.mark.cpu
+def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
+    """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
+    batch = Batch(SCENES[:1] * 4)
+    most = batch._state.particles.most
+    assert most < LARGEST_GRID and 4 * COPIES * 4 * most <= MOST
+    way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
+    batch.worlds[1].arrays()["position"][-1] += [way, way, way]
+    before = [state(world) for world in batch.worlds]
+    failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 1)
+    for words in ("spread over", "nodes (limit", "substeps 0 to", "restore a snapshot"):
+        assert words in str(failure)
+
+
+@pytest.mark.cpu
+def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = Batch(SCENES[:1] * 4)
+    zeros = plasticine.aligned_zeros
+
+    def scarce(*shape: int) -> np.ndarray:
+        if shape[0] == 4 and len(shape) == 3 and shape[1] > 20_000:
+            raise MemoryError("Unable to allocate")
+        return zeros(*shape)
+
+    monkeypatch.setattr(plasticine, "aligned_zeros", scarce)  # the second array of the two that grow
+    batch.worlds[2].arrays()["position"][-1] += [0.0, 400.0, 0.0]
+    before = [state(world) for world in batch.worlds]
+    failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 2)
+    assert "no memory for the grid round the particles (Unable to allocate)" in str(failure)
+    grid = batch._state.particles
+    assert grid.masses.shape[2] == grid.velocities.shape[1]
 
 
 def test_loads_are_held_each_its_own_and_one_out_of_reach_is_told(fresh: Batch) -> None:

@@ -61,6 +61,7 @@ def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest
     monkeypatch.delenv(dump.FOLDER, raising=False)
     failure = press_through(PressWorld(SCENE))
     assert failure.dump is None and "tacsim debug" not in str(failure)
+    assert str(failure).endswith("; set TACSIM_DUMPS to a folder to keep a replayable state")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -69,7 +70,7 @@ def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, mon
     with dumps_in(tmp_path / "theirs"):
         assert os.environ[dump.FOLDER] == str(tmp_path / "mine")
         with no_dumps():
-            assert dump.FOLDER not in os.environ
+            assert os.environ[dump.FOLDER] == ""
     assert os.environ[dump.FOLDER] == str(tmp_path / "mine")
     monkeypatch.delenv(dump.FOLDER)
     with dumps_in(tmp_path / "theirs"):

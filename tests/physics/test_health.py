@@ -8,16 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics import diagnosis, press
+from tacsim.physics import diagnosis, health, press
 from tacsim.physics.controller import Launch, Motion, Reading, run
-from tacsim.physics.health import RETRIES, Health, Place, SimulationDiverged, attempt, require_room, retried
+from tacsim.physics.health import (
+    LARGEST_COURANT,
+    RETRIES,
+    Health,
+    Place,
+    SimulationDiverged,
+    attempt,
+    require_room,
+    retried,
+)
 from tacsim.physics.path import Path
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import MoveStats, Order
-from tacsim.scene import Gel, Indenter, Scene, Sphere
+from tacsim.scene import Gel, Indenter, Scene, Settling, Sphere
 
+BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3, 10e-3, 4e-3)))
 STILL = Path([Pose()], [Pose()], substeps=0, dt=0.4)
 REST = Reading(np.zeros((1, 3)), np.zeros((1, 3)), 1.0, 0.0, 0)
 STATS = MoveStats(10, 5, 0.001, True, 0.0, 0)
@@ -78,6 +89,10 @@ def nothing(arrays: dict[str, np.ndarray]) -> None:
         (Health(1.0, 0, 0.05, 0.0, 0, 0.0), "lost its volume in one substep"),
         (Health(1.0, 0, 1.0, 0.7, 0, 0.0), "0.7 of the wave speed (limit 0.5)"),
         (Health(1.0, 3, 1.0, 0.0, 0, 0.0), "left the grid (3 particle substeps)"),
+        (
+            Health(1.0, 0, 1.0, 0.0, 0, 0.0, 1.2),
+            "1.2 of what the pressure wave takes through the most squeezed element",
+        ),
     ],
 )
 def test_what_the_kernels_saw_is_judged(seen: Health, words: str) -> None:
@@ -221,9 +236,7 @@ def test_a_place_tells_where_the_frames_are() -> None:
 
 def test_a_press_with_too_long_a_step_comes_out_right_by_retrying(monkeypatch: pytest.MonkeyPatch) -> None:
     def pressed() -> tuple[float, int]:
-        world = PressWorld(
-            Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3,) * 2 + (4e-3,)))
-        )
+        world = PressWorld(BALL)
         retries = 0
         for _ in range(3):
             pose = world.pose("indenter")
@@ -234,4 +247,61 @@ def test_a_press_with_too_long_a_step_comes_out_right_by_retrying(monkeypatch: p
     monkeypatch.setattr(press, "COURANT", 1.2)
     found, some = pressed()
     assert none == 0 and some > 0
-    assert found == pytest.approx(truth, rel=0.08)
+    assert found == pytest.approx(truth, rel=0.06)
+
+
+def moved(world: PressWorld, gradient: np.ndarray) -> None:
+    """Gives all of the gel one deformation gradient (3, 3)."""
+    u = world.arrays()["gel_displacement"]
+    rest = np.stack(np.meshgrid(*[np.arange(n) for n in u.shape[1:4]], indexing="ij"), axis=-1)
+    u[...] = rest @ (gradient - np.eye(3)).T
+
+
+@pytest.mark.parametrize(
+    ("gradient", "share"),
+    [
+        (np.diag([1.0, 1.0, 1.0]), 1.0),
+        (np.diag([1.0, 1.0, 0.5]), 0.5),
+        (np.diag([0.35, 1.0, 1.5]), 0.35),
+        (Rotation.from_rotvec([0.9, 0.9, 0.9]).as_matrix(), 1.0),  # turned so far that edges along x seem 0.4 long
+        (Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix() @ np.diag([1.0, 0.3, 1.0]), 0.3),
+    ],
+)
+def test_the_step_is_measured_against_the_most_squeezed_element(gradient: np.ndarray, share: float) -> None:
+    world = PressWorld(BALL)
+    world.move({})
+    moved(world, gradient)
+    courant = world._courant()
+    exact = press.COURANT / share
+    if exact > LARGEST_COURANT:
+        assert courant == pytest.approx(exact, rel=1e-4)
+    else:
+        assert exact - 1e-4 <= courant <= LARGEST_COURANT
+
+
+def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though nothing blows up, as is seen without the limit."""
+    monkeypatch.setattr(press, "COURANT", 0.8)
+    world = PressWorld(BALL.model_copy(update={"settling": Settling(mach=0.1)}))
+    clear = world.snapshot()
+
+    def pressed() -> list[MoveStats]:
+        world.restore(clear)
+        ways = [{"indenter": Pose(np.array([0, 0, 4e-3 - depth]))} for depth in (0.27e-3, 0.54e-3, 0.8e-3)]
+        return [world.move(way) for way in ways]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(health, "LARGEST_COURANT", np.inf)
+        assert all(stats.settled and stats.retries == 0 for stats in pressed())
+    last = pressed()[-1]
+    assert last.retries == 1 and last.time_step == pytest.approx(0.4e-3) and 0.4 < last.courant < LARGEST_COURANT
+
+
+def test_a_motion_tells_by_which_numbers_it_went() -> None:
+    world = PressWorld(BALL)
+    pose = world.pose("indenter")
+    stats = world.move({"indenter": Pose(pose.position - [0, 0, 0.5e-3])})
+    assert stats.time_step == pytest.approx(0.4e-3) and stats.damping == pytest.approx(1.0)
+    assert 0.4 < stats.courant < 0.6 and stats.retries == 0
+    stats = world.move({"indenter": pose}, duration=1e-3)
+    assert stats.damping == 0.0 and stats.time_step == pytest.approx(0.4e-3, rel=0.05)

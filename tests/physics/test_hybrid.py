@@ -8,9 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
 from tacsim.physics import hybrid
+from tacsim.physics.facing import gel_overlap
+from tacsim.physics.gel import gel_facts
 from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.hybrid import HybridWorld
-from tacsim.scene import Body, BodyMaterial, Box, Scene
+from tacsim.physics.layout import HOUSED
+from tacsim.scene import Body, BodyMaterial, Box, Gel, Scene
 
 CLAY = BodyMaterial(yield_stress=30e3)
 CUBE = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=CLAY)
@@ -308,3 +311,75 @@ def test_the_upper_gel_carries_what_falls_up_and_both_differ_by_the_weight() -> 
     lower, upper = -w.wrench("lower")[2], -w.wrench("upper")[2]
     assert lower > weight
     assert upper - lower == pytest.approx(weight, rel=2e-2)
+
+
+def over_the_rim(housing: float | None) -> HybridWorld:
+    """A cube of 4 mm, 1 mm of it beyond the rim of both gels, squeezed by 1.2 mm."""
+    gel = Gel(size=(10e-3, 10e-3, 4e-3), housing=housing)
+    w = world(Body(geometry=Box(size=(4e-3, 4e-3, 4e-3)), material=CLAY), gel=gel)
+    w.move({**shift(w, "lower", (4e-3, 0, 0)), **shift(w, "upper", (4e-3, 0, 0))})
+    squeeze(w, 1.2e-3)
+    return w
+
+
+def housing_forces(w: HybridWorld) -> np.ndarray:
+    """(2,) that the body presses on the housing of each gel with [N]."""
+    sums = w.snapshot()["sums"].astype(float).sum(axis=0)
+    return -sums[HOUSED : HOUSED + 6].reshape(2, 3)[:, 2]
+
+
+def beside_the_gel(w: HybridWorld, name: str) -> np.ndarray:
+    """Heights of the body's surface beside a gel, over its rest surface [mm]."""
+    state, pose = w.snapshot(), w.pose(name)
+    planes = state["planes"]
+    radius = np.full(len(planes), 0.25)
+    known = np.linalg.norm(planes, axis=1) > 0
+    radius[known] = np.minimum(1 / np.linalg.norm(planes[known], axis=1), 0.5)
+    local = (state["position"] - 1e3 * pose.position) @ Rotation.from_quat(pose.quaternion).as_matrix()
+    return (local[:, 2] - radius)[(np.abs(local[:, :2]) > 5.0).any(axis=1)]
+
+
+def test_beside_a_gel_its_housing_carries_the_body() -> None:
+    housed, free = over_the_rim(0.1e-3), over_the_rim(None)
+    forces = housing_forces(housed)
+    assert (forces > 0.05 * -housed.wrench("lower")[2]).all() and not housing_forces(free).any()
+    for name in housed.sensors:
+        assert beside_the_gel(housed, name).min() > -0.1 - 0.02
+        assert beside_the_gel(free, name).min() < -0.1 - 0.1
+        assert -housed.wrench(name)[2] > 1.2 * -free.wrench(name)[2]
+
+
+def test_gels_in_one_another_are_told_and_too_deep_refused() -> None:
+    """They do not feel each other. Here they meet round a body thinner than what they give."""
+    w = world(Body(geometry=Box(size=(2e-3, 2e-3, 1.5e-3)), material=CLAY))
+    squeeze(w, 0.4e-3)
+    before = w.snapshot()
+    apart = w.move({})
+    assert apart.gel_overlap == apart.guard_hits == 0
+    gap = w.pose("upper").position[2] - w.pose("lower").position[2]
+    met = w.move(shift(w, "upper", (0, 0, -gap - 0.1e-3)))
+    assert met.settled and 0.09e-3 < met.gel_overlap < 0.2e-3 and met.guard_hits > 0
+    w.restore(before)
+    with pytest.raises(
+        SimulationDiverged, match=r"gels lie 1\.[01]\d* mm inside one another.*further apart"
+    ) as refused:
+        w.move(shift(w, "upper", (0, 0, -gap - 1.6e-3)))
+    assert refused.value.refine == 1  # no smaller step would help
+    assert all(a.tobytes() == before[name].tobytes() for name, a in w.snapshot().items())
+
+
+def test_overlap_of_gels_is_that_of_their_deformed_surfaces() -> None:
+    facts = gel_facts(Gel(size=(10e-3, 8e-3, 4e-3)), 1e-3)
+    tops = np.zeros((2, 11, 9, 3), np.float32)
+    turned = Rotation.from_euler("zx", [30, 180], degrees=True).as_matrix()
+    rotations = np.stack([np.eye(3), turned])
+
+    def found(x: float, z: float) -> float:
+        return gel_overlap(facts, tops, rotations, np.array([[1.0, 2.0, 3.0], [1.0 + x, 2.0, 3.0 + z]]))
+
+    assert found(0.0, 0.01) == 0.0 and found(0.0, -0.3) == pytest.approx(0.3)
+    assert found(20.0, -0.3) == 0.0  # beside one another
+    tops[0, ..., 2] = -0.2
+    assert found(0.0, -0.3) == pytest.approx(0.1)
+    tops[1, 3, 4, 2] = 0.25  # a bump
+    assert found(0.0, -0.1) == pytest.approx(0.15)

@@ -1,5 +1,6 @@
 """A rigid indenter on one gel: force, friction, frames."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from tacsim import shapes
 from tacsim.interface import Pose
+from tacsim.physics.indenter import POINTS
 from tacsim.physics.layer import layer_contact
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import Order
@@ -192,8 +194,25 @@ def test_a_motion_driven_launch_by_launch_is_the_move() -> None:
         assert all(left[name].tobytes() == right[name].tobytes() for name in left)
 
 
+def owned(thing: object) -> Iterator[np.ndarray]:
+    """All arrays that an object of ours holds, also within others of ours."""
+    for value in vars(thing).values():
+        for part in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(part, np.ndarray):
+                yield part
+            elif type(part).__module__.startswith("tacsim.physics") and hasattr(part, "__dict__"):
+                yield from owned(part)
+
+
 def test_a_press_allocates_no_particles_or_grid() -> None:
+    """Its state is the gel, three numbers and one of each contact point on it, and little besides."""
     w = world(Sphere(radius=4e-3))
+    move(w, (0, 0, -0.3e-3))
+    state = w._state
+    nx, ny, _ = state.gel[0].elements
+    points = 4 * POINTS**2 * nx * ny
+    assert sum(a.size for a in owned(state)) < sum(a.size for a in owned(state.gels)) + points + 1000
+    assert not {"body", "particles", "memory"} & set(vars(state))
     assert w.truth() is None
     assert set(w.snapshot()) == {
         "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses", "rates", "true_inertia",

@@ -75,7 +75,8 @@ EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
     "gel to a tenth, plate": {"press": "turned inside out"},
     "gel to a tenth, punch": {"press": "turned inside out"},
     "one layer of particles": {
-        "hybrid": lambda f: balanced(f) and f["height"] < 0.6e-3,
+        # the gels, 2.5 times as wide as it, meet round it
+        "hybrid": lambda f: balanced(f) and f["height"] < 0.6e-3 and f["guard_hits"] > 0,
         "seed": lambda f: balanced(f) and f["height"] < 0.6e-3,
     },
     "scene of 10 mm": {"hybrid": balanced, "seed": balanced},
@@ -112,11 +113,14 @@ EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
     "yield and slide": dict.fromkeys(
         ("hybrid", "seed"), lambda f: balanced(f) and f["x"] == pytest.approx(1.5e-3, rel=0.2)
     ),
-    # Gels don't feel each other in hybrid: 2 mm into one another, unnoticed.
-    "sensor through the body": {"hybrid": lambda f: f["gap"] < -1.9e-3 and f["force"] > 1, "seed": balanced},
+    # Gels don't feel each other in hybrid.
+    "sensor through the body": {"hybrid": "mm inside one another, which they do not feel", "seed": balanced},
     "indenter through the gel": {"press": "of the wave speed"},
-    "body over the rim": {"hybrid": balanced, "seed": balanced},
-    "body over the rim, no housing": {"hybrid": balanced},
+    "body over the rim": {
+        "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.635, rel=0.05),
+        "seed": balanced,
+    },
+    "body over the rim, no housing": {"hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.381, rel=0.05)},
     # In between, nothing is left of the first grasp but what has flown; then it is met again.
     "release and grasp again": {
         "hybrid": lambda f: (
@@ -161,7 +165,7 @@ EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
         "seed": lambda f: balanced(f) and f["force"] == pytest.approx(0.581, rel=0.05),
     },
     "short steps, press": {"press": lambda f: f["retries"] == 0 and f["force"] == pytest.approx(0.682, rel=0.02)},
-    "step limit violated": {"hybrid": lambda f: balanced(f) and f["retries"] > 0, "seed": balanced},
+    "step limit violated": dict.fromkeys(("hybrid", "seed"), lambda f: balanced(f) and f["retries"] > 0),
     "step limit violated, press": {"press": lambda f: f["settled"] == 1 and f["retries"] > 0},
     "NaN in position": dict.fromkeys(("hybrid", "seed"), "position[0, 0] is nan"),
     "NaN in velocity": dict.fromkeys(("hybrid", "seed"), "velocity[0, 0] is nan"),
@@ -210,11 +214,12 @@ def outcomes(worker: Worker) -> Callable[[str, str], Outcome]:
 
 @pytest.mark.parametrize(
     ("name", "physics", "tolerance"),
-    [("step limit {}", "hybrid", 0.1), ("step limit {}", "seed", 0.1), ("step limit {}, press", "press", 0.1)],
+    [("step limit {}", "hybrid", 0.01), ("step limit {}", "seed", 0.04), ("step limit {}, press", "press", 0.06)],
 )
 def test_a_step_beyond_the_limit_changes_no_result(
     outcomes: Callable[[str, str], Outcome], name: str, physics: str, tolerance: float
 ) -> None:
+    """A press: its springs are as soft as the constant, patched here, says; a shorter step alone leaves them so."""
     kept, violated = (outcomes(name.format(how), physics).facts for how in ("kept", "violated"))
     assert violated["force"] == pytest.approx(kept["force"], rel=tolerance)
 

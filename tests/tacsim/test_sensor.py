@@ -272,6 +272,11 @@ def test_every_picture_says_how_its_state_was_reached(spring_world: Any) -> None
     stats = sensor.read(0.0).stats
     assert stats == clock.diagnostics()
     assert stats["residual"] == 0.001
+    assert stats.keys() == {
+        "substeps", "hold", "residual", "settled", "overlap", "guard_hits", "retries", "load_error", "time_step",
+        "damping", "courant", "gel_overlap", "shortened",
+    }  # fmt: skip
+    assert all(type(value) is float for value in stats.values())
 
 
 def test_noise_is_another_in_each_sensor_frame_and_episode_and_the_same_again(open_springs: Any) -> None:

@@ -1,0 +1,34 @@
+"""How deep two gels lie in one another: contact knows body and gel, not gel and gel, so this is watched instead.
+
+Lengths in mm, as in kernels.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from tacsim.physics.gel import GelFacts
+
+Floats = NDArray[np.floating]
+
+
+def gel_overlap(facts: GelFacts, tops: Floats, rotations: Floats, origins: Floats) -> float:
+    """The deepest that a surface node of one gel lies below the surface of the other [mm]; 0 where they are apart.
+
+    tops: (2, nx + 1, ny + 1, 3) displacements of both gels' surfaces, each in its sensor's frame [mm]; rotations
+    (2, 3, 3) and origins (2, 3) [mm] of the sensors in the world. Heights between nodes are linear, and those of a
+    surface are taken where its nodes rest: what it has moved sideways is left out.
+    """
+    half = np.array(facts.half)
+    at = np.stack(np.meshgrid(*[np.arange(n) * facts.spacing for n in tops.shape[1:3]], indexing="ij"), axis=-1) - half
+    deepest = 0.0
+    for here, there in ((0, 1), (1, 0)):
+        points = tops[there].astype(np.float64)
+        points[..., :2] += at
+        points = (points.reshape(-1, 3) @ rotations[there].T + origins[there] - origins[here]) @ rotations[here]
+        heights = tops[here][..., 2]
+        low = points[(points[:, 2] < heights.max()) & (np.abs(points[:, :2]) < half).all(axis=1)]
+        if len(low):
+            surface = map_coordinates(heights, ((low[:, :2] + half) / facts.spacing).T, order=1)
+            deepest = max(deepest, float((surface - low[:, 2]).max()))
+    return deepest

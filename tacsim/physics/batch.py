@@ -16,6 +16,7 @@ from tacsim.physics.hybrid import HybridState, HybridWorld
 from tacsim.physics.load import LoadNotReached
 from tacsim.physics.press import PressState, PressWorld
 from tacsim.physics.world import MoveStats, Order
+from tacsim.runtime import launching
 from tacsim.scene import Scene
 
 Result = MoveStats | SimulationDiverged | LoadNotReached | None
@@ -93,7 +94,9 @@ class Batch:
                     error.add_note(f"in the targets or loads of environment {index}")
                     raise
             while wanted:
-                for index, result in advance_all(self._state, self.worlds, wanted).items():
+                with launching():
+                    results = advance_all(self._state, self.worlds, wanted)
+                for index, result in results.items():
                     motion = motions[index]
                     if isinstance(result, SimulationDiverged):
                         go_on(index, partial(motion.throw, result))

@@ -29,6 +29,7 @@ from tacsim.physics.layout import FORCE
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import Path, merged, plan, plan_on
 from tacsim.physics.world import MoveStats, Order, put_back, taken
+from tacsim.runtime import launching
 from tacsim.scene import GelSurface, Scene
 
 
@@ -172,6 +173,7 @@ class DrivenWorld(ABC):
         mach, gel = self.scene.settling.flow_mach, self._gel
         return plan_on(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
 
+    @launching()  # whole: worlds of a batch share arrays, among them those that say who takes part
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         prepared = self.prepare(Launch(path, first, last))
         self._state.advance({self._index: prepared.drive})

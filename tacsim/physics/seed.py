@@ -22,7 +22,7 @@ from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import MM, Path, merged, plan
 from tacsim.physics.world import MoveStats, Order, put_back
-from tacsim.runtime import start
+from tacsim.runtime import launching, start
 from tacsim.sampling import body_points
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 
@@ -261,6 +261,7 @@ class SeedWorld:
             raise SimulationDiverged("every particle of the body left the grid", str(where), "move slower, or less far")
         return Reading(backing + self._gain, backing, self._floor, self._overlap(path, last), left)
 
+    @launching()
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance
 

@@ -15,6 +15,7 @@ from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.hybrid import HybridState, HybridWorld
 from tacsim.physics.load import LoadNotReached
 from tacsim.physics.press import PressState, PressWorld
+from tacsim.physics.single import Single
 from tacsim.physics.world import MoveStats, Order
 from tacsim.runtime import launching
 from tacsim.scene import Scene
@@ -22,7 +23,7 @@ from tacsim.scene import Scene
 Result = MoveStats | SimulationDiverged | LoadNotReached | None
 
 
-class Batch:
+class Batch(Single):
     """Worlds of several scenes, all round bodies or all with indenters, whose gels share one lattice.
 
     All else is each scene's own: materials, friction, body or indenter, number of particles, settling. `worlds` are

@@ -65,6 +65,10 @@ class DrivenWorld(SingleWorld):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Views of all that changes in a motion, by name."""
 
+    def _numbers(self) -> dict[str, NDArray[Any]]:
+        """What a snapshot holds besides: of how the last motion has left this world."""
+        return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.true))}
+
     @abstractmethod
     def _stop(self) -> None:
         """Sets the speed of everything to zero."""
@@ -80,15 +84,13 @@ class DrivenWorld(SingleWorld):
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        state = taken(self.arrays(), self._poses)
-        state["true_inertia"] = np.array(float(self._inertia.true))
-        state["rates"] = self._rates.copy()
-        return state
+        return taken({**self.arrays(), **self._numbers()}, self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        poses = put_back({**self.arrays(), "rates": self._rates}, list(self._poses), state)
-        self._poses = poses
-        self._take(self._true if state["true_inertia"] else self._scaled)
+        """See World."""
+        numbers = self._numbers()
+        self._poses = put_back({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
+        self._take(self._true if numbers["true_inertia"] else self._scaled)
 
     def wrench(self, name: str) -> NDArray[np.float64]:
         first = FORCE + 6 * self._sensor(name)

@@ -22,7 +22,7 @@ from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import MM, Path, merged, plan
 from tacsim.physics.single import SingleWorld
-from tacsim.physics.world import MoveStats, Order, put_back
+from tacsim.physics.world import MoveStats, Order, put_back, taken
 from tacsim.runtime import launching, start
 from tacsim.sampling import body_points
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
@@ -141,12 +141,10 @@ class SeedWorld(SingleWorld):
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        state = {name: a.copy() for name, a in self.arrays().items()}
-        state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
-        return state
+        return taken(self.arrays(), self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Raises ValueError if `state` is no snapshot of such a world."""
+        """See World."""
         self._poses = put_back(self.arrays(), self.sensors, state)
 
     def wrench(self, name: str) -> NDArray[np.float64]:

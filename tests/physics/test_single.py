@@ -6,6 +6,7 @@ import copy
 import pickle
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,3 +119,26 @@ def test_a_snapshot_makes_a_second_world(world: World) -> None:
     for one in (world, other):
         one.move(down(one))
     assert np.array_equal(other.wrench("lower"), world.wrench("lower"))
+
+
+def test_a_snapshot_that_does_not_fit_changes_nothing(world: World) -> None:
+    world.move(down(world))
+    good = dict(world.snapshot())
+    before = state(world)
+
+    def refused(kind: type[Exception], words: str, given: Any) -> None:
+        with pytest.raises(kind, match=words):
+            world.restore(given)
+        assert state(world) == before
+
+    for name, array in good.items():
+        refused(ValueError, f"'{name}' must have shape .*, found nothing", {k: a for k, a in good.items() if k != name})
+        refused(ValueError, f"'{name}' must have shape", {**good, name: np.zeros((2, *array.shape))})
+        refused(ValueError, f"'{name}' must hold", {**good, name: array.astype(complex)})
+    for numbers in (np.full_like(good["poses"], np.nan), np.zeros_like(good["poses"])):
+        refused(ValueError, "snapshot: 'poses' of 'lower': Pose", {**good, "poses": numbers})
+    for name in {"rates", "true_inertia", "speed"} & set(good):
+        refused(ValueError, f"'{name}' is not finite", {**good, name: np.full_like(good[name], np.nan)})
+    refused(TypeError, "a snapshot holds arrays by their names", None)
+    world.restore({name: array.tolist() for name, array in good.items()})  # type: ignore[misc]
+    assert state(world) == before

@@ -14,6 +14,7 @@ from tacsim.quantity import Acceleration, Angle, Density, Facts, Length, Pressur
 
 Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
 Modulus = Annotated[Pressure, Field(ge=1.0, le=1e12)]  # from a foam of liquid to beyond diamond [Pa]
+MassDensity = Annotated[Density, Field(ge=1.0, le=1e5)]  # from an aerogel to beyond osmium [kg/m^3]
 Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
 Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
@@ -31,7 +32,7 @@ class GelMaterial(Facts):
 
     youngs_modulus: Modulus = 0.145e6
     poisson_ratio: PoissonRatio = 0.48
-    density: Annotated[Density, Field(gt=0, le=1e5)] = 1000.0  # of dynamic motions only; a guess near silicone's
+    density: MassDensity = 1000.0  # of dynamic motions only; a guess near silicone's
     source: str = ""
 
 
@@ -49,7 +50,7 @@ class BodyMaterial(Facts):
     # H: growth of the uniaxial yield stress by equivalent plastic strain [Pa]
     hardening_modulus: Annotated[Pressure, Field(ge=0, le=1e12)] = 0.0
     # Weight and dynamic motions; inertia is scaled elsewhere. Plasticine: a guess within the 1.5 to 2 g/cm^3 told.
-    density: Annotated[Density, Field(gt=0, le=1e5)] = 1700.0
+    density: MassDensity = 1700.0
     source: str = ""
 
     @model_validator(mode="after")

@@ -15,13 +15,15 @@ from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.hybrid import HybridState, HybridWorld
 from tacsim.physics.load import LoadNotReached
 from tacsim.physics.press import PressState, PressWorld
+from tacsim.physics.single import Single
 from tacsim.physics.world import MoveStats, Order
+from tacsim.runtime import launching
 from tacsim.scene import Scene
 
 Result = MoveStats | SimulationDiverged | LoadNotReached | None
 
 
-class Batch:
+class Batch(Single):
     """Worlds of several scenes, all round bodies or all with indenters, whose gels share one lattice.
 
     All else is each scene's own: materials, friction, body or indenter, number of particles, settling. `worlds` are
@@ -93,7 +95,9 @@ class Batch:
                     error.add_note(f"in the targets or loads of environment {index}")
                     raise
             while wanted:
-                for index, result in advance_all(self._state, self.worlds, wanted).items():
+                with launching():
+                    results = advance_all(self._state, self.worlds, wanted)
+                for index, result in results.items():
                     motion = motions[index]
                     if isinstance(result, SimulationDiverged):
                         go_on(index, partial(motion.throw, result))

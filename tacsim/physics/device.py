@@ -57,7 +57,7 @@ from tacsim.physics.layout import (
 )  # fmt: skip
 from tacsim.physics.plasticine import BodyState
 from tacsim.physics.transfers import Particles, Strips, grid_to_particles, particles_to_grid
-from tacsim.runtime import ti
+from tacsim.runtime import launching, ti
 
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
 
@@ -252,6 +252,7 @@ class Mirror:
         )  # fmt: skip
 
 
+@launching()
 def run_press(
     mirror: Mirror, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray, values: np.ndarray,
     facts: np.ndarray, counts: np.ndarray, partial: np.ndarray,
@@ -268,6 +269,7 @@ def run_press(
     mirror.bring(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=partial)
 
 
+@launching()
 def run_hybrid(
     mirror: Mirror, drive: np.ndarray, gels: GelState, body: BodyState, memory: np.ndarray, facts: np.ndarray,
     counts: np.ndarray, partial: np.ndarray,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol
@@ -29,7 +29,9 @@ from tacsim.physics.inertia import Inertia, plan_in_time
 from tacsim.physics.layout import FORCE, GEL_DAMPING, STEP
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import Path, merged, plan, plan_on
+from tacsim.physics.single import SingleWorld
 from tacsim.physics.world import MoveStats, Order, put_back, taken
+from tacsim.runtime import launching
 from tacsim.scene import GelSurface, Scene
 
 
@@ -43,10 +45,9 @@ class DrivenState(Protocol):
     def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None: ...
 
 
-class DrivenWorld(ABC):
+class DrivenWorld(SingleWorld):
     """One environment of a state whose gels are layers of finite elements in their sensors' frames."""
 
-    sensors: tuple[str, ...]
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
     yields: bool  # what is pressed keeps what a hurried motion does to it
 
@@ -54,7 +55,6 @@ class DrivenWorld(ABC):
     _state: DrivenState
     _index: int
     _gel: GelFacts
-    _poses: dict[str, Pose]  # of the driven frames
     _rates: NDArray[np.float64]  # (frames, 6) at which a motion that flows has left them [-, rad/mm]
     _scaled: Inertia  # for the way to rest
     _true: Inertia
@@ -65,6 +65,10 @@ class DrivenWorld(ABC):
     @abstractmethod
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Views of all that changes in a motion, by name."""
+
+    def _numbers(self) -> dict[str, NDArray[Any]]:
+        """What a snapshot holds besides: of how the last motion has left this world."""
+        return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.true))}
 
     @abstractmethod
     def _stop(self) -> None:
@@ -81,21 +85,16 @@ class DrivenWorld(ABC):
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        state = taken(self.arrays(), self._poses)
-        state["true_inertia"] = np.array(float(self._inertia.true))
-        state["rates"] = self._rates.copy()
-        return state
+        return taken({**self.arrays(), **self._numbers()}, self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        poses = put_back({**self.arrays(), "rates": self._rates}, list(self._poses), state)
-        self._poses = poses
-        self._take(self._true if state["true_inertia"] else self._scaled)
-
-    def pose(self, name: str) -> Pose:
-        return self._poses[name]
+        """See World."""
+        numbers = self._numbers()
+        self._poses = put_back({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
+        self._take(self._true if numbers["true_inertia"] else self._scaled)
 
     def wrench(self, name: str) -> NDArray[np.float64]:
-        first = FORCE + 6 * self.sensors.index(name)
+        first = FORCE + 6 * self._sensor(name)
         wrench: NDArray[np.float64] = (
             self._state.partial[self._index, :, first : first + 6].astype(np.float64).sum(axis=0)
         )
@@ -103,7 +102,7 @@ class DrivenWorld(ABC):
         return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._state.gels, self._index, self.sensors.index(name))
+        return gel_surface(self._gel, self._state.gels, self._index, self._sensor(name))
 
     # ---------------------------------------------------------------- inertia
 
@@ -146,8 +145,7 @@ class DrivenWorld(ABC):
     ) -> MoveStats:  # fmt: skip
         return run(self.motion(Order(targets, loads or {}, duration, flow)), self._advance)
 
-    def motion(self, order: Order) -> Motion:
-        """`move`, a launch at a time."""
+    def _carry_out(self, order: Order) -> Motion:
         end = merged(self._poses, order.targets)
         require_loads(order.loads, self.sensors)
         begin, goals, rest = dict(self._poses), dict(end), np.zeros_like(self._rates)
@@ -189,6 +187,7 @@ class DrivenWorld(ABC):
         mach, gel = self.scene.settling.flow_mach, self._gel
         return plan_on(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
 
+    @launching()  # whole: worlds of a batch share arrays, among them those that say who takes part
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         prepared = self.prepare(Launch(path, first, last))
         self._state.advance({self._index: prepared.drive})

@@ -218,8 +218,8 @@ class HybridWorld(DrivenWorld):
             "planes": b.plane(i), "contact": state.memory[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
 
-    def snapshot(self) -> dict[str, np.ndarray]:
-        return {**super().snapshot(), "speed": np.array(self._speed)}
+    def _numbers(self) -> dict[str, np.ndarray]:
+        return {**super()._numbers(), "speed": np.array(self._speed)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         super().restore(state)

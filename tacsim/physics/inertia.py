@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from tacsim.interface import Pose
 from tacsim.physics.controller import Launch
 from tacsim.physics.gel import MM, MPA, GelFacts
-from tacsim.physics.path import PEAK, Path, longest_way
+from tacsim.physics.path import MOST, PEAK, ROUNDING, Path, longest_way
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 
@@ -54,11 +54,17 @@ def kernel_density(density: float, second: float) -> float:
 def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
     """The path of a dynamic motion; `lever` [mm]: see `longest_way`.
 
-    Raises ValueError for a duration [s] that is no positive number, or in which the fastest frame would race the gel's
-    own waves.
+    Raises ValueError for a duration [s] that is not positive, that has far too many substeps or nothing of one, or in
+    which the fastest frame would race the gel's own waves.
     """
     if not (math.isfinite(duration) and duration > 0):
         raise ValueError(f"duration is {duration:g} s: give a positive time, or None for a quasi-static motion")
+    substep = inertia.step / inertia.second
+    if not ROUNDING <= duration / substep <= MOST:
+        raise ValueError(
+            f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (the materials say so) it must lie between "
+            f"{ROUNDING * substep:.3g} and {MOST * substep:.3g} s: is it in seconds?"
+        )
     kernel_time, wave = duration * inertia.second, inertia.second / MM
     peak = PEAK * longest_way(start, end, lever) / kernel_time
     if peak > FASTEST_DRIVE:

@@ -124,6 +124,7 @@ def keep_loads(
             f"mm); bring its target nearer to contact, or ask for another load"
         )
 
+    world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a way that is far too long
     end.update(start)
     way = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
     pieces = max(1, math.ceil(way / (PIECE * thickness)))

@@ -26,6 +26,7 @@ SHORT = 0.5  # ways shorter than so many gel thicknesses go slower than they may
 FLOW = 1.25  # shortest step that flows, in wave times; longer by as much as its speed changes
 LOOK = 1.0  # time of the hold between two looks at the forces, in the same times
 ROUNDING = 1e-6  # of a number of substeps
+MOST = 1_000_000  # substeps of one motion: hours, and no motion that anybody means
 
 
 def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
@@ -142,6 +143,8 @@ def plan(
 
     What the stop writes into a body that `yields` grows with how hard it brakes, so short ways go slower: with the root
     of their length, which is the same braking for all.
+
+    Raises ValueError for a way that takes more than MOST substeps.
     """
     look = math.ceil(LOOK * thickness / dt)
     length = longest_way(start, end, lever)
@@ -150,7 +153,7 @@ def plan(
     if yields:
         mach *= min(1.0, math.sqrt(length / (SHORT * thickness)))
     lasting = max(PEAK * length / mach, RAMP * thickness)
-    return Path(start, end, math.ceil(lasting / dt), dt, look=look, rise=RAMP * thickness / 2 / lasting)
+    return Path(start, end, _substeps(lasting / dt, length, mach), dt, look=look, rise=RAMP * thickness / 2 / lasting)
 
 
 def plan_on(
@@ -159,15 +162,27 @@ def plan_on(
 ) -> Path:  # fmt: skip
     """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at the mean speed of
     the step as if it were the same all the way; at most Mach `mach`. Where speeds change it lasts longer, up to twice
-    as long from rest. Without a way and at rest it has no substeps."""
+    as long from rest. Without a way and at rest it has no substeps. Raises ValueError as `plan` does."""
     ways = np.array([way_between(a, b) for a, b in zip(start, end, strict=True)])
     look = math.ceil(LOOK * thickness / dt)
     if not (ways.any() or rates.any()):
         return Path(start, end, 0, dt, look=look)
-    lasting = dt * math.ceil(max(longest(ways, lever) / mach, FLOW * thickness) / dt - ROUNDING)
+    length = longest(ways, lever)
+    lasting = dt * _substeps(max(length / mach, FLOW * thickness) / dt - ROUNDING, length, mach)
     onward = ways / lasting
     lasting *= 1.0 + longest(onward - rates, lever) / mach
-    return Path(start, end, math.ceil(lasting / dt - ROUNDING), dt, look=look, rates=(rates, onward))
+    substeps = _substeps(lasting / dt - ROUNDING, length, mach)
+    return Path(start, end, substeps, dt, look=look, rates=(rates, onward))
+
+
+def _substeps(count: float, length: float, mach: float) -> int:
+    """The whole number for `count`. Raises ValueError for a way of `length` [mm] that takes MOST of them and more."""
+    if not count <= MOST:
+        raise ValueError(
+            f"a way of {length / MM:.3g} m at Mach {mach:.3g} would take {count:.2g} substeps (limit {MOST:,}); are "
+            f"the targets in metres? if so, go there in several motions, or faster"
+        )
+    return math.ceil(count)
 
 
 def merged(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:

@@ -21,8 +21,9 @@ from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, re
 from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import MM, Path, merged, plan
-from tacsim.physics.world import MoveStats, Order, put_back
-from tacsim.runtime import start
+from tacsim.physics.single import SingleWorld
+from tacsim.physics.world import MoveStats, Order, put_back, taken
+from tacsim.runtime import launching, start
 from tacsim.sampling import body_points
 from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 
@@ -78,13 +79,13 @@ def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
     return Solid(mass=mass, volume=volume, mu=mu, lam=lam, limit=limit)  # type: ignore[call-arg]  # a Taichi dataclass
 
 
-class SeedWorld:
+class SeedWorld(SingleWorld):
     """World of a scene with a body, by the seed's scheme.
 
     Raises ValueError without a body, or for one that hardens; RuntimeError on a device (TACSIM_DEVICE).
     """
 
-    sensors: tuple[str, ...] = ("lower", "upper")
+    sensors = ("lower", "upper")
 
     def __init__(self, scene: Scene) -> None:
         if scene.body is None:
@@ -141,20 +142,15 @@ class SeedWorld:
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        state = {name: a.copy() for name, a in self.arrays().items()}
-        state["poses"] = np.array([[*p.position, *p.quaternion] for p in self._poses.values()])
-        return state
+        return taken(self.arrays(), self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Raises ValueError if `state` is no snapshot of such a world."""
+        """See World."""
         self._poses = put_back(self.arrays(), self.sensors, state)
-
-    def pose(self, name: str) -> Pose:
-        return self._poses[name]
 
     def wrench(self, name: str) -> NDArray[np.float64]:
         """(6,) what the gel does to its backing: what the object does to the gel, once the gel is at rest."""
-        reaction = self._backing[self.sensors.index(name)].astype(np.float64)
+        reaction = self._backing[self._sensor(name)].astype(np.float64)
         to_sensor = _rotation(self._poses[name]).inv()
         return np.concatenate([to_sensor.apply(reaction[:3]), to_sensor.apply(reaction[3:]) / MM])
 
@@ -167,7 +163,7 @@ class SeedWorld:
 
     def _in_sensor(self, name: str) -> NDArray[np.float64]:
         """Particles of a gel in its sensor's frame [mm]."""
-        first, pose = self.sensors.index(name) * self._gels, self._poses[name]
+        first, pose = self._sensor(name) * self._gels, self._poses[name]
         x: NDArray[np.float64] = self._x[first : first + self._gels] - pose.position * MM
         return x @ _rotation(pose).as_matrix()
 
@@ -195,8 +191,7 @@ class SeedWorld:
             raise ValueError("physics 'seed' settles every motion; leave out flow, or use physics 'hybrid'")
         return run(self.motion(Order(targets, loads or {})), self._advance)
 
-    def motion(self, order: Order) -> Motion:
-        """`move`, a launch at a time."""
+    def _carry_out(self, order: Order) -> Motion:
         end = merged(self._poses, {name: self._upright(name, pose) for name, pose in order.targets.items()})
         self._check_room(end)
         require_loads(order.loads, self.sensors)
@@ -265,6 +260,7 @@ class SeedWorld:
         overlap = self._overlap(path, last)
         return Reading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
 
+    @launching()
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
         from tacsim.physics.seed_kernels import Step, advance
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tacsim.physics.lanes import PARTS
-from tacsim.runtime import ti
+from tacsim.runtime import launching, ti
 from tacsim.threads import threads
 
 CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
@@ -101,6 +101,7 @@ def team_sizes(environments: int) -> tuple[int, ...]:
     return tuple(size for size in (1, 2, 4) if size <= largest)
 
 
+@launching()
 def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: Sequence[int] = (0,)) -> None:
     """Launches `kernel(team, drive, ..., sync)` with the team that is fastest of late; tuples of arguments are spread.
 

@@ -66,7 +66,8 @@ class World(Protocol):
         self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
         *, flow: bool = False,
     ) -> MoveStats:  # fmt: skip
-        """Drives the named frames to their targets along a ramped straight path, then holds until settled.
+        """Drives the named frames to their targets along a ramped straight path, then holds until settled. What turns
+        takes the shorter way round: more than half a turn is several motions.
 
         loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis; across it,
         and in orientation, they follow their target (or stay). Afterwards `pose` says where they came to. Raises
@@ -100,7 +101,9 @@ class World(Protocol):
         """A copy of the whole state, as named arrays."""
         ...
 
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Raises TypeError or ValueError, with nothing changed, if `state` is no snapshot of such a world."""
+        ...
 
 
 def taken(arrays: Mapping[str, NDArray[Any]], poses: Mapping[str, Pose]) -> dict[str, NDArray[Any]]:
@@ -111,17 +114,34 @@ def taken(arrays: Mapping[str, NDArray[Any]], poses: Mapping[str, Pose]) -> dict
 
 
 def put_back(
-    arrays: Mapping[str, NDArray[Any]], frames: Sequence[str], state: Mapping[str, NDArray[Any]]
-) -> dict[str, Pose]:
-    """Copies a snapshot into a world's arrays; returns the poses. Raises ValueError, with nothing changed, if it does
-    not fit."""
-    for name, shape in {**{name: a.shape for name, a in arrays.items()}, "poses": (len(frames), 7)}.items():
-        if name not in state or state[name].shape != shape:
-            found = state[name].shape if name in state else "nothing"
-            raise ValueError(f"snapshot: '{name}' must have shape {shape}, found {found}; is it of this scene?")
+    arrays: Mapping[str, NDArray[Any]], frames: Sequence[str], state: Mapping[str, NDArray[Any]],
+    finite: Sequence[str] = (),
+) -> dict[str, Pose]:  # fmt: skip
+    """Copies a snapshot into a world's arrays; returns the poses.
+
+    finite: those of the arrays that no motion can begin from unless they are. Raises TypeError for what is no snapshot,
+    ValueError for one that does not fit; then nothing is changed.
+    """
+    if not isinstance(state, Mapping):
+        raise TypeError(f"a snapshot holds arrays by their names, as World.snapshot gives them; found {state!r}")
+    found = {name: np.asarray(state[name]) for name in (*arrays, "poses") if name in state}
+    for name, wanted in {**arrays, "poses": np.empty((len(frames), 7))}.items():
+        if name not in found or found[name].shape != wanted.shape:
+            shape = found[name].shape if name in found else "nothing"
+            raise ValueError(f"snapshot: '{name}' must have shape {wanted.shape}, found {shape}; is it of this scene?")
+        if not np.can_cast(found[name].dtype, wanted.dtype, "same_kind"):
+            raise ValueError(f"snapshot: '{name}' must hold {wanted.dtype}, found {found[name].dtype}")
+        if name in finite and not np.isfinite(found[name]).all():
+            raise ValueError(f"snapshot: '{name}' is not finite; restore another one")
+    poses = {}
+    for frame, numbers in zip(frames, found["poses"], strict=True):
+        try:
+            poses[frame] = Pose(numbers[:3], numbers[3:])
+        except ValueError as error:
+            raise ValueError(f"snapshot: 'poses' of '{frame}': {error}") from None
     for name, a in arrays.items():
-        a[...] = state[name]
-    return {name: Pose(p[:3], p[3:]) for name, p in zip(frames, state["poses"], strict=True)}
+        a[...] = found[name]
+    return poses
 
 
 def make_world(scene: Scene) -> World:

@@ -148,6 +148,13 @@ def test_a_duration_that_makes_no_sense_is_refused(duration: float, words: str) 
     assert all(np.array_equal(before[name], array) for name, array in world.snapshot().items())
 
 
+@pytest.mark.parametrize("duration", [5e-324, 1e-300, 1e5, 1e305, 1e308])
+def test_a_duration_of_no_substep_or_of_far_too_many_is_refused(duration: float) -> None:
+    world = PressWorld(Scene(body=None, indenter=Indenter(), gel=GEL))
+    with pytest.raises(ValueError, match=r"duration is .* s; .* it must lie between .* is it in seconds\?"):
+        world.move({}, duration=duration)
+
+
 def test_the_advice_for_a_longer_duration_holds() -> None:
     world = PressWorld(Scene(body=None, indenter=Indenter(), gel=GEL))
     with pytest.raises(ValueError, match="at least") as refused:

@@ -63,3 +63,11 @@ def test_loads_that_make_no_sense_are_refused() -> None:
         world.move({}, loads={"indenter": 0.3})
     with pytest.raises(ValueError, match="load of 'lower' is -1 N"):
         world.move({}, loads={"lower": -1.0})
+
+
+def test_a_way_that_would_take_for_ever_is_refused_with_a_load_too() -> None:
+    world = press()
+    before = world.snapshot()
+    with pytest.raises(ValueError, match="are the targets in metres"):
+        world.move(by(world, "indenter", (500.0, 0, 0)), loads={"lower": 0.3})
+    assert all(a.tobytes() == before[name].tobytes() for name, a in world.snapshot().items())

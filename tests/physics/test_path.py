@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.path import PEAK, plan, ramp
+from tacsim.physics.path import MOST, PEAK, plan, plan_on, ramp
 
 
 @pytest.mark.parametrize("rise", [0.5, 0.1])
@@ -74,3 +74,15 @@ def test_the_shortest_motion_lets_the_gel_follow() -> None:
     far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     assert far.substeps == 94
     assert short.rise == 0.5 and far.rise * far.substeps * far.dt == pytest.approx(4.0, rel=0.01)
+
+
+def test_a_way_that_would_take_for_ever_is_refused() -> None:
+    """Millimetres given as metres; but not what is slow and meant: 50 mm at Mach 0.001, in fine steps."""
+    far = [Pose(np.array([0, 0, 500.0]))]
+    words = r"500 m at Mach 0\.03 would take 7\.8e\+07 substeps \(limit 1,000,000\); are the targets in metres\?"
+    with pytest.raises(ValueError, match=words):
+        plan([Pose()], far, mach=0.03, dt=0.4, lever=10.0, thickness=4.0)
+    with pytest.raises(ValueError, match=r"500 m at Mach 0\.01 would take 1\.2e\+08 substeps"):
+        plan_on([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
+    slow = plan([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
+    assert 0.7 * MOST < slow.substeps < MOST

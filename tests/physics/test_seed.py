@@ -196,7 +196,7 @@ def test_targets_that_it_cannot_follow_are_refused():
         world.move({"lower": Pose(quaternion=Rotation.from_euler("x", 1, degrees=True).as_quat())})
     with pytest.raises(ValueError, match="overlap by 4 mm"):
         world.move({"upper": Pose(np.array([0, 0, -4e-3]), HALF_TURN)})
-    with pytest.raises(KeyError, match="no sensor 'left'"):
+    with pytest.raises(KeyError, match="no driven frame left"):
         world.move({"left": Pose()})
 
 

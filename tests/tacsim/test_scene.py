@@ -37,6 +37,14 @@ def test_a_modulus_that_no_material_has_is_refused(modulus: float) -> None:
             material(youngs_modulus=modulus)
 
 
+@pytest.mark.parametrize("density", [0.0, 1e-300, 0.99, 1.01e5])
+def test_a_density_that_no_material_has_is_refused(density: float) -> None:
+    """A motion in real time would take for ever, and what is divided by it overflow."""
+    for material in (GelMaterial, BodyMaterial):
+        with pytest.raises(ValidationError, match="density"):
+            material(density=density)
+
+
 def test_sizes_beyond_what_touches_a_gel_are_refused() -> None:
     for size in (1e-300, 1e308):
         with pytest.raises(ValidationError, match="radius"):

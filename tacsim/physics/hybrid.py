@@ -271,7 +271,7 @@ class HybridWorld(DrivenWorld):
         backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
-        centre = np.mean(self._state.particles.x(self._index), axis=0, dtype=np.float64)
+        centre = np.array([column.mean(dtype=np.float64) for column in self._state.particles.x(self._index).T])
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
         meeting = self._gel_overlap(prepared)

@@ -145,8 +145,7 @@ def _squeeze_rows(world: World, truth: float, variant: str, repeat: int) -> list
 
 def settled_squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]:
     """3 mm from touch, settled to 1 %: every method against one truth, the slow limit of our `standard` mesh.
-
-    That row of ours which has this very mesh is judged without its coarseness.
+    Our row of this very mesh is judged without its coarseness; the seed's bodies stick where ours rub.
     """
     truth = slow_force("standard")
     world = touching(squeeze_scene(preset, physics))

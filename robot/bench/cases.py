@@ -89,14 +89,14 @@ def _real_cases(data: Path) -> tuple[Case, ...]:
 
 
 def description(group: Group, name: str, method: str) -> str:
-    """What a case does, from the first line of its docstring; empty for a case that is no more."""
+    """What a case does, from the first paragraph of its docstring; empty for a case that is no more."""
     if (group, name) in BY_DATA:
-        return _first_line(BY_DATA[group, name])
+        return _first_paragraph(BY_DATA[group, name])
     for case in CASES:
         if (case.group, case.name, case.method) == (group, name, method):
-            return _first_line(case.measure.func if isinstance(case.measure, partial) else case.measure)
+            return _first_paragraph(case.measure.func if isinstance(case.measure, partial) else case.measure)
     return ""
 
 
-def _first_line(function: object) -> str:
-    return (function.__doc__ or "").strip().partition("\n")[0]
+def _first_paragraph(function: object) -> str:
+    return " ".join((function.__doc__ or "").partition("\n\n")[0].split())

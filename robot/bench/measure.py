@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -12,7 +12,9 @@ from typing import TypeVar
 import numpy as np
 
 T = TypeVar("T")
-BUDGET = 1.0  # [s] no further repetition once the timed ones took this long
+BUDGET = 1.0  # [s] no further repetition once the timed ones took this long ...
+LEAST = 3  # ... but so many, which a spread needs, ...
+DEAR = 5.0  # [s] ... unless one takes so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +59,16 @@ def timed(run: Callable[[], T], repeat: int, warm: Callable[[], object] | None =
     (run if warm is None else warm)()
     samples: list[float] = []
     processor: list[float] = []
-    while not samples or (len(samples) < repeat and sum(samples) < BUDGET):
+    while not samples or (len(samples) < repeat and _worth_another(samples)):
         cpu, wall = time.process_time(), time.perf_counter()
         result = run()
         samples.append(time.perf_counter() - wall)
         processor.append(time.process_time() - cpu)
     return Timing(tuple(samples), float(np.median(processor))), result
+
+
+def _worth_another(samples: Sequence[float]) -> bool:
+    return sum(samples) < BUDGET or (len(samples) < LEAST and max(samples) < DEAR)
 
 
 def forget_peak_memory() -> None:

@@ -31,11 +31,12 @@ READING = (
     "ran one after the other.\n"
     "- **Error** is against what stands under each table: a closed form, a limit of fine meshes, a symmetry, or the "
     "same mesh driven so slowly that speed plays no part.\n"
-    "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`, under a minute. Other methods need "
-    "`--baselines`, our own long rows (fine meshes, `standard` squeezes, 100,000 substeps of rest) `--long`; both take "
-    "many minutes. This page: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then `tacsim "
-    "bench --from benchmarks/reference.json --docs docs`, with `--from benchmarks/gpu/report.json` too where there is "
-    "one. That is of a GPU: `make test-gpu` measures it and writes the page.\n"
+    "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`; the last of the figures says how long "
+    "that takes (slow limits are kept for the next time). Other methods need `--baselines`, our own long rows (fine "
+    "meshes, `standard` squeezes, 100,000 substeps of rest) `--long`; both take many minutes. This page: `tacsim "
+    "bench all --baselines --long --json benchmarks/reference.json`, then `tacsim bench --from "
+    "benchmarks/reference.json --docs docs`, with `--from benchmarks/gpu/report.json` too where there is one. That is "
+    "of a GPU: `make test-gpu` measures it and writes the page.\n"
     "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
     "`robot/bench/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
     "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
@@ -105,7 +106,7 @@ def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
         f"![Time against error, by method](images/{PICTURE})",
         "## Figures",
         FIGURES,
-        table(targets.HEADER, targets.lines(report.results)),
+        table(targets.HEADER, [*targets.lines(report.results), slowest_group(report)]),
         "## How to read and rerun",
         READING,
     ]
@@ -127,6 +128,16 @@ def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
         *([] if devices else [NO_DEVICE]),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def slowest_group(report: Report) -> list[str]:
+    """The figure that no row has: what `tacsim bench GROUP` takes, as a line of the table."""
+    seconds = report.metadata.group_seconds
+    name = "a group without `--baselines` and `--long`"
+    if seconds:
+        name += f" ({', '.join(f'{group} {value:.0f} s' for group, value in seconds.items())})"
+    slowest = max(seconds.values(), default=None)
+    return targets.lines([], [targets.Target(name, "s", 40, None, lambda rows: slowest)])[0]
 
 
 def _on_device(title: str, reports: Sequence[Report], cpu: Report) -> list[str]:

@@ -13,7 +13,7 @@ RADII = "contact_radius.png"
 # what is drawn: case, variant ("" for any), title, unit of the error
 PANELS = (
     ("sphere_press", "", "Ball R 4 mm, 1 mm deep", "error of the surface [µm rms]"),
-    ("squeeze", "settled to 1 %", "3 mm squeeze, settled", "error of the force [%]"),
+    ("settled_squeeze", "", "3 mm squeeze, settled", "force against one slow limit, of standard [%]"),
     ("plasticine_step", "", "Yield of a 10 mm cube", "error of the stress [%]"),
 )
 # contact radii: figure of the row, words, colour, style

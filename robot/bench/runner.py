@@ -46,6 +46,11 @@ class Case:
     missing: str = ""  # why it cannot be measured here: what the user's folder lacks
 
     @property
+    def short(self) -> bool:
+        """Whether it needs neither --baselines nor --long."""
+        return not (self.baseline or self.long)
+
+    @property
     def needs_cpu(self) -> bool:
         """Whether it says nothing of a device. Other methods are written for the CPU, or in NumPy."""
         return self.cpu or self.method != "tacsim" or self.group == "robot"
@@ -74,12 +79,17 @@ def run_cases(
     rows: list[Row] = []
     failures: list[Failure] = []
     missing = [Missing(**_names(case), cause=case.missing) for case in cases if case.missing]
+    group_seconds: dict[Group, float] = {}
     for together in _apart([case for case in cases if not case.missing]):
+        started = time.perf_counter()
         for case, found in _run(together, repeat, on_start, stop):
             if isinstance(found, str):
                 failures.append(Failure(**_names(case), cause=found))
             else:
                 rows += found
+        if together[0].short:
+            group = together[0].group
+            group_seconds[group] = group_seconds.get(group, 0.0) + time.perf_counter() - started
     groups = list(dict.fromkeys(case.group for case in cases))
     return Report(
         metadata=Metadata(
@@ -94,6 +104,7 @@ def run_cases(
             long=long,
             repeat=repeat,
             seconds=time.perf_counter() - began,
+            group_seconds=group_seconds,
         ),
         results=rows,
         failures=failures,
@@ -110,9 +121,8 @@ def _apart(cases: Sequence[Case]) -> list[list[Case]]:
     method gets one of its own, and so does every long case."""
     parts: list[list[Case]] = []
     for case in cases:
-        shared = not (case.baseline or case.long)
         last = parts[-1][-1] if parts else None
-        if shared and last is not None and last.group == case.group and not (last.baseline or last.long):
+        if case.short and last is not None and last.short and last.group == case.group:
             parts[-1].append(case)
         else:
             parts.append([case])

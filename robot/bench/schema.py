@@ -96,6 +96,7 @@ class Metadata(_Frozen):
     long: bool = False  # long rows of ours were measured too
     repeat: Annotated[int, Field(ge=1)]
     seconds: NotNegative  # the whole run
+    group_seconds: dict[Group, NotNegative] = {}  # each group's short cases of ours: what it takes without options
 
 
 class Report(_Frozen):

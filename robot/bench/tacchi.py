@@ -1,10 +1,16 @@
 """A press at the numbers that Tacchi publishes (Chen et al., RA-L 2023, and its repository): the gel as elastic
 particles on an MLS-MPM grid, the indenter as kinematic particles, contact through the grid alone.
 
-Our own kernels; the numbers are theirs: units mm and s, rho 1, E 1.45e5, nu 0.45, fixed corotated, dt 1e-4, dx 33/256,
-gel 101 x 101 x 21 particles 0.2 mm apart, lowest three layers frozen, indenter at 200 mm/s from 1 mm above the gel,
-stop when the top layer has sunk by 1 mm. One thing is in their favour: the grid ends round the gel instead of filling a
-cube of 256^3 nodes. Of the published densities of indenter points we take the middle one, whose contact fits best.
+The kernels are this module's own, since those of tacsim.physics.seed_kernels cannot run these numbers: there two gels,
+neo-Hookean and with a sensor each, close round a body; the grid is stretched so that their backings lie on its nodes;
+everything that moves is driven by those backings, damped, and has a scaled density. Here one gel of another law (fixed
+corotated), its lowest particles frozen, meets particles with a velocity of their own, undamped. The same in both: APIC
+with quadratic B-splines, F <- (I + dt C) F, bodies that stick to each other through the one grid.
+
+The numbers are theirs: units mm and s, rho 1, E 1.45e5, nu 0.45, fixed corotated, dt 1e-4, dx 33/256, gel 101 x 101 x
+21 particles 0.2 mm apart, lowest three layers frozen, indenter at 200 mm/s from 1 mm above the gel, stop when the top
+layer has sunk by 1 mm. One thing is in their favour: the grid ends round the gel instead of filling a cube of 256^3
+nodes. Of the published densities of indenter points we take the middle one, whose contact fits best.
 """
 
 import math

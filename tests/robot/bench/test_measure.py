@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,8 +32,12 @@ def test_the_first_run_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_repetitions_stop_at_the_budget_but_one_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(100))
     monkeypatch.setattr(measure.time, "perf_counter", lambda: 0.6 * measure.BUDGET * next(clock))
-    assert len(timed(lambda: 0, 10)[0].samples) == 2
+    assert len(timed(lambda: 0, 10)[0].samples) == 3  # what a spread needs; two would fill the budget
+    assert len(timed(lambda: 0, 2)[0].samples) == 2
     assert len(timed(lambda: 0, 1)[0].samples) == 1
+    clock = iter(range(100))
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: 1.01 * measure.DEAR * next(clock))
+    assert len(timed(lambda: 0, 10)[0].samples) == 1
 
 
 def test_median_and_spread() -> None:
@@ -77,6 +82,14 @@ def test_a_case_that_raises_or_dies_is_named_and_the_next_one_runs() -> None:
     assert 2 < row.error < 20  # small strain without friction at a quarter of the thickness
     assert report.metadata.machine.cores >= 1 and report.metadata.versions["numpy"]
     assert Report.model_validate_json(report.model_dump_json()) == report
+
+
+def test_a_report_says_how_long_each_group_took() -> None:
+    more = replace(RAISES, group="materials"), replace(DIES, group="scenes", baseline=True), replace(RAISES, long=True)
+    facts = run_cases([RAISES, *more], 1, baselines=True, long=True).metadata
+    assert list(facts.group_seconds) == ["press", "materials"]  # other methods and long rows of ours do not count
+    assert 0 < sum(facts.group_seconds.values()) < facts.seconds
+    assert "group_seconds" not in json_schema()["$defs"]["Metadata"]["required"]  # older reports have none
 
 
 def test_a_stop_ends_the_running_case_at_once() -> None:

@@ -108,6 +108,17 @@ def test_the_page_shows_figures_and_a_missed_one(report: Report) -> None:
     assert "| a second world is ready | 99 ms | ≤ 50 |  | **missed** |" in missed
 
 
+def test_the_page_shows_how_long_a_group_takes(report: Report) -> None:
+    def page(**seconds: float) -> str:
+        return markdown(report.model_copy(update={"metadata": report.metadata.model_copy(
+            update={"group_seconds": seconds})}))  # fmt: skip
+
+    name = "a group without `--baselines` and `--long`"
+    assert f"| {name} (press 12 s, squeeze 39 s) | 39.4 s | ≤ 40 |  | met |" in page(press=12.3, squeeze=39.4)
+    assert f"| {name} (press 41 s) | 41 s | ≤ 40 |  | **missed** |" in page(press=41.0)
+    assert f"| {name} |  | ≤ 40 |  | not measured |" in page()
+
+
 def test_real_rows_bring_their_picture(tmp_path: Path, report: Report) -> None:
     figures = {"depth_mm": 0.5, "ball_radius_mm": 3.0, "thickness_mm": 10.0, "real_px": 20.0, "pressure_px": 21.0}
     changes = {"group": "real", "case": "contact_radius", "variant": "R 3 mm: image", "figures": figures}

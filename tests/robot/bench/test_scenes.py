@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from robot.bench import deep, press, scenes
+from robot.bench import deep, press, scenes, squeeze
 from robot.bench.squeeze import close, squeeze_scene, touching
 from tacsim.interface import Pose
 from tacsim.physics.batch import Batch
@@ -19,6 +19,27 @@ def test_slab_theory() -> None:
     assert deep.slab_force(30e3, 1e-6, 1e-2 / 100 ** (1 / 3)) / (3.0 * 100 ** (1 / 3)) == pytest.approx(
         2.9245, abs=1e-4
     )
+
+
+def test_a_slab_row_tells_what_the_body_itself_went_through() -> None:
+    (row,) = deep._slab_rows(squeeze_scene("draft"), (0.15,), "closed by {:.0f} %")
+    assert row.variant == "closed by 15 %"
+    height = row.figures["height_mm"]
+    assert 8.5 < height < 10  # the gels give way by the rest
+    assert row.figures["squeezed_percent"] == pytest.approx(100 - 10 * height)
+    assert f"{height:.2f} mm high" in row.note
+    assert row.figures["slab_n"] == pytest.approx(deep.slab_force(30e3, 1e-6, height * 1e-3))
+
+
+def test_a_squeeze_is_judged_by_its_own_limit_and_by_one_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = {"draft": 4.3, "standard": 4.0}
+    monkeypatch.setattr(squeeze, "slow_force", lambda preset, physics="hybrid": limits[preset])
+    rows = {row.variant: row for row in squeeze.squeeze("draft", "hybrid", 1)}
+    (common,) = squeeze.settled_squeeze("draft", "hybrid", 1)
+    force = common.figures["force_n"]
+    assert rows["settled to 1 %"].error == pytest.approx(abs(force / 4.3 - 1) * 100)
+    assert common.error == pytest.approx(abs(force / 4.0 - 1) * 100)
+    assert rows["overlap"].error < 0.02 and 0 < rows["gap"].error < 0.02  # mm: what must be reached
 
 
 def test_a_second_world_is_the_first_once_more() -> None:
@@ -65,7 +86,7 @@ def test_a_sheared_body_rests_where_it_is() -> None:
 
 def test_the_plate_slides_until_friction_is_built_up() -> None:
     (row,) = press.sliding_force(1e-3, 1)
-    assert row.figures["way_mm"] >= 3
+    assert row.figures["way_mm"] >= 2
     assert row.error < 1.0 and row.note == ""
 
 

@@ -57,7 +57,7 @@ def test_the_worst_row_counts() -> None:
 
 def test_figures_of_a_row_and_units() -> None:
     step = row(case="plasticine_alone", figures={"wall_per_particle_substep_ns": 76.0})
-    assert target("plasticine step, 64,000 particles, wall").judge([step]) == (76.0, "missed")
+    assert target("plasticine step, 64,000 particles, wall: plasticine alone").judge([step]) == (76.0, "missed")
     control = row(case="control_step", variant="0.1 mm, flowing, and two images", seconds=0.02)
     assert target("control step, draft, two images: flowing").judge([control]) == (pytest.approx(20.0), "met")
     assert target("control step, draft, two images: each one settled").judge([control])[1] == "not measured"
@@ -88,8 +88,8 @@ def test_the_table_says_it_in_words() -> None:
     shown = {cells[0]: cells[1:] for cells in lines([row(seconds=0.5)])}
     assert shown["press of a ball R 4 mm, 1 mm deep, h 0.5 mm"] == ["0.5 s", "≤ 0.3", "≤ 0.05", "**missed**"]
     assert shown["... faster than at Tacchi's settings"] == ["", "≥ 100", "≥ 500", "not measured"]
-    assert shown["squeeze by 80 %, force against slab theory"][-1] == "not measured"
-    slab = lines([row(case="slab", variant="80 % of its height", error=40.0)], TARGETS)
+    assert shown["soft gels, sensors closed by 80 %: force against slab theory"][-1] == "not measured"
+    slab = lines([row(case="slab", variant="sensors closed by 80 %", error=40.0)], TARGETS)
     assert "**missed**: beyond the limit it must be explained: docs/physics.md, How to choose" in {c[-1] for c in slab}
     assert "test_no_case_ended_the_process" in shown["hard cases that end their process"][-1]
 
@@ -109,7 +109,8 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
     """Rows made of the cases' own names and resolutions, with the variants and figures that the targets ask for."""
     variants = ["", "tolerance", "two speeds, Mach 0.03 and 0.015", "not settled", "settled to 1 %",
                 "force balance", "overlap", "0.1 mm, flowing", "0.1 mm, settled",
-                "80 % of its height", "stick limit", "lattice, 3 mm", "random, 3 mm",
+                "gap", "sensors closed by 80 %", "by 67 %", "by 80 %",
+                "its centre", "its farthest particle", "stick limit", "lattice, 3 mm", "random, 3 mm",
                 "R 3 mm, 1 mm deep: image", "R 3 mm, 1 mm deep: pressure",
                 "THUsight: picture", "THUsight: normals", "Taxim: picture", "FOTS: picture", "R 3 mm: height",
                 "surfaces: drift, gain −30 %", "640 x 480", "320 x 240",

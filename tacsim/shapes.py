@@ -212,6 +212,9 @@ def distance_grid(geometry: Shape, spacing: float, box: tuple[ArrayLike, ArrayLi
         )
     counts = nodes.astype(int)
     if isinstance(geometry, Mesh):
+        half, band = extent(geometry) / 2, BAND * spacing
+        if (lower > half + band).any() or (upper < -half - band).any():
+            raise ValueError(f"the box comes nowhere within {_mm(band)} of the {_name(geometry)}; put it round a part")
         return _mesh_grid(geometry, fingerprint(geometry.path), tuple(lower), tuple(counts), spacing)
     points = np.stack(np.meshgrid(*_axes(lower, counts, spacing), indexing="ij"), axis=-1)
     values = distance(geometry, points.reshape(-1, 3)).reshape(points.shape[:3])

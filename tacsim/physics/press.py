@@ -1,5 +1,6 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from tacsim.physics.gel import (
     MM,
     MPA,
     Corners,
+    GelFacts,
     GelState,
     Lattice,
     Nodes,
@@ -22,7 +24,7 @@ from tacsim.physics.gel import (
     gel_forces,
     one_lattice,
 )
-from tacsim.physics.health import Health, copies, judged
+from tacsim.physics.health import Health, SimulationDiverged, copies, judged
 from tacsim.physics.hybrid import ZETA_GEL_HELD, side_by_side
 from tacsim.physics.hybrid_kernels import Drive
 from tacsim.physics.indenter import (
@@ -59,8 +61,8 @@ from tacsim.physics.layout import (
 )  # fmt: skip
 from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.runtime import start, ti
-from tacsim.scene import Box, Cylinder, Scene, Shape, Sphere
-from tacsim.shapes import MAX_NODES, extent
+from tacsim.scene import Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.shapes import MAX_NODES, extent, farthest
 from tacsim.tiles import TILE, TiledDistance, tiled_distance
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
@@ -68,6 +70,7 @@ from tacsim.tiles import TILE, TiledDistance, tiled_distance
 COURANT = 0.4
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
+UNSEEN = 0.5  # spacings of contact points that an indenter may dip between them; a ball that just does not fit: 0.35
 MARGIN = 2.0  # elements round a mesh, or the part of a gel that lies there: nothing else touches in the next launch
 
 
@@ -119,7 +122,7 @@ class PressState:
     """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for gels that are not cut alike."""
+        """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
         start()
         self.gel = [gel_facts(scene.gel, scene.element) for scene in scenes]
         lattice = one_lattice(self.gel)
@@ -139,6 +142,7 @@ class PressState:
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
         """Writes one environment's indenter into facts and counts; returns the distances of a mesh."""
         assert scene.indenter is not None
+        _require_resolved(scene.indenter.geometry, self.gel[index])
         kind, size, mesh = _shape_facts(scene.indenter.geometry)
         self.counts[index, KIND], self.facts[index, SHAPE : SHAPE + 3] = kind, size
         self.facts[index, SHAPE_SPACING] = GRID_SPACING * MM
@@ -268,7 +272,47 @@ class PressWorld(DrivenWorld):
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
+        if not force.any() and (prepared.launch.held or prepared.launch.last == prepared.launch.path.substeps):
+            self._require_touch(prepared)
         return Reading(force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half))
+
+    def _require_touch(self, prepared: Prepared) -> None:
+        """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points."""
+        assert self.scene.indenter is not None
+        rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
+        down = rows[:3].T @ [0.0, 0.0, -1.0]
+        mesh, geometry = self._state.meshes[self._index], self.scene.indenter.geometry
+        if isinstance(geometry, Mesh):
+            assert mesh is not None
+            lowest = mesh.vertices[np.argmax(mesh.vertices @ down)]
+        else:
+            lowest = farthest(geometry, down)
+        tip = rows[:3] @ (lowest * MM) + rows[3]
+        if (np.abs(tip[:2]) > np.array(self._gel.half) - spacing).any():
+            return  # beside the gel, or at its rim
+        nodes = self._surface_nodes()
+        near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
+        depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
+        if depth > UNSEEN * spacing / POINTS:
+            cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
+            finer = self._gel.thickness / (2 * self._gel.elements[2])
+            advice = (
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between them: "
+                f"use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
+            )
+            raise SimulationDiverged(cause, str(prepared.where), advice)
+
+
+def _require_resolved(geometry: Shape, gel: GelFacts) -> None:
+    """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
+    narrow, spacing = float(extent(geometry)[:2].min()) * MM, gel.spacing / POINTS
+    if narrow < math.sqrt(2.0) * spacing:
+        layers = math.ceil(gel.thickness / (narrow * POINTS / math.sqrt(2.0)))
+        raise ValueError(
+            f"the indenter ({geometry.shape}) is {narrow:.4g} mm wide and fits between the gel's contact points, which "
+            f"lie {spacing:.4g} mm apart (element_size / {POINTS}): choose element_size at most "
+            f"{math.floor(1e4 * gel.thickness / layers) / 1e4:g} mm, or a finer preset"
+        )
 
 
 def _shape_facts(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistance | None]:

@@ -7,10 +7,11 @@ import pytest
 
 from tacsim import tiles
 from tacsim.interface import Pose
+from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.layer import layer_contact
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import Order
-from tacsim.scene import Box, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
+from tacsim.scene import Box, Cylinder, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
 
 
 def world(geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, **scene: object) -> PressWorld:
@@ -249,3 +250,28 @@ def test_contact_forgets_what_it_no_longer_touches(kind: str, tmp_path: Path) ->
     move(w, (0, 0, 6e-3))
     far = w.snapshot()
     assert not far["slip"].any() and not far["pressure"].any()
+
+
+def test_an_indenter_that_fits_between_the_contact_points_is_refused() -> None:
+    for shape in (Sphere(radius=0.1e-3), Box(size=(0.3e-3, 4e-3, 4e-3)), Cylinder(radius=0.2e-3, height=4e-3)):
+        with pytest.raises(ValueError, match=r"fits between .* 0\.3333 mm apart .* choose element_size at most 0\."):
+            world(shape, preset="draft")
+    assert world(Sphere(radius=0.24e-3), preset="draft")
+    with pytest.raises(ValueError, match=r"at most 0\.2105 mm"):
+        world(Sphere(radius=0.05e-3), preset="draft")
+    assert world(Sphere(radius=0.05e-3), element_size=0.2105e-3, gel=Gel(size=(4e-3, 4e-3, 4e-3)))
+
+
+def test_a_tip_that_passes_between_the_contact_points_is_an_error(tmp_path: Path) -> None:
+    """A needle below a plate: by its width it may be pressed, so only the way down shows it."""
+    import trimesh
+
+    needle = trimesh.creation.box((0.1, 0.1, 2.0))
+    plate = trimesh.creation.box((4.0, 4.0, 1.0)).apply_translation((0, 0, 1.5))
+    trimesh.util.concatenate([needle, plate]).export(tmp_path / "needle.stl")
+    w = world(Mesh(path=str(tmp_path / "needle.stl")), preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+    move(w, (0, 0, -0.2e-3))
+    before = w.snapshot()
+    with pytest.raises(SimulationDiverged, match=r"0\.4 mm deep .* no contact point .* such as 0\.5 mm, or a finer"):
+        move(w, (0, 0, -0.3e-3))
+    assert all(before[name].tobytes() == a.tobytes() for name, a in w.snapshot().items())

@@ -239,9 +239,7 @@ def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatA
     Exact where it is below `band` [m] (at least one grid spacing). Beyond, the sign is right and the value is the
     distance to the triangle that is nearest to the nearest node in the band: never too small; too large only where
     several triangles are nearly as near (by half a spacing at most in the tests: the centre of a ball), or where the
-    grid leaves out the nearest part of the surface.
-
-    Raises ValueError when no node lies within `band` of the surface.
+    grid leaves out the nearest part of the surface. Where no node lies within `band`, one that is next to it is exact.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -250,9 +248,7 @@ def signed_distance_on_grid(surface: Surface, axes: Axes, band: float) -> FloatA
     limit = band / surface.unit + surface.reach
     near = np.isfinite(surface.tree.query(points, distance_upper_bound=limit)[0])
     if not near.any():
-        raise ValueError(
-            f"the grid comes nowhere within {band:.3g} m of the mesh; put its box round the part that touches"
-        )
+        near[np.argmin(surface.tree.query(points)[0])] = True
     values = np.empty(len(points))
     triangle = np.empty(len(points), dtype=np.int64)
     values[near], triangle[near] = _nearest(surface, points[near])

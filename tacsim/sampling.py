@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from tacsim.scene import Body, Shape
-from tacsim.shapes import FloatArray, distance, extent, nearest_surface, particles
+from tacsim.shapes import FloatArray, distance, extent, nearest_surface, no_particle, particles
 
 ITERATIONS = 20  # of mutual repulsion
 REACH = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
@@ -46,6 +46,8 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
         depth, normals = surface(points)
         points -= np.maximum(depth + SKIN * spacing, 0.0)[:, None] * normals
     inside: NDArray[np.bool_] = distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
+    if not inside.any():
+        raise no_particle(geometry, spacing)
     return np.asarray(points[inside])
 
 

@@ -48,6 +48,19 @@ def extent(geometry: Shape) -> FloatArray:
             return np.array(_mesh_extent(geometry, fingerprint(geometry.path)))
 
 
+def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike) -> FloatArray:
+    """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those."""
+    along = np.asarray(direction, dtype=np.float64)
+    match geometry:
+        case Box():
+            return np.asarray(np.sign(along) * np.array(geometry.size) / 2)
+        case Sphere():
+            return np.asarray(geometry.radius * along / np.linalg.norm(along))
+        case Cylinder():
+            rim = geometry.radius * along[:2] / max(float(np.linalg.norm(along[:2])), 1e-12)
+            return np.append(rim, np.sign(along[2]) * geometry.height / 2)
+
+
 def volume(geometry: Shape) -> float:
     """Enclosed volume [m^3]. Raises what :func:`tacsim.mesh.load_mesh` raises."""
     match geometry:
@@ -93,7 +106,7 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
         inside = distance(geometry, nodes) <= 0
     found: FloatArray = nodes[inside]
     if len(found) == 0:
-        raise ValueError(f"{_name(geometry)} holds no particle at a spacing of {_mm(spacing)}; use a smaller spacing")
+        raise no_particle(geometry, spacing)
     misfit = len(found) / estimate - 1
     if isinstance(geometry, Mesh) and abs(misfit) > MAX_MISFIT:
         raise ValueError(
@@ -101,6 +114,10 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
             f"{MAX_MISFIT:.0%}); parts are thinner than the spacing: use a smaller one"
         )
     return found
+
+
+def no_particle(geometry: Shape, spacing: float) -> ValueError:
+    return ValueError(f"{_name(geometry)} holds no particle at a spacing of {_mm(spacing)}; use a smaller spacing")
 
 
 def _check_layers(geometry: Shape, size: FloatArray, spacing: float, layers: NDArray[np.int_]) -> None:
@@ -212,6 +229,9 @@ def distance_grid(geometry: Shape, spacing: float, box: tuple[ArrayLike, ArrayLi
         )
     counts = nodes.astype(int)
     if isinstance(geometry, Mesh):
+        half, band = extent(geometry) / 2, BAND * spacing
+        if (lower > half + band).any() or (upper < -half - band).any():
+            raise ValueError(f"the box comes nowhere within {_mm(band)} of the {_name(geometry)}; put it round a part")
         return _mesh_grid(geometry, fingerprint(geometry.path), tuple(lower), tuple(counts), spacing)
     points = np.stack(np.meshgrid(*_axes(lower, counts, spacing), indexing="ij"), axis=-1)
     values = distance(geometry, points.reshape(-1, 3)).reshape(points.shape[:3])

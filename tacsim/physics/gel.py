@@ -83,9 +83,12 @@ class GelFacts:
 
 
 def gel_facts(gel: Gel, element: float) -> GelFacts:
-    """Fits cubic elements of about `element` [m] into the gel. Raises ValueError if its sides do not fit one cube."""
-    counts = tuple(max(2 if axis == 2 else 4, round(side / element)) for axis, side in enumerate(gel.size))
-    spacing = gel.size[2] / counts[2]
+    """Fits cubic elements of about `element` [m] into the gel, two of them or more along each axis.
+
+    Raises ValueError if its sides do not fit one cube, or are narrower than two.
+    """
+    layers = max(2, round(gel.size[2] / element))
+    spacing = gel.size[2] / layers
     for side in gel.size[:2]:
         if abs(round(side / spacing) * spacing - side) > 0.05 * spacing:
             raise ValueError(
@@ -93,8 +96,14 @@ def gel_facts(gel: Gel, element: float) -> GelFacts:
                 f"choose element_size so that length, width and thickness are whole multiples of it"
             )
     nx, ny = (round(side / spacing) for side in gel.size[:2])
+    if min(nx, ny) < 2:
+        most = min(gel.size[:2]) / 2
+        raise ValueError(
+            f"gel size {gel.size} m makes {nx} x {ny} x {layers} elements of {spacing * 1e3:.4g} mm; its surface is a "
+            f"spline and needs two along each axis: choose an element_size of at most {most * 1e3:.4g} mm"
+        )
     mu, lam = lame(gel.material)
-    return GelFacts((nx, ny, counts[2]), spacing * MM, mu * MPA, lam * MPA)
+    return GelFacts((nx, ny, layers), spacing * MM, mu * MPA, lam * MPA)
 
 
 def one_lattice(gels: Sequence[GelFacts]) -> GelFacts:

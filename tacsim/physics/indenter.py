@@ -15,6 +15,7 @@ from tacsim.physics.layout import (
     KIND,
     OVERLAP,
     SHAPE,
+    SHAPE_FIRST,
     SHAPE_NODES,
     SHAPE_ORIGIN,
     SHAPE_SPACING,
@@ -64,11 +65,18 @@ def direction(y):
 
 
 @ti.func
-def signed_distance(env, kind, size, y, values: ti.template(), nodes, origin, spacing):
+def box_distance(size, y):
+    """Distance and outward normal of a box of half extents `size`."""
+    return corner_distance(ti.abs(y) - size, direction(y))
+
+
+@ti.func
+def signed_distance(env, kind, size, y, values: ti.template(), first, nodes, origin, spacing):
     """Distance from the indenter's surface (negative inside) and its outward normal, at y in the indenter's frame.
 
-    size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere.
-    nodes, origin, spacing: of this environment's distance grid in `values`.
+    size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; of a mesh half extents of
+    its bounding box. first, nodes, origin, spacing: of this environment's distance grid, of which `values` has `nodes`
+    from number `first` on along each axis; the world keeps at hand what can touch (`PressState.cover`).
     """
     phi, n = FAR, vec3(0.0, 0.0, 1.0)
     if kind == SPHERE:
@@ -76,19 +84,19 @@ def signed_distance(env, kind, size, y, values: ti.template(), nodes, origin, sp
         phi = r - size[0]
         n = y / ti.max(r, 1e-12)
     elif kind == BOX:
-        phi, n = corner_distance(ti.abs(y) - size, direction(y))
+        phi, n = box_distance(size, y)
     elif kind == CYLINDER:
         r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
         phi, radial = corner_distance(vec3(r - size[0], -FAR, ti.abs(y[2]) - size[2]), vec3(1.0))
         n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])
     else:
         at = (y - origin) / spacing
+        whole = ti.floor(at)
+        cell, w = whole.cast(ti.i32) - first, at - whole
         known = True
         for d in ti.static(range(3)):
-            known = known and at[d] >= 0.0 and at[d] < nodes[d] - 1
+            known = known and cell[d] >= 0 and cell[d] < nodes[d] - 1
         if known:
-            cell = ti.floor(at).cast(ti.i32)
-            w = at - cell.cast(ti.f32)
             phi = 0.0
             n = vec3(0.0)
             for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
@@ -115,6 +123,7 @@ def indent(
     grid_origin = vec3(facts[env, SHAPE_ORIGIN], facts[env, SHAPE_ORIGIN + 1], facts[env, SHAPE_ORIGIN + 2])
     grid_spacing = facts[env, SHAPE_SPACING]
     nodes = ti.Vector([counts[env, SHAPE_NODES], counts[env, SHAPE_NODES + 1], counts[env, SHAPE_NODES + 2]])
+    first_node = ti.Vector([counts[env, SHAPE_FIRST], counts[env, SHAPE_FIRST + 1], counts[env, SHAPE_FIRST + 2]])
     rows = [vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(6)]
     rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
     area = h * h / (POINTS * POINTS)
@@ -131,19 +140,25 @@ def indent(
         first_cell, last_cell = part_range(nx, part)
     for cell_i in range(first_cell, last_cell):
         for cell_j in range(low, high):
-            # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides. A distance
-            # grows no faster than the way, and no point of the cell is farther from its middle than two elements.
+            # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh,
+            # whose distances are true only near it, that of its bounding box. A distance grows no faster than the way,
+            # and no point of the cell is farther from its middle than two elements.
             middle = vec3(0.0)
             for p, q in ti.static(ti.ndrange(2, 2)):
                 node = skin_at(row + cell_i + p + 1, cell_j + q + 1, ny)
                 middle += 0.25 * vec3(skin[node], skin[node + 1], skin[node + 2])
             at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
             at += middle
-            far, _ = signed_distance(env, kind, size, back @ (at - centre), values, nodes, grid_origin, grid_spacing)
+            far = 0.0
+            if kind == GRID:
+                far, _ = box_distance(size, back @ (at - centre))
+            else:
+                far, _ = signed_distance(
+                    env, kind, size, back @ (at - centre), values, first_node, nodes, grid_origin, grid_spacing
+                )
             if far > FAR_CELL * h:
-                # Nothing passes this margin in one substep, so what is beyond has forgotten. A mesh's distances end
-                # nearer, and jump there.
-                if far < (FAR_CELL + 1) * h or kind == GRID:
+                # Nothing passes this margin in one substep, so what is beyond has forgotten.
+                if far < (FAR_CELL + 1) * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                         slip[env, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
                         pressure[env, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
@@ -157,7 +172,7 @@ def indent(
                     vs = skin_sum(skin, row + nx + 3, first_i, first_j, wx, wy, ny)
                     x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
                     phi, n_local = signed_distance(
-                        env, kind, size, back @ (x - centre), values, nodes, grid_origin, grid_spacing
+                        env, kind, size, back @ (x - centre), values, first_node, nodes, grid_origin, grid_spacing
                     )
                     touching = False
                     if phi < 0.5 * h:

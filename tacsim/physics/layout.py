@@ -22,7 +22,7 @@ HOUSING = 18  # below the gel's surface [mm]; negative: none
 GRAVITY = 19  # acceleration x, y, z [1/mm]
 ORIGIN = 22  # of the grid x, y, z [mm]
 SHAPE = 25  # of an indenter: three sizes [mm]
-SHAPE_ORIGIN = 28  # of its distance grid x, y, z [mm]
+SHAPE_ORIGIN = 28  # of its distance grid, node (0, 0, 0): x, y, z [mm]
 SHAPE_SPACING = 31  # of its distance grid [mm]
 SPREAD = 32  # share of an incompressible body's widening that is part of the motion its damping is against
 CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
@@ -37,9 +37,10 @@ SLAB = 6  # first node plane and the one after the last of part 0, 1, ...
 KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
 CAPACITY = 16  # strips of grid nodes that an environment has room for, in each copy
-SHAPE_NODES = 17  # of an indenter's distance grid x, y, z
+SHAPE_NODES = 17  # of an indenter's distance grid, how many are at hand along x, y, z
 ELEMENTS = 20  # of a gel along x, y, z
-COUNTS = 23
+SHAPE_FIRST = 23  # of the nodes that are at hand of an indenter's distance grid, number along x, y, z
+COUNTS = 26
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements

@@ -1,5 +1,6 @@
 """A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from tacsim.physics.gel import (
     MM,
     MPA,
     Corners,
+    GelFacts,
     GelState,
     Lattice,
     Nodes,
@@ -22,7 +24,7 @@ from tacsim.physics.gel import (
     gel_forces,
     one_lattice,
 )
-from tacsim.physics.health import Health, copies, judged
+from tacsim.physics.health import Health, SimulationDiverged, copies, judged
 from tacsim.physics.hybrid import ZETA_GEL_HELD, side_by_side
 from tacsim.physics.hybrid_kernels import Drive
 from tacsim.physics.indenter import (
@@ -49,6 +51,7 @@ from tacsim.physics.layout import (
     KIND,
     NUMBERS,
     SHAPE,
+    SHAPE_FIRST,
     SHAPE_NODES,
     SHAPE_ORIGIN,
     SHAPE_SPACING,
@@ -58,15 +61,17 @@ from tacsim.physics.layout import (
 )  # fmt: skip
 from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
 from tacsim.runtime import start, ti
-from tacsim.scene import Box, Cylinder, Scene, Sphere
-from tacsim.shapes import distance_grid, extent
+from tacsim.scene import Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.shapes import MAX_NODES, extent, farthest
+from tacsim.tiles import TILE, TiledDistance, tiled_distance
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
 # with the step's square, so 0.5 costs overlap.
 COURANT = 0.4
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
-REACH = 3e-3  # of a mesh's distance grid, up from its tip [m]
+UNSEEN = 0.5  # spacings of contact points that an indenter may dip between them; a ball that just does not fit: 0.35
+MARGIN = 2.0  # elements round a mesh, or the part of a gel that lies there: nothing else touches in the next launch
 
 
 @ti.kernel
@@ -117,7 +122,7 @@ class PressState:
     """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for gels that are not cut alike."""
+        """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
         start()
         self.gel = [gel_facts(scene.gel, scene.element) for scene in scenes]
         lattice = one_lattice(self.gel)
@@ -130,15 +135,45 @@ class PressState:
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
-        self._values = _stacked([self._set_shape(index, scene) for index, scene in enumerate(scenes)])
+        self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
+        self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
+        self._laid: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # tiles at hand, of environments with a mesh
 
-    def _set_shape(self, index: int, scene: Scene) -> np.ndarray:
-        """Writes one environment's indenter into facts and counts; returns its distance values [mm]."""
-        kind, size, values, origin, spacing = _distance_facts(scene)
-        self.counts[index, KIND], self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = kind, values.shape
-        self.facts[index, SHAPE : SHAPE + 3], self.facts[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = size, origin
-        self.facts[index, SHAPE_SPACING] = spacing
-        return values
+    def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
+        """Writes one environment's indenter into facts and counts; returns the distances of a mesh."""
+        assert scene.indenter is not None
+        _require_resolved(scene.indenter.geometry, self.gel[index])
+        kind, size, mesh = _shape_facts(scene.indenter.geometry)
+        self.counts[index, KIND], self.facts[index, SHAPE : SHAPE + 3] = kind, size
+        self.facts[index, SHAPE_SPACING] = GRID_SPACING * MM
+        if mesh is not None:
+            self.facts[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
+        return mesh
+
+    def cover(self, index: int, low: np.ndarray, high: np.ndarray) -> None:
+        """Has at hand the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
+
+        Raises ValueError for more nodes than there is memory for.
+        """
+        mesh = self.meshes[index]
+        assert mesh is not None
+        first, end = mesh.around(low / MM, high / MM)
+        old = self._laid.get(index)
+        if old is not None:
+            if (first >= old[0]).all() and (end <= old[1]).all():
+                return
+            both = np.minimum(first, old[0]), np.maximum(end, old[1])
+            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= MAX_NODES:
+                first, end = both
+        values = mesh.values(first, end) * np.float32(MM)
+        if (np.array(values.shape) > self._values.shape[1:]).any():
+            more = np.maximum(np.array(values.shape) - self._values.shape[1:], 0)
+            self._values = np.pad(self._values, [(0, 0), *((0, int(n)) for n in more)])
+        nx, ny, nz = values.shape
+        self._values[index, :nx, :ny, :nz] = values
+        self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
+        self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
+        self._laid[index] = first, end
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
@@ -154,15 +189,6 @@ class PressState:
                 press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.facts,
                 self.counts, self.partial, active=list(drives),
             )  # fmt: skip
-
-
-def _stacked(grids: Sequence[np.ndarray]) -> np.ndarray:
-    """Distance values of all environments in one array (E, most x, most y, most z); each has its own node counts."""
-    most = np.max([grid.shape for grid in grids], axis=0)
-    values = np.zeros((len(grids), *most), np.float32)
-    for index, grid in enumerate(grids):
-        values[index, : grid.shape[0], : grid.shape[1], : grid.shape[2]] = grid
-    return values
 
 
 class PressWorld(DrivenWorld):
@@ -216,7 +242,28 @@ class PressWorld(DrivenWorld):
         both = path.drive(launch.first, launch.last)
         self._state.facts[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
-        return Prepared(launch, relative_drive(both[:, 0], both[:, 1]), where, good)
+        drive = relative_drive(both[:, 0], both[:, 1])
+        self._cover(drive)
+        return Prepared(launch, drive, where, good)
+
+    def _cover(self, drive: np.ndarray) -> None:
+        """A mesh's distances wherever the gel's surface may meet it in this launch."""
+        mesh = self._state.meshes[self._index]
+        if mesh is None:
+            return
+        margin, half = MARGIN * self._gel.spacing, mesh.half * MM
+        for rows in drive[[0, -1], 0].astype(np.float64):
+            at = (self._surface_nodes() - rows[3]) @ rows[:3]
+            near = at[(np.abs(at) <= half + margin).all(axis=1)]
+            if len(near):
+                self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
+
+    def _surface_nodes(self) -> np.ndarray:
+        """Where the nodes of the gel's surface are (n, 3) [mm], sensor frame."""
+        top = self._state.gels.u[self._index, 0, :, :, -1].astype(np.float64)
+        axes = (self._gel.spacing * (np.arange(n) - (n - 1) / 2) for n in top.shape[:2])
+        top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        return top.reshape(-1, 3)
 
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
@@ -225,29 +272,60 @@ class PressWorld(DrivenWorld):
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
+        if not force.any() and (prepared.launch.held or prepared.launch.last == prepared.launch.path.substeps):
+            self._require_touch(prepared)
         return Reading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
             scheme=Scheme(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
 
+    def _require_touch(self, prepared: Prepared) -> None:
+        """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points."""
+        assert self.scene.indenter is not None
+        rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
+        down = rows[:3].T @ [0.0, 0.0, -1.0]
+        mesh, geometry = self._state.meshes[self._index], self.scene.indenter.geometry
+        if isinstance(geometry, Mesh):
+            assert mesh is not None
+            lowest = mesh.vertices[np.argmax(mesh.vertices @ down)]
+        else:
+            lowest = farthest(geometry, down)
+        tip = rows[:3] @ (lowest * MM) + rows[3]
+        if (np.abs(tip[:2]) > np.array(self._gel.half) - spacing).any():
+            return  # beside the gel, or at its rim
+        nodes = self._surface_nodes()
+        near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
+        depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
+        if depth > UNSEEN * spacing / POINTS:
+            cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
+            finer = self._gel.thickness / (2 * self._gel.elements[2])
+            advice = (
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
+                f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
+            )
+            raise SimulationDiverged(cause, str(prepared.where), advice)
 
-def _distance_facts(scene: Scene) -> tuple[int, tuple[float, ...], np.ndarray, tuple[float, ...], float]:
-    """Kind, size [mm], distance values [mm], and their origin and spacing [mm]; a mesh is sampled near its tip."""
-    assert scene.indenter is not None
-    geometry = scene.indenter.geometry
-    empty = np.zeros((2, 2, 2), np.float32)
+
+def _require_resolved(geometry: Shape, gel: GelFacts) -> None:
+    """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
+    narrow, spacing = float(extent(geometry)[:2].min()) * MM, gel.spacing / POINTS
+    if narrow < math.sqrt(2.0) * spacing:
+        layers = math.ceil(gel.thickness / (narrow * POINTS / math.sqrt(2.0)))
+        raise ValueError(
+            f"the indenter ({geometry.shape}) is {narrow:.4g} mm wide and fits between the gel's contact points, which "
+            f"lie {spacing:.4g} mm apart (element_size / {POINTS}): choose element_size at most "
+            f"{math.floor(1e4 * gel.thickness / layers) / 1e4:g} mm, or a finer preset"
+        )
+
+
+def _shape_facts(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistance | None]:
+    """Kind and size [mm] for the kernels (`signed_distance`), and the distances of a mesh."""
     match geometry:
         case Sphere():
-            return SPHERE, (geometry.radius * MM, 0.0, 0.0), empty, (0.0, 0.0, 0.0), 1.0
+            return SPHERE, (geometry.radius * MM, 0.0, 0.0), None
         case Cylinder():
-            return CYLINDER, (geometry.radius * MM, 0.0, geometry.height / 2 * MM), empty, (0.0, 0.0, 0.0), 1.0
+            return CYLINDER, (geometry.radius * MM, 0.0, geometry.height / 2 * MM), None
         case Box():
-            return BOX, tuple(side / 2 * MM for side in geometry.size), empty, (0.0, 0.0, 0.0), 1.0
-    half = extent(geometry) / 2
-    reach = 2 * GRID_SPACING + np.minimum(half, np.array(scene.gel.size) / 2)
-    top = min(half[2] + 2 * GRID_SPACING, -half[2] + REACH + scene.gel.size[2] / 2)
-    grid = distance_grid(
-        geometry, GRID_SPACING, ([-reach[0], -reach[1], -half[2] - 2 * GRID_SPACING], [reach[0], reach[1], top])
-    )
-    values = np.ascontiguousarray(grid.values * np.float32(MM))
-    return GRID, (0.0, 0.0, 0.0), values, tuple(float(o) * MM for o in grid.origin), grid.spacing * MM
+            return BOX, tuple(side / 2 * MM for side in geometry.size), None
+    mesh = tiled_distance(geometry, GRID_SPACING)
+    return GRID, tuple(float(side) * MM for side in mesh.half), mesh

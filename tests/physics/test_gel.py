@@ -259,3 +259,9 @@ def test_inversion_is_seen() -> None:
 def test_sizes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="does not divide"):
         gel_facts(Gel(size=(20e-3, 20.4e-3, 4e-3)), 1e-3)
+
+
+def test_a_gel_of_one_element_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"makes 1 x 4 x 4 elements of 1 mm; .* element_size of at most 0\.5 mm"):
+        gel_facts(Gel(size=(1e-3, 4e-3, 4e-3)), 1e-3)
+    assert gel_facts(Gel(size=(1e-3, 4e-3, 4e-3)), 0.5e-3).elements == (2, 8, 8)

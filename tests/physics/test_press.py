@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tacsim import shapes
+from tacsim import tiles
 from tacsim.interface import Pose
+from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.indenter import POINTS
 from tacsim.physics.layer import layer_contact
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import Order
-from tacsim.scene import Box, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
+from tacsim.scene import Box, Cylinder, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
 
 
 def world(geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, **scene: object) -> PressWorld:
@@ -138,6 +139,37 @@ def test_a_mesh_presses_like_its_closed_form(tmp_path: object) -> None:
     assert np.abs(a.surface("lower").displacement - b.surface("lower").displacement).max() < 10e-6
 
 
+def brick(folder: Path, size: tuple[float, float, float]) -> tuple[Box, Mesh]:
+    """The same box [mm] in closed form and as an STL file."""
+    import trimesh
+
+    trimesh.creation.box(size).export(folder / "brick.stl")
+    return Box(size=tuple(side * 1e-3 for side in size)), Mesh(path=str(folder / "brick.stl"))
+
+
+def test_a_mesh_wider_than_the_gel_is_there_wherever_it_is_moved(tmp_path: Path) -> None:
+    """Its far ends, brought over the gel after it was pressed, and by a turn, press as those of the closed form."""
+    forces = []
+    for shape in brick(tmp_path, (18, 5, 2)):
+        w = world(shape, 0.2, preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+        found = []
+        for by, turn in (((0, 0, -0.4e-3), 0.0), ((7e-3, 0, 0), 0.0), ((0, 0, 0), 0.5)):
+            move(w, by, turn)
+            found.append(-w.wrench("lower")[2])
+        forces.append(found)
+    assert forces[1] == pytest.approx(forces[0], rel=0.02) and min(forces[0]) > 0.2
+
+
+def test_a_mesh_laid_on_its_side_presses_like_its_closed_form(tmp_path: Path) -> None:
+    lying, forces = np.array([0, np.sin(np.pi / 4), 0, np.cos(np.pi / 4)]), []
+    for shape in brick(tmp_path, (2, 2, 10)):
+        w = world(shape, preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+        for height in (9e-3, 1.1e-3, 0.7e-3):
+            assert w.move({"indenter": Pose(np.array([0, 0, height]), lying)}).settled
+        forces.append(w.wrench("lower")[2])
+    assert forces[1] == pytest.approx(forces[0], rel=1e-3) and forces[0] < -0.2
+
+
 def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,22 +183,23 @@ def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     computed: list[str] = []
 
     def count(name: str) -> None:
-        real = getattr(shapes, name)
-        monkeypatch.setattr(shapes, name, lambda *given: (computed.append(name), real(*given))[1])
+        real = getattr(tiles, name)
+        monkeypatch.setattr(tiles, name, lambda *given: (computed.append(name), real(*given))[1])
 
     count("load_mesh")
     count("signed_distance_on_grid")
     first = world(write(3.0))
-    assert computed.count("signed_distance_on_grid") == 1
+    move(first, (0, 0, -0.4e-3))
+    assert computed.count("load_mesh") == 1 and 1 <= computed.count("signed_distance_on_grid") <= 9
     computed.clear()
     second = world(write(3.0))
+    move(second, (0, 0, -0.4e-3))
     assert computed == []
-    for w in (first, second):
-        move(w, (0, 0, -0.4e-3))
     assert first.wrench("lower")[2] < -0.01 and first.wrench("lower").tobytes() == second.wrench("lower").tobytes()
     third = world(write(2.0))
-    assert computed.count("signed_distance_on_grid") == 1
-    assert third.pose("indenter").position[2] == pytest.approx(2.1e-3, rel=0.01)
+    move(third, (0, 0, -0.4e-3))
+    assert computed.count("load_mesh") == 1
+    assert third.pose("indenter").position[2] == pytest.approx(1.7e-3, rel=0.01)
 
 
 @pytest.mark.cpu
@@ -236,3 +269,28 @@ def test_contact_forgets_what_it_no_longer_touches(kind: str, tmp_path: Path) ->
     move(w, (0, 0, 6e-3))
     far = w.snapshot()
     assert not far["slip"].any() and not far["pressure"].any()
+
+
+def test_an_indenter_that_fits_between_the_contact_points_is_refused() -> None:
+    for shape in (Sphere(radius=0.1e-3), Box(size=(0.3e-3, 4e-3, 4e-3)), Cylinder(radius=0.2e-3, height=4e-3)):
+        with pytest.raises(ValueError, match=r"fits between .* 0\.3333 mm apart .* choose element_size at most 0\."):
+            world(shape, preset="draft")
+    assert world(Sphere(radius=0.24e-3), preset="draft")
+    with pytest.raises(ValueError, match=r"at most 0\.2105 mm"):
+        world(Sphere(radius=0.05e-3), preset="draft")
+    assert world(Sphere(radius=0.05e-3), element_size=0.2105e-3, gel=Gel(size=(4e-3, 4e-3, 4e-3)))
+
+
+def test_a_tip_that_passes_between_the_contact_points_is_an_error(tmp_path: Path) -> None:
+    """A needle below a plate: by its width it may be pressed, so only the way down shows it."""
+    import trimesh
+
+    needle = trimesh.creation.box((0.1, 0.1, 2.0))
+    plate = trimesh.creation.box((4.0, 4.0, 1.0)).apply_translation((0, 0, 1.5))
+    trimesh.util.concatenate([needle, plate]).export(tmp_path / "needle.stl")
+    w = world(Mesh(path=str(tmp_path / "needle.stl")), preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+    move(w, (0, 0, -0.2e-3))
+    before = w.snapshot()
+    with pytest.raises(SimulationDiverged, match=r"0\.4 mm deep .* no contact point .* such as 0\.5 mm, or a finer"):
+        move(w, (0, 0, -0.3e-3))
+    assert all(before[name].tobytes() == a.tobytes() for name, a in w.snapshot().items())

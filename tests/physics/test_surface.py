@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tacsim.optics.spline import displacement_and_jacobian
-from tacsim.physics.contact import skin_sum, spline
+from tacsim.physics.contact import skin_sums, spline
 from tacsim.physics.gel import MM, GelState, Skin, gel_facts, gel_surface, skin_row
 from tacsim.physics.lanes import vec2, vec4
 from tacsim.runtime import start, ti
@@ -27,9 +27,8 @@ def evaluate(skin: Skin, points: Points, found: Sums, gel: ti.i32, h: ti.f32, nx
     for p in range(points.shape[0]):
         i, wx, dx = spline(points[p][0])
         j, wy, dy = spline(points[p][1])
-        found[p, 0] = skin_sum(skin, row, i, j, wx, wy, ny)
-        found[p, 1] = skin_sum(skin, row, i, j, dx / h, wy, ny)
-        found[p, 2] = skin_sum(skin, row, i, j, wx, dy / h, ny)
+        value, by_x, by_y = skin_sums(skin, row, i, j, wx, wy, dx / h, dy / h, ny)
+        found[p, 0], found[p, 1], found[p, 2] = value, by_x, by_y
 
 
 def rim(count: int) -> np.ndarray:

@@ -60,3 +60,11 @@ def test_a_lattice_is_the_default() -> None:
 def test_what_cannot_be_sampled_is_refused_either_way() -> None:
     with pytest.raises(ValueError, match="no particle fits"):
         body_points(Body(geometry=Sphere(radius=0.1 * MM), sampling="random"), 1 * MM)
+
+
+def test_a_body_that_no_random_particle_falls_into_is_refused() -> None:
+    """One particle of a lattice fits; one at random in the same cell may lie outside."""
+    ball = Sphere(radius=0.5 * MM)
+    assert len(body_points(Body(geometry=ball, sampling="random", seed=2), 1 * MM)) == 1
+    with pytest.raises(ValueError, match="sphere holds no particle at a spacing of 1 mm"):
+        body_points(Body(geometry=ball, sampling="random", seed=0), 1 * MM)

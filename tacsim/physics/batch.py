@@ -57,7 +57,7 @@ class Batch(Single):
         before. One that has to try again does so while the others go on.
 
         Raises ValueError for a wrong number of targets or loads, or a load of an environment that rests; what
-        `World.move` raises for targets and loads that make no sense, before anything moves. Interrupted, worlds that
+        `World.move` raises for an order that makes no sense, before anything moves. Interrupted, worlds that
         are still on their way are taken back.
         """
         if loads is None:
@@ -91,8 +91,8 @@ class Batch(Single):
             for index, motion in motions.items():
                 try:
                     go_on(index, motion.__next__)
-                except (KeyError, ValueError) as error:
-                    error.add_note(f"in the targets or loads of environment {index}")
+                except Exception as error:
+                    error.add_note(f"in the motion of environment {index}")
                     raise
             while wanted:
                 with launching():
@@ -112,6 +112,9 @@ class Batch(Single):
 def _require_one_kind(scenes: Sequence[Scene]) -> None:
     if not scenes:
         raise ValueError("a batch needs at least one scene")
+    for index, scene in enumerate(scenes):
+        if not isinstance(scene, Scene):
+            raise TypeError(f"environment {index} must be a Scene, found {scene!r}")
     seeds = [index for index, scene in enumerate(scenes) if scene.physics == "seed"]
     if seeds:
         raise ValueError(

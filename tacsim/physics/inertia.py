@@ -16,6 +16,7 @@ from tacsim.interface import Pose
 from tacsim.physics.controller import Launch
 from tacsim.physics.gel import MM, MPA, GelFacts
 from tacsim.physics.path import MOST, PEAK, ROUNDING, Path, longest_way
+from tacsim.physics.world import is_number
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 
@@ -55,8 +56,10 @@ def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, in
     """The path of a dynamic motion; `lever` [mm]: see `longest_way`.
 
     Raises ValueError for a duration [s] that is not positive, that has far too many substeps or nothing of one, or in
-    which the fastest frame would race the gel's own waves.
+    which the fastest frame would race the gel's own waves; TypeError for what is no number.
     """
+    if not is_number(duration):
+        raise TypeError(f"duration must be a number [s], or None for a quasi-static motion; found {duration!r}")
     if not (math.isfinite(duration) and duration > 0):
         raise ValueError(f"duration is {duration:g} s: give a positive time, or None for a quasi-static motion")
     substep = inertia.step / inertia.second

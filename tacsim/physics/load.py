@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from tacsim.interface import Pose
 from tacsim.physics.controller import Launch, Motion, Reading, move_and_settle
 from tacsim.physics.path import Path
-from tacsim.physics.world import MoveStats
+from tacsim.physics.world import MoveStats, is_number
 from tacsim.scene import Scene
 
 # All as shares of the gel's thickness
@@ -45,10 +45,14 @@ class Loadable(Protocol):
 
 
 def require_loads(loads: Mapping[str, float], sensors: Sequence[str]) -> None:
-    """Raises KeyError for what is no sensor, ValueError for a load that is negative or not finite."""
+    """Raises KeyError for what is no sensor, ValueError for a load that is negative or not finite, and TypeError."""
+    if not isinstance(loads, Mapping):
+        raise TypeError(f"loads are forces [N] by the names of sensors ({', '.join(sensors)}), found {loads!r}")
     for name, load in loads.items():
         if name not in sensors:
             raise KeyError(f"no sensor '{name}' to hold a load; this world has {', '.join(sensors)}")
+        if not is_number(load):
+            raise TypeError(f"load of '{name}' must be a number [N], found {load!r}")
         if not (math.isfinite(load) and load >= 0.0):
             raise ValueError(f"load of '{name}' is {load:g} N; give 0 or more (positive = pressed)")
 

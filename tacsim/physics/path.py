@@ -186,8 +186,13 @@ def _substeps(count: float, length: float, mach: float) -> int:
 
 
 def merged(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:
-    """Where every driven frame ends. Raises KeyError for a frame that is not driven."""
-    unknown = sorted(set(targets) - set(poses))
+    """Where every driven frame ends. Raises KeyError for a frame that is not driven, TypeError for what is no pose."""
+    if not isinstance(targets, Mapping):
+        raise TypeError(f"targets are poses by the names of frames ({', '.join(poses)}), found {targets!r}")
+    unknown = [str(name) for name in targets if name not in poses]
     if unknown:
         raise KeyError(f"no driven frame {', '.join(unknown)}; this world drives {', '.join(poses)}")
+    for name, target in targets.items():
+        if not isinstance(target, Pose):
+            raise TypeError(f"target of '{name}' must be a Pose, found {target!r}; leave '{name}' out and it stays")
     return {**poses, **targets}

@@ -192,7 +192,8 @@ class SeedWorld(SingleWorld):
         return run(self.motion(Order(targets, loads or {})), self._advance)
 
     def _carry_out(self, order: Order) -> Motion:
-        end = merged(self._poses, {name: self._upright(name, pose) for name, pose in order.targets.items()})
+        end = merged(self._poses, order.targets)
+        end.update((name, self._upright(name, end[name])) for name in order.targets)
         self._check_room(end)
         require_loads(order.loads, self.sensors)
         begin, goals = dict(self._poses), dict(end)
@@ -216,8 +217,6 @@ class SeedWorld(SingleWorld):
 
     def _upright(self, name: str, pose: Pose) -> Pose:
         """`pose` without a tilt of up to TILT, which the scheme can't follow."""
-        if name not in self.sensors:
-            raise KeyError(f"no sensor '{name}'; this world has {', '.join(self.sensors)}")
         flip = Rotation.identity() if name == "lower" else Rotation.from_quat(HALF_TURN)
         turn = (Rotation.from_quat(pose.quaternion) * flip.inv()).as_matrix()
         tilt = float(np.arctan2(np.hypot(turn[0, 2], turn[1, 2]), turn[2, 2]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
@@ -104,6 +105,11 @@ class World(Protocol):
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Raises TypeError or ValueError, with nothing changed, if `state` is no snapshot of such a world."""
         ...
+
+
+def is_number(value: object) -> bool:
+    """Whether it is one real number, of Python or NumPy."""
+    return isinstance(value, Real)
 
 
 def taken(arrays: Mapping[str, NDArray[Any]], poses: Mapping[str, Pose]) -> dict[str, NDArray[Any]]:

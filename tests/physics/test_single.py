@@ -50,6 +50,7 @@ def test_nor_can_a_batch_be() -> None:
         copy.deepcopy(Batch([BALL]))
 
 
+@pytest.mark.cpu
 def test_a_world_makes_one_motion_at_a_time() -> None:
     """Its numbers are those of a motion on its way: whoever else moves it is told, and that motion is not disturbed."""
     batch, alone = Batch([BALL, BALL]), PressWorld(BALL)
@@ -67,7 +68,7 @@ def test_a_world_makes_one_motion_at_a_time() -> None:
     assert state(world) == state(alone)
 
 
-@pytest.mark.parametrize("kind", [PressWorld, HybridWorld, SeedWorld])
+@pytest.mark.parametrize("kind", [PressWorld, HybridWorld, pytest.param(SeedWorld, marks=pytest.mark.cpu)])
 def test_a_motion_that_fails_leaves_the_world_free(kind: type, monkeypatch: pytest.MonkeyPatch) -> None:
     world = make_world({PressWorld: BALL, HybridWorld: CUBE, SeedWorld: SEED}[kind])
     with monkeypatch.context() as patched:
@@ -110,6 +111,7 @@ def test_frames_that_are_not_there_are_named(world: World) -> None:
         world.pose("middle")
 
 
+@pytest.mark.cpu
 def test_a_snapshot_makes_a_second_world(world: World) -> None:
     """As the error of a copy advises."""
     world.move(down(world))
@@ -142,3 +144,30 @@ def test_a_snapshot_that_does_not_fit_changes_nothing(world: World) -> None:
     refused(TypeError, "a snapshot holds arrays by their names", None)
     world.restore({name: array.tolist() for name, array in good.items()})  # type: ignore[misc]
     assert state(world) == before
+
+
+WRONG: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("targets are poses by the names of frames \\(lower, .*\\), found None", {"targets": None}),
+    ("targets are poses", {"targets": [1]}),
+    ("targets are poses", {"targets": "lower"}),
+    ("target of 'lower' must be a Pose, found None", {"targets": {"lower": None}}),
+    (r"target of 'lower' must be a Pose, found \[0, 0, 0\]", {"targets": {"lower": [0, 0, 0]}}),
+    ("loads are forces .* found \\[1\\]", {"targets": {}, "loads": [1]}),
+    ("load of 'lower' must be a number .*, found '1'", {"targets": {}, "loads": {"lower": "1"}}),
+    ("load of 'lower' must be a number .*, found None", {"targets": {}, "loads": {"lower": None}}),
+)
+
+
+def test_an_order_of_wrong_types_is_refused_in_words(world: World) -> None:
+    before = state(world)
+    for words, order in WRONG:
+        with pytest.raises(TypeError, match=words):
+            world.move(**order)
+    with pytest.raises(KeyError, match="no driven frame 3; this world drives lower"):
+        world.move({3: Pose()})  # type: ignore[dict-item]
+    assert state(world) == before
+
+
+def test_a_duration_that_is_no_number_is_refused_in_words() -> None:
+    with pytest.raises(TypeError, match=r"duration must be a number .* found '1'"):
+        PressWorld(BALL).move({}, duration="1")  # type: ignore[arg-type]

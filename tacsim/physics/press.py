@@ -297,8 +297,8 @@ class PressWorld(DrivenWorld):
             cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
             finer = self._gel.thickness / (2 * self._gel.elements[2])
             advice = (
-                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between them: "
-                f"use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
+                f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
             )
             raise SimulationDiverged(cause, str(prepared.where), advice)
 

@@ -20,12 +20,15 @@ from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, sample_surface
 from tacsim.physics.world import MoveStats, World, make_world
-from tacsim.scene import Scene, Shape
+from tacsim.scene import Gel, Scene, Shape
 from tacsim.shapes import distance, extent
 
 # A surface point nearer to the indenter than this share of a gel element is in contact: the gel surface is a spline on
 # its elements, which follows the indenter no closer. Enlarges the radius of a ball's contact by about 4 %.
 TOUCHING = 0.01
+QUARTER = math.pi / 2  # a motion turns the shorter way round, so a twist is cut into pieces of at most this [rad]
+MOST_TWIST = math.radians(3600.0)
+MOST_SLIDE = 3.0  # widths of the gel: beyond, it is long out of touch
 BRIDGED = 0.2  # under a flat face the spline swings about it by as much; counts within a contact
 
 
@@ -53,13 +56,12 @@ class Pressed:
 def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
     """Presses the scene's indenter, then slides and twists it.
 
-    Raises ValueError for a scene without indenter or a depth that is not within the gel, SimulationDiverged.
+    Raises ValueError for a scene without indenter, a depth that is not within the gel, or a slide or twist beyond all
+    measure; SimulationDiverged.
     """
     if scene.indenter is None:
         raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")
-    thickness = scene.gel.size[2]
-    if not 0 < motion.depth < thickness:
-        raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
+    _require_sensible(scene.gel, motion)
     world = make_world(scene)
     targets = _targets(world.pose("indenter"), scene.indenter.geometry, motion)
     moves = tuple(world.move({"indenter": target}) for target in targets)
@@ -77,14 +79,26 @@ def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
     )
 
 
+def _require_sensible(gel: Gel, motion: Press) -> None:
+    thickness, farthest, way = gel.size[2], MOST_SLIDE * max(gel.size[:2]), math.hypot(*motion.slide)
+    if not 0 < motion.depth < thickness:
+        raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
+    if not way <= farthest:
+        raise ValueError(f"slide is {way:.4g} m long; at most {MOST_SLIDE:g} widths of the gel, {farthest:.4g} m")
+    if not abs(motion.twist) <= MOST_TWIST:
+        most = math.degrees(MOST_TWIST)
+        raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
+
+
 def _targets(start: Pose, geometry: Shape, motion: Press) -> list[Pose]:
     """Poses of the indenter, one after the other. Its frame's origin is the centre of its bounding box."""
     down = np.array([start.position[0], start.position[1], float(extent(geometry)[2]) / 2 - motion.depth])
     targets = [Pose(down, start.quaternion)]
     if any(motion.slide):
         targets.append(Pose(down + np.append(motion.slide, 0.0), start.quaternion))
-    if motion.twist:
-        turned = Rotation.from_rotvec([0.0, 0.0, motion.twist]) * se3.rotation(start)
+    pieces = math.ceil(abs(motion.twist) / QUARTER)
+    for piece in range(1, pieces + 1):
+        turned = Rotation.from_rotvec([0.0, 0.0, motion.twist * piece / pieces]) * se3.rotation(start)
         targets.append(Pose(targets[-1].position, turned.as_quat()))
     return targets
 
@@ -109,7 +123,8 @@ def _contact(world: World, scene: Scene, seen: SurfaceSample, sensor: SensorMode
 
 
 def facts_of(scene: Scene, motion: Press, pressed: Pressed, sensor: SensorModel) -> dict[str, Any]:
-    """The result as JSON, SI units."""
+    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured."""
+    residual = max(move.residual for move in pressed.moves)
     return {
         "indenter": scene.indenter.model_dump(mode="json") if scene.indenter else None,
         "gel": scene.gel.model_dump(mode="json"),
@@ -124,7 +139,7 @@ def facts_of(scene: Scene, motion: Press, pressed: Pressed, sensor: SensorModel)
         "deepest": float(pressed.height.max()),
         "pixel_pitch": sensor.geometry.pixel_pitch,
         "settled": all(move.settled for move in pressed.moves),
-        "residual": max(move.residual for move in pressed.moves),
+        "residual": residual if math.isfinite(residual) else None,
         "substeps": sum(move.substeps for move in pressed.moves),
     }
 

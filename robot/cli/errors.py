@@ -44,8 +44,11 @@ def explain(error: Exception) -> tuple[str, int]:
     from robot.policy import PolicyNotFound
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
+    from tacsim.physics.dump import DumpError
 
-    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, Unusable)):
+    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, Unusable, DumpError)):
+        return str(error), UNUSABLE
+    if _refused(error):
         return str(error), UNUSABLE
     if isinstance(error, ExceptionGroup):
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
@@ -53,18 +56,21 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
         return f"{where}{error.strerror or str(error) or type(error).__name__}", FAILED
-    if type(error).__module__.partition(".")[0] in OURS or _raised_by_us(error):
+    if type(error).__module__.partition(".")[0] in OURS:
         return str(error) or type(error).__name__, FAILED
     return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", FAILED
 
 
-def _raised_by_us(error: Exception) -> bool:
-    """True for a ValueError that stands in our own code: its text is written for the person who gave the value."""
+def _refused(error: Exception) -> bool:
+    """True for what our own code says of a value, a file or a device that it was given: a bare ValueError or a
+    FileNotFoundError in words, and a RuntimeError of the one module that starts Taichi."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    module = trace.tb_frame.f_globals.get("__name__", "") if trace is not None else ""
-    return isinstance(error, ValueError) and str(module).partition(".")[0] in OURS
+    module = str(trace.tb_frame.f_globals.get("__name__", "") if trace is not None else "")
+    in_words = type(error) is ValueError or (isinstance(error, FileNotFoundError) and error.errno is None)
+    ours = in_words and module.partition(".")[0] in OURS
+    return ours or (type(error) is RuntimeError and module == "tacsim.runtime")
 
 
 def complain(message: str) -> None:

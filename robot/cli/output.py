@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -26,12 +26,24 @@ Overrides = Annotated[
 
 
 def new_directory(out: Path | None, what: str) -> Path:
-    """The folder to be made for the results of `what`. Raises typer.BadParameter if there is one already."""
+    """The folder to be made for the results of `what`. Raises typer.BadParameter if there is one already, or none can
+    be made there: better now than after the work."""
     folder = Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{what}" if out is None else out
     if folder.exists():
         raise typer.BadParameter(
             f"{folder} exists already; name a new folder, nothing is overwritten", param_hint="--out"
         )
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise typer.BadParameter(
+            f"{folder} cannot be made ({error.strerror}); name a folder that can be written", param_hint="--out"
+        ) from None
+    finally:
+        for place in new:
+            with suppress(OSError):
+                place.rmdir()
     return folder
 
 

@@ -94,7 +94,8 @@ def press(
     results.print(f"contact radius   {facts['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {facts['deepest'] * 1e3:.3f} mm")
     if not facts["settled"]:
-        notes.print(f"warning: not settled, relative residual {facts['residual']:.2g}; raise settling.max_substeps")
+        held = "not held" if facts["residual"] is None else f"relative residual {facts['residual']:.2g}"
+        notes.print(f"warning: not settled, {held}; raise settling.max_substeps")
     say_files(*sorted(folder.iterdir()))
 
 

@@ -9,22 +9,26 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from robot.cli import app
 from robot.cli.errors import explain
 from robot.cli.output import writing
+from robot.press import Press, _targets
 from robot.reproduce import EXPERIMENTS, TrialFailed, as_json, image_difference, run_trials, shortcomings, telling
 from tacsim.config import ConfigError
 from tacsim.figure4 import Trial
-from tacsim.interface import IncompatibleRig, TactileFrame
+from tacsim.interface import IncompatibleRig, Pose, TactileFrame
 from tacsim.record.episode import EpisodeError
 from tacsim.record.reader import read_episode
+from tacsim.scene import Sphere
 
 COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", "bench", "mock", "compare")
 TINY = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")  # a world of seconds
@@ -81,6 +85,15 @@ def test_version() -> None:
         (("press", "sphere", "--radius", "1e308"), "radius"),
         (("run", "--set", "arms.upper.driver=replay"), "arms.upper"),
         (("run", "replay"), "sensors.finger.source"),
+        (("press", "missing.stl"), "missing.stl: no such mesh file"),
+        (("press", "sphere", "--depth", "9 mm"), "0.009"),
+        (("press", "sphere", "--depth", "0"), "must be above 0"),
+        (("press", "sphere", "--slide", "10 m, 0"), "at most 3 widths of the gel, 0.06 m"),
+        (("press", "sphere", "--twist", "1e9 deg"), "at most 3600 deg"),
+        (("press", "sphere", "--radius", "0.05 mm", "--depth", "0.3 mm"), "choose element_size at most"),
+        (("press", "sphere", "--set", "gel.size=[20 mm, 13.3 mm, 4 mm]"), "does not divide into cubes"),
+        (("press", "sphere", "--out", "/proc/self/x"), "/proc/self/x cannot be made"),
+        (("run", "--out", "/dev/null/x"), "/dev/null/x cannot be made (Not a directory)"),
     ],
 )
 def test_wrong_words_end_with_2_and_write_nothing(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
@@ -95,8 +108,6 @@ def test_wrong_words_end_with_2_and_write_nothing(words: tuple[str, ...], said: 
     ("words", "said"),
     [
         (("run", "replay", "--set", "sensors.finger.source=missing.mcap"), "missing.mcap"),
-        (("press", "missing.stl"), "missing.stl"),
-        (("press", "sphere", "--depth", "9 mm"), "0.009"),
         (("replay", "missing.mcap"), "missing.mcap"),
     ],
 )
@@ -164,6 +175,45 @@ def test_press_slides_and_twists_against_friction(tmp_path: Path) -> None:
     height = np.load(tmp_path / "slid" / "height.npy", allow_pickle=False)
     deep = np.argwhere(height > 0.35e-3)
     assert deep[:, 1].mean() == pytest.approx(159.5 + 0.5 / 0.0625, abs=3)  # +x is to the right, where the box went
+
+
+@pytest.mark.parametrize(("name", "content", "said"), [("e", b"", "is empty"), ("t", bytes(84) + b"x", "should have")])
+def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / f"{name}.stl").write_bytes(content)
+    result = tacsim("press", f"{name}.stl")
+    assert result.exit_code == 2 and said in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("TACSIM_THREADS", "0", "TACSIM_THREADS must be a whole number from 1 on"),
+        ("TACSIM_DEVICE", "abacus", "TACSIM_DEVICE must be one of cpu"),
+        ("TACSIM_DEVICE", "metal", "Taichi finds no such device"),
+    ],
+)
+def test_a_machine_that_is_not_there_ends_with_2(variable: str, value: str, said: str, tmp_path: Path) -> None:
+    words = (*START, "press", "sphere", "--preset", "draft")
+    result = subprocess.run(words, env={**_environment(), variable: value}, capture_output=True, text=True)
+    assert result.returncode == 2 and said in result.stderr and "unexpected" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_twist_beyond_half_a_turn_goes_on_the_same_way() -> None:
+    start, motion = Pose(np.array([0.0, 0.0, 5e-3])), Press(twist=np.radians(-270.0))
+    targets = _targets(start, Sphere(radius=4e-3), motion)
+    turns = [Rotation.from_quat(target.quaternion) for target in targets]
+    steps = [np.degrees((b * a.inv()).as_rotvec()) for a, b in pairwise(turns)]
+    assert np.allclose(steps, [[0, 0, -90.0]] * 3)
+
+
+def test_a_press_that_is_not_held_says_so(tmp_path: Path) -> None:
+    hasty = ("--preset", "draft", "--set", "settling.max_substeps=0", "--set", "gel.size=[8 mm, 8 mm, 4 mm]")
+    result = tacsim("press", "sphere", "--radius", "2 mm", "--depth", "0.2 mm", "--out", "p", *hasty)
+    assert result.exit_code == 0, result.output
+    facts = json.loads((tmp_path / "p" / "press.json").read_text())
+    assert facts["residual"] is None and facts["settled"] is False
+    assert "not settled, not held" in result.stderr
 
 
 def test_a_press_that_diverges_leaves_what_debug_reads(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, in
     if not ROUNDING <= duration / substep <= MOST:
         raise ValueError(
             f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (the materials say so) it must lie between "
-            f"{ROUNDING * substep:.3g} and {MOST * substep:.3g} s: is it in seconds?"
+            f"{ROUNDING * substep:.3g} and {MOST * substep:.3g} s: is it in seconds? if so, make several motions of it"
         )
     kernel_time, wave = duration * inertia.second, inertia.second / MM
     peak = PEAK * longest_way(start, end, lever) / kernel_time

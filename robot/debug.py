@@ -23,6 +23,7 @@ from tacsim.shapes import distance
 
 State = Mapping[str, NDArray[Any]]
 TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"}
+BOOKKEEPING = ("poses", "rates", "speed", "true_inertia")  # no arrays of the kernels: kept of "before" alone
 PICKED = 6000  # particles drawn at most
 
 
@@ -47,9 +48,12 @@ def open_world(dump: Dump) -> World:
         state = dump.states[moment]
         if moment != "before" and not state:
             continue
+        unknown = sorted(set(state) - set(own))
+        if unknown:
+            raise DumpError(f"array '{moment}.{unknown[0]}' is none of this scene's: {', '.join(own)}")
         for name, a in own.items():
-            if moment != "before" and name not in state:
-                continue  # what is no array of the kernels (poses)
+            if moment != "before" and name in BOOKKEEPING and name not in state:
+                continue
             found = state.get(name)
             if found is None or found.shape != a.shape or found.dtype != a.dtype:
                 shown = "nothing" if found is None else f"{found.dtype} {found.shape}"

@@ -60,6 +60,7 @@ def _print_facts(dump: Dump) -> None:
 
 
 def _print_table(rows: list[tuple[str, dict[str, str]]]) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from robot.debug import TITLES
@@ -67,7 +68,7 @@ def _print_table(rows: list[tuple[str, dict[str, str]]]) -> None:
     shown = [moment for moment in TITLES if any(moment in values for _, values in rows)]
     table = Table("", *(TITLES[moment] for moment in shown), box=None, padding=(0, 2, 0, 0))
     for what, values in rows:
-        table.add_row(what, *(values.get(moment, "") for moment in shown))
+        table.add_row(what, *(escape(values.get(moment, "")) for moment in shown))
     results.print(table)
 
 

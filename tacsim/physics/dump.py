@@ -37,6 +37,7 @@ MOST_DUMPS = 20  # in one folder; training that diverges again and again must no
 MOST_JSON = 1_000_000  # bytes
 MOST_ARRAYS = 100
 MOST_BYTES = 2_000_000_000  # of all arrays together
+MOST_SECONDS = 1000.0  # of a dynamic motion; a tenth of a second takes as many substeps as a dozen squeezes
 DTYPES = {"float32", "float64", "int32", "int64", "bool"}
 MOMENTS = ("before", "good", "failed")
 MESH = "shape.stl"
@@ -64,7 +65,7 @@ class DumpFacts(Facts):
     poses: dict[str, Numbers7]  # before the motion
     targets: dict[str, Numbers7]  # asked for
     loads: dict[str, float] = {}  # held by sensors [N]; dumps of older versions say nothing of them
-    duration: float | None = None  # of a dynamic motion [s]
+    duration: float | None = Field(None, gt=0, le=MOST_SECONDS)  # of a dynamic motion [s]
     flow: bool = False  # it flows into the next
     failed_poses: dict[str, Numbers7]  # at the end of the launch that went wrong; empty if there was none
     health: dict[str, str]  # what the kernels saw in the last launch
@@ -227,10 +228,34 @@ def read(folder: Path) -> Dump:
         raise DumpError(f"{described}: a dump may name no STL file but its own {MESH}, not {mesh}")
     dump = Dump(facts.model_copy(update={"scene": scene}), _read_arrays(folder / "state.npz"))
     try:
+        _require_sound(facts)
         _ = dump.order
     except ValueError as error:
         raise DumpError(f"{described}: {error}") from None
+    for name in ("poses", "rates", "speed"):
+        if name in dump.states["before"] and not np.isfinite(dump.states["before"][name]).all():
+            raise DumpError(f"{folder / 'state.npz'}: before.{name}: not all of its numbers are finite")
     return dump
+
+
+def _require_sound(facts: DumpFacts) -> None:
+    """Raises ValueError that names the key, for frames that the scene does not drive, or lacks, and poses that are
+    none."""
+    sensors = facts.scene.sensors
+    frames = sensors if facts.scene.indenter is None else (*sensors, "indenter")
+    for key, numbers in (("poses", facts.poses), ("failed_poses", facts.failed_poses), ("targets", facts.targets)):
+        missing = set() if key == "targets" or not (numbers or key == "poses") else set(frames) - set(numbers)
+        wrong = sorted((set(numbers) - set(frames)) | missing)
+        if wrong:
+            raise ValueError(f"{key}.{wrong[0]}: this scene drives {', '.join(frames)}")
+        for name, pose in numbers.items():
+            try:
+                _poses({name: pose})
+            except ValueError as error:
+                raise ValueError(f"{key}.{name}: {error}") from None
+    for name, load in facts.loads.items():
+        if name not in sensors or load < 0:
+            raise ValueError(f"loads.{name}: must be 0 N or more on one of {', '.join(sensors)}, found {load:g}")
 
 
 def _read_arrays(path: Path) -> dict[str, dict[str, NDArray[Any]]]:
@@ -251,7 +276,7 @@ def _read_arrays(path: Path) -> dict[str, dict[str, NDArray[Any]]]:
                     states[moment][name] = _read_array(file, member.file_size, f"{path}: {member.filename}")
     except FileNotFoundError:
         raise DumpError(f"{path} is missing: the dump is incomplete") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise DumpError(f"{path} is damaged: {error}") from None
     return states
 

@@ -98,11 +98,11 @@ def test_arrays_of_another_scene_are_refused(tmp_path: Path, monkeypatch: pytest
         return tacsim("debug", place)
 
     fewer = changed(element_size=2e-3)
-    assert fewer.exit_code == 1 and "'before.gel_displacement' must be float32" in fewer.output
+    assert fewer.exit_code == 2 and "'before.gel_displacement' must be float32" in fewer.output
     huge = changed(element_size=0.05e-3)  # a thousand times as much memory
-    assert huge.exit_code == 1 and "gel nodes, but 'before.gel_displacement' holds" in huge.output
+    assert huge.exit_code == 2 and "gel nodes, but 'before.gel_displacement' holds" in huge.output
     other = changed(particle_spacing=1e-3)
-    assert other.exit_code == 1 and "for this scene, found" in other.output
+    assert other.exit_code == 2 and "for this scene, found" in other.output
     (place / "dump.json").write_text(json.dumps(facts))
     dump = read(place)
     dump.states["before"]["poses"][0, 3:] = 0.0
@@ -120,4 +120,39 @@ def test_a_run_that_diverges_leaves_a_dump_and_says_where(tmp_path: Path, monkey
     assert (tmp_path / "first" / "diverged" / "00" / "state.npz").is_file()
     assert tacsim("debug", "first/diverged/00").exit_code == 1
     nowhere = tacsim("debug", "first")
-    assert nowhere.exit_code == 1 and "is no dump: it has no dump.json" in nowhere.output
+    assert nowhere.exit_code == 2 and "is no dump: it has no dump.json" in nowhere.output
+
+
+def test_an_altered_dump_is_refused_with_file_and_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = diverge(SCENES["press"], tmp_path, monkeypatch)
+    text, arrays = (place / "dump.json").read_text(), (place / "state.npz").read_bytes()
+    here, none = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], [0.0] * 7
+
+    def refused(said: str) -> None:
+        result = tacsim("debug", place)
+        assert result.exit_code == 2 and said in " ".join(result.output.split()), result.output
+
+    for change, said in (
+        ({"poses": {"other": here}}, "dump.json: poses.indenter: this scene drives lower, indenter"),
+        ({"poses": {"lower": none, "indenter": here}}, "dump.json: poses.lower: Pose.quaternion must have unit length"),
+        ({"failed_poses": {"lower": here}}, "dump.json: failed_poses.indenter"),
+        ({"targets": {"other": here}}, "dump.json: targets.other: this scene drives"),
+        ({"loads": {"other": 1.0}}, "dump.json: loads.other: must be 0 N or more on one of lower, found 1"),
+        ({"loads": {"lower": -1.0}}, "dump.json: loads.lower"),
+        ({"duration": 1e308}, "dump.json: duration: Input should be less than or equal to 1000"),
+    ):
+        (place / "dump.json").write_text(json.dumps({**json.loads(text), **change}))
+        refused(said)
+    (place / "dump.json").write_text(text)
+
+    for name, array, said in (
+        ("before.rates", np.full((2, 6), np.inf), "state.npz: before.rates: not all of its numbers are finite"),
+        ("good.position", np.zeros(3, np.float32), "array 'good.position' is none of this scene's"),
+        ("before.strain", np.zeros((3, 2), np.float32), "array 'before.strain' is none of this scene's"),
+        ("good.gel_displacement", None, "array 'good.gel_displacement' must be float32"),
+    ):
+        (place / "state.npz").write_bytes(arrays)
+        with np.load(place / "state.npz", allow_pickle=False) as archive:
+            altered = {**archive, name: array}
+        np.savez(place / "state.npz", **{key: a for key, a in altered.items() if a is not None})
+        refused(said)

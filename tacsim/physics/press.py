@@ -314,7 +314,7 @@ def _require_resolved(geometry: Shape, gel: GelFacts) -> None:
         raise ValueError(
             f"the indenter ({geometry.shape}) is {narrow:.4g} mm wide and fits between the gel's contact points, which "
             f"lie {spacing:.4g} mm apart (element_size / {POINTS}): choose element_size at most "
-            f"{math.floor(1e4 * gel.thickness / layers) / 1e4:g} mm, or a finer preset"
+            f"{math.floor(1e4 * gel.thickness / layers) / 1e4:g} mm"
         )
 
 

@@ -38,6 +38,7 @@ from tacsim.physics.layout import (
     STEP,
     STEPS,
     STIFFNESS,
+    TURNING,
 )  # fmt: skip
 from tacsim.physics.plasticine import (
     BORDER,
@@ -254,10 +255,21 @@ class HybridWorld(DrivenWorld):
             ) from None
         good = copies(self.arrays())
         state.facts[index, STEP] = path.step
-        state.facts[index, CENTRE : CENTRE + 3] = [column.mean(dtype=np.float64) for column in x.T]
+        self._note_inertia(x)
         self._answer(launch)
         Health.clear(state.partial[index])
         return Prepared(launch, drive, where, good)
+
+    def _note_inertia(self, x: np.ndarray) -> None:
+        """Centre and inverse moment of inertia of the particles (n, 3) [mm], where the kernels find them."""
+        facts = self._state.facts[self._index]
+        centre = np.array([column.mean(dtype=np.float64) for column in x.T])
+        arm = [column - c for column, c in zip(x.T, centre, strict=True)]
+        second = np.array([[a @ b for b in arm] for a in arm]).astype(np.float64) * float(facts[BODY_MASS])
+        inertia = np.trace(second) * np.eye(3) - second
+        inverse = np.linalg.pinv(inertia, rcond=1e-6, hermitian=True)  # particles on a line have none about it
+        facts[CENTRE : CENTRE + 3] = centre
+        facts[TURNING : TURNING + 6] = [*np.diagonal(inverse), inverse[0, 1], inverse[0, 2], inverse[1, 2]]
 
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""

@@ -50,6 +50,7 @@ from tacsim.physics.layout import (
     STEP,
     STEPS,
     STRIDE,
+    TURNING,
     VELOCITY,
 )  # fmt: skip
 from tacsim.physics.team import CHUNK, WHO, Sync, first_in_chunk, meet, shares
@@ -94,13 +95,27 @@ def part_sum(partial: ti.template(), env, first):
 
 
 @ti.func
+def moment_about(centre, origin, rotate, force, moment):
+    """Of a force and a moment about a sensor's `origin`, both in its axes: the moment about `centre`, world axes."""
+    return rotate @ moment + (origin - centre).cross(rotate @ force)
+
+
+@ti.func
+def symmetric(facts: ti.template(), env, first):
+    """A symmetric matrix of six facts: xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz = facts[env, first], facts[env, first + 1], facts[env, first + 2]
+    xy, xz, yz = facts[env, first + 3], facts[env, first + 4], facts[env, first + 5]
+    return ti.Matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+@ti.func
 def grid_update(
     env, part, it, drive: ti.template(), masses: ti.template(), velocities: ti.template(), facts: ti.template(),
     counts: ti.template(), partial: ti.template(),
 ):  # fmt: skip
     """Momentum to velocity; damps towards the affine motion that the two sensors impose, not towards rest.
 
-    A boost is added to every velocity: selective mass scaling of the slowest mode, the rigid translation of a body that
+    A boost is added to every velocity: selective mass scaling of the slowest modes, the rigid motions of a body that
     hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
 
     With SPREAD the reference also widens as fast as a body must whose volume stays (docs/decisions/0002).
@@ -120,6 +135,10 @@ def grid_update(
     mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
     boost = ((facts[env, LIGHTNESS] - 1.0) * dt / (facts[env, BODY_MASS] * counts[env, PARTICLES])) * push
     p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
+    centre = vec3(facts[env, CENTRE], facts[env, CENTRE + 1], facts[env, CENTRE + 2])
+    torque = -moment_about(centre, p0, rotation(drive, env, it, 0), force0, part_sum(partial, env, FORCE + 3))
+    torque -= moment_about(centre, p1, rotation(drive, env, it, 1), force1, part_sum(partial, env, FORCE + 9))
+    turn = ((facts[env, LIGHTNESS] - 1.0) * dt) * symmetric(facts, env, TURNING) @ torque
     v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
     w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
     axis = p1 - p0
@@ -130,7 +149,6 @@ def grid_update(
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
     widening = -0.5 * facts[env, SPREAD] * share * (v1 - v0).dot(axis) / length2
-    centre = vec3(facts[env, CENTRE], facts[env, CENTRE + 1], facts[env, CENTRE + 2])
     nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
     base = env * counts[env, CAPACITY]
     nz = nz // NODES  # strips
@@ -148,8 +166,9 @@ def grid_update(
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
                     if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
-                        velocity = vec3(q[4 * n], q[4 * n + 1], q[4 * n + 2]) / q[4 * n + 3] + boost + dt * weight
                         x = origin + cell * vec3(i, j, k * NODES + n)
+                        velocity = vec3(q[4 * n], q[4 * n + 1], q[4 * n + 2]) / q[4 * n + 3] + dt * weight
+                        velocity += boost + turn.cross(x - centre)
                         t = alone + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
                         reference = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
                         if driven:

@@ -26,7 +26,8 @@ SHAPE_ORIGIN = 28  # of its distance grid, node (0, 0, 0): x, y, z [mm]
 SHAPE_SPACING = 31  # of its distance grid [mm]
 SPREAD = 32  # share of an incompressible body's widening that is part of the motion its damping is against
 CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
-FACTS = 36
+TURNING = 36  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
+FACTS = 42
 
 # counts (environments, COUNTS) int32
 NEVER = 0  # always 0: see tacsim.physics.lanes.keep_or

@@ -79,7 +79,7 @@ def all_outcomes() -> dict[str, Any]:
         note(name, outcome(world, stats))
     # a launch of environment 0 alone, in states that are unphysical; environment 1 rests
     last = (1, -1, -1, -1, 2)  # node of the upper gel, in the surface
-    for name, array, entry, value in (("race", "velocity", (-1, 2), 5.0), ("invert", "gel_displacement", last, -6.0)):
+    for name, array, entry, value in (("race", "velocity", (-1, 2), 20.0), ("invert", "gel_displacement", last, -6.0)):
         before = first.snapshot()
         first.arrays()[array][entry] += value
         here = list(first._poses.values())

@@ -25,7 +25,7 @@ from tacsim.physics.single import SingleWorld
 from tacsim.physics.world import MoveStats, Order, put_back, taken
 from tacsim.runtime import launching, start
 from tacsim.sampling import body_points
-from tacsim.scene import BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
+from tacsim.scene import FASTEST, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 
 Float32 = NDArray[np.float32]
 
@@ -285,7 +285,7 @@ class SeedWorld(SingleWorld):
         if len(body):
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
-        margin = MARGIN * self._dx + 2 * self._mach * (last - first) * self._dt
+        margin = MARGIN * self._dx + 2 * max(self._mach, FASTEST) * (last - first) * self._dt
         room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
         require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
         layers = self._fit_layers(faces)

@@ -57,7 +57,7 @@ def pressed(squeezed):
 def test_a_free_body_keeps_its_momentum(monkeypatch):
     monkeypatch.setattr(seed, "BODY_DAMPING", 0.0)
     monkeypatch.setattr(seed, "SWAY_DAMPING", 0.0)
-    world = make(tolerance=1e-9, max_substeps=40)
+    world = make(tolerance=1e-9, max_substeps=40, mach=0.03)
     squeeze(world, -6e-3)  # out of reach of the gels
     x, v = world._body_points(), world._v[2 * world._gels :]
     arm = x - x.mean(axis=0)

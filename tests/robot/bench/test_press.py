@@ -32,7 +32,8 @@ def test_a_press_ends_where_a_slow_one_does() -> None:
     for mach, most in ((0.015, 3.0), (0.05, 5.0), (0.1, 25.0)):  # um at most
         row = by_mach[mach]
         assert 0 < row.figures["rms_um"] < row.error < most
-        assert (row.figures["substeps_other"] > row.figures["substeps_usual"]) == (mach < press.USUAL)
+        assert row.substeps is not None and settled.substeps is not None
+        assert (row.substeps > settled.substeps) == (mach < press.USUAL)
 
 
 def test_a_shallow_balls_force_goes_to_that_of_an_elastic_layer(monkeypatch: pytest.MonkeyPatch) -> None:

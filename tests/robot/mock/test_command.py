@@ -52,7 +52,7 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
     ("options", "words", "code"),
     [
         (["--model", "ur7"], "--model", 2),
-        (["--host", "192.168.0.9"], "not a loopback", 1),
+        (["--host", "192.168.0.9"], "not a loopback", 2),
         (["--arms", "0"], "nothing to run", 2),
         (["--arms", "0", "--cameras", "1", "--camera-port", "70000"], "--camera-port", 2),
     ],

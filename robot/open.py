@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calibration.errors import naming
+from tacsim.admittance import held_loads
 from tacsim.config import LoadedRig, load_rig
 from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import Arm, Normaliser, SensorSpec, TactileFrame
@@ -175,6 +176,7 @@ def _open_sim(facts: RigFacts) -> Rig:
         diagnostics=clock.diagnostics,
         gather=at_once,
         watch=_gel_watch(facts, sensors),
+        held=held_loads(facts.task),
     )
 
 

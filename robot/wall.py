@@ -20,6 +20,7 @@ from robot.trajectory import PERIOD
 from robot.twin_sensor import TwinSensor
 from robot.ur import URArm
 from tacsim import pose as se3
+from tacsim.admittance import held_loads
 from tacsim.guard import GelWatch
 from tacsim.hardware import CameraSensorFacts, UrArmFacts
 from tacsim.interface import ArmState, Normaliser, Pose, TactileSource
@@ -162,6 +163,7 @@ def open_wall(facts: RigFacts, confirm: Confirm | None, *, dry_run: bool = False
             diagnostics=diagnostics,
             beside=bench.close,
             watch=_watch(facts, sensors, arms),
+            held=held_loads(facts.task),
         )
         stack.pop_all()
         return rig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from tacsim.interface import (
     Action,
@@ -24,6 +24,9 @@ from tacsim.interface import (
 )
 from tacsim.limits import check_action
 from tacsim.threads import one_by_one
+
+if TYPE_CHECKING:
+    from tacsim.admittance import Admittance
 
 
 class Start(Protocol):
@@ -52,6 +55,7 @@ class Rig:
         gather: how the sensors are read: one by one, or all at once where that is faster (tacsim.threads).
         beside: closes what the rig needs besides sensors and arms, after them.
         watch: looks at what is touched before anybody acts on it, and raises what ends the episode.
+        held: normal forces that arms hold, whatever the actions ask along the z of their sensors; None: none.
     """
 
     def __init__(
@@ -69,6 +73,7 @@ class Rig:
         gather: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = one_by_one,
         beside: Callable[[], None] | None = None,
         watch: Callable[[Mapping[str, TactileObservation]], None] | None = None,
+        held: Admittance | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
@@ -76,7 +81,8 @@ class Rig:
         self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
         self._normalisers, self._start, self._truth = dict(normalisers), start, truth
         self._diagnostics, self._timeout, self._beside = diagnostics, read_timeout, beside
-        self._gather, self._watch = gather, watch
+        self._gather, self._watch, self._held = gather, watch, held
+        self._felt: Mapping[str, ArmState] = {}
         self._frames: Mapping[str, TactileFrame] = {}
         self._references: Mapping[str, TactileFrame] = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
@@ -122,6 +128,8 @@ class Rig:
         for name, normaliser in self._normalisers.items():
             normaliser.take_reference(self._references[name])
         self._start.touch()
+        if self._held is not None:
+            self._held.reset()
         return self.observe()
 
     def observe(self) -> Observation:
@@ -135,7 +143,7 @@ class Rig:
         arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self._arms.items()}
         now = self._clock.now()
         tactile = {name: self._normalisers[name](frame, now) for name, frame in frames.items()}
-        self._frames = frames
+        self._frames, self._felt = frames, arms
         if self._watch is not None:
             self._watch(tactile)
         return Observation(tactile=tactile, arms=arms, time=now)
@@ -147,7 +155,11 @@ class Rig:
         Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged.
         """
         check_action(action, self._addressable, self.name)
+        if self._held is not None:
+            action = self._held(action, self._felt)
         sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self._arms.items()}
+        if self._held is not None:
+            self._held.sent(sent)
         self._clock.tick()
         return self.observe(), sent
 

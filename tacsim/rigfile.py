@@ -78,6 +78,9 @@ class RepositionFacts(Facts):
     scene: Scene = Scene()
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
     max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
+    # Normal forces that arms hold along the z of their sensors (tacsim.admittance), by arm; an arm without one holds
+    # its height. [N]
+    loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
     touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
     placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.1e-3
@@ -133,7 +136,27 @@ class RigFacts(Facts):
                         "no arm '{arm}'; allowed: {arms}",
                         {"arm": name, "arms": ", ".join(self.arms) or "(none)", "at": ("keep_out", index, "arms")},
                     )
+        if isinstance(self.task, RepositionFacts):
+            for name, load in self.task.loads.items():
+                self._check_load(name, load)
         return self
+
+    def _check_load(self, name: str, load: float) -> None:
+        """A load of the task is held by an arm of the rig, which must not stop at it."""
+        at = ("task", "reposition", "loads", name)
+        arm = self.arms.get(name)
+        if arm is None:
+            arms = ", ".join(self.arms) or "(none)"
+            raise PydanticCustomError(
+                "no_such_arm", "no arm '{arm}'; allowed: {arms}", {"arm": name, "arms": arms, "at": at}
+            )
+        limits = None if isinstance(arm, ReplayArmFacts) else arm.limits
+        if limits is not None and not load < limits.force:
+            raise PydanticCustomError(
+                "load_beyond_limit",
+                "arm '{arm}' stops at limits.force, {force} N; give a load below it",
+                {"arm": name, "force": f"{limits.force:g}", "at": at},
+            )
 
     def kept_out(self, arm: str) -> dict[str, float]:
         """Least distances [m] of `arm` to other arms, by their names."""

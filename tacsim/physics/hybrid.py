@@ -46,6 +46,7 @@ from tacsim.physics.plasticine import (
     BodyState,
     body_facts,
     bounds,
+    centre_of,
 )
 from tacsim.physics.team import run_team
 from tacsim.pose import HALF_TURN_X
@@ -263,9 +264,9 @@ class HybridWorld(DrivenWorld):
     def _note_inertia(self, x: np.ndarray) -> None:
         """Centre and inverse moment of inertia of the particles (n, 3) [mm], where the kernels find them."""
         facts = self._state.facts[self._index]
-        centre = np.array([column.mean(dtype=np.float64) for column in x.T])
-        arm = [column - c for column, c in zip(x.T, centre, strict=True)]
-        second = np.array([[a @ b for b in arm] for a in arm]).astype(np.float64) * float(facts[BODY_MASS])
+        centre = centre_of(x)
+        arms = x.T - centre[:, None]
+        second = arms @ arms.T * float(facts[BODY_MASS])
         inertia = np.trace(second) * np.eye(3) - second
         inverse = np.linalg.pinv(inertia, rcond=1e-6, hermitian=True)  # particles on a line have none about it
         facts[CENTRE : CENTRE + 3] = centre
@@ -283,7 +284,7 @@ class HybridWorld(DrivenWorld):
         backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
-        centre = np.array([column.mean(dtype=np.float64) for column in self._state.particles.x(self._index).T])
+        centre = centre_of(self._state.particles.x(self._index))
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
         meeting = self._gel_overlap(prepared)

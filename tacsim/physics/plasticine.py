@@ -185,6 +185,11 @@ def bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
 
 
+def centre_of(x: np.ndarray) -> np.ndarray:
+    """Mean (3,) of points (n, 3) in float64; by columns, as `bounds`."""
+    return np.array([x[:, d].mean(dtype=np.float64) for d in range(x.shape[1])])
+
+
 def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tuple[int, int, int]]:
     """Origin and node counts of a grid round the particles (n, 3) [mm]; whole strips along z."""
     least, most = bounds(x)

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,11 @@ class SimulationDiverged(RuntimeError):
         self.refine = 1  # the step was cut into so many at the last attempt
         self.dump: Path | None = None
         self.no_dump = ""  # why there is none
+
+    def of_launch(self, good: State, failed: State, where: Place) -> Self:
+        """Keeps what a dump wants of the launch that went wrong: the arrays before and after it, and the poses then."""
+        self.good, self.failed, self.poses = good, copies(failed), where.poses
+        return self
 
     def __str__(self) -> str:
         steps = f"even with 1/{self.refine} of the time step; " if self.refine > 1 else ""
@@ -143,9 +148,8 @@ def judged(arrays: State, good: State, health: Health, where: Place) -> Health:
     if complaint is None:
         return health
     words, quantity = complaint
-    failure = SimulationDiverged(words, str(where))
-    failure.quantity, failure.health, failure.poses = quantity, health, where.poses
-    failure.good, failure.failed = good, copies(arrays)
+    failure = SimulationDiverged(words, str(where)).of_launch(good, arrays, where)
+    failure.quantity, failure.health = quantity, health
     raise failure
 
 

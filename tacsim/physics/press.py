@@ -303,7 +303,8 @@ class PressWorld(DrivenWorld):
                 f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
                 f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
             )
-            raise SimulationDiverged(cause, str(prepared.where), advice)
+            failure = SimulationDiverged(cause, str(prepared.where), advice, retry=False)
+            raise failure.of_launch(prepared.good, self.arrays(), prepared.where)
 
 
 def _require_resolved(geometry: Shape, gel: GelFacts) -> None:

@@ -123,10 +123,8 @@ class Health:
         if self.off_grid:
             return f"particles left the grid ({self.off_grid} particle substeps)", "speed"
         if self.courant > LARGEST_COURANT:
-            words = (
-                f"the time step is {self.courant:.3g} of what the pressure wave takes through the most squeezed element"
-            )
-            return f"{words} (limit {LARGEST_COURANT:g})", "corner"
+            words = f"the time step is {self.courant:.3g} of what the pressure wave takes through the most squeezed"
+            return f"{words} element or grid cell (limit {LARGEST_COURANT:g})", "element length"
         return None
 
 

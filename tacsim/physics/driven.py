@@ -154,6 +154,8 @@ class DrivenWorld(SingleWorld):
         if order.duration is not None:
             timed = plan_in_time(a, b, order.duration, self._true, max(self._gel.half))
         onward = self._plan_on(a, b if order.flow else a)  # or to where they are: a stop
+        if timed is None and not order.flow:
+            self.plan(a, b)  # raises ValueError for a way that is far too long, before a stop
 
         def after_stop(refine: int) -> Motion:
             self._change(self._scaled if timed is None else self._true)

@@ -114,7 +114,7 @@ def table(dump: Dump) -> list[tuple[str, dict[str, str]]]:
     if dump.facts.health:
         seen = dump.facts.health
         said = {"overlap": "deepest overlap [mm]", "capped": "overlaps capped", "off_grid": "off the grid"}
-        said["courant"] = "time step / the wave's, most squeezed element"
+        said["courant"] = "time step / the wave's, most squeezed element or cell"
         rows |= {words: {"failed": seen[key]} for key, words in said.items() if key in seen}
     return list(rows.items())
 

@@ -202,10 +202,10 @@ class DistanceGrid:
 def distance_grid(geometry: Shape, spacing: float, box: tuple[ArrayLike, ArrayLike] | None = None) -> DistanceGrid:
     """Signed distance on a grid of `spacing` [m] that covers `box`: its lower and upper corner, (3,) each [m].
 
-    Only the part of an indenter that can touch need be covered; without `box` it is the bounding box and two spacings
-    round it. Node values are exact (float32) for the closed forms, and within 2 spacings of a mesh; further away the
-    sign is right and the value never too small, see :func:`tacsim.mesh.signed_distance_on_grid`. Interpolation adds
-    up to 3/8 spacing^2 / R at a surface of radius R, and a fraction of the spacing at sharp edges.
+    Without `box` it is the bounding box and two spacings round it; of a mesh that touches here and there see
+    :mod:`tacsim.tiles`. Node values are exact (float32) for the closed forms, and within 2 spacings of a mesh; further
+    away the sign is right and the value never too small, see :func:`tacsim.mesh.signed_distance_on_grid`. Interpolation
+    adds up to 3/8 spacing^2 / R at a surface of radius R, and a fraction of the spacing at sharp edges.
 
     The grid of a mesh takes a second or more, so the process remembers the latest: asked again for the same nodes round
     the same bytes of the same file, it gives the same object, whose arrays are read-only.

@@ -51,7 +51,7 @@ class TiledDistance:
         if np.prod(counts.astype(float)) > MAX_NODES:
             raise ValueError(
                 f"mesh {self.name}: a grid of {' x '.join(map(str, counts))} nodes {self.spacing * 1e3:.4g} mm apart "
-                f"would be needed where it can touch; the limit is {MAX_NODES:,}: cut off of mesh and gel what does not"
+                f"would be needed where it can touch; the limit is {MAX_NODES:,}"
             )
         found = np.empty(counts, np.float32)
         for tile in np.ndindex(*(end - first)):

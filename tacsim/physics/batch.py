@@ -30,8 +30,10 @@ class Batch(Single):
     whole: each moves alone, is read, kept and restored like any other, and no other changes.
     """
 
+    _instead = "Batch(scenes) and restore each world's snapshot()"
+
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for scenes that cannot share a launch, and says which."""
+        """Raises ValueError for scenes that cannot share a launch, and says which; TypeError for what is no scene."""
         _require_one_kind(scenes)
         self._state: HybridState | PressState
         self.worlds: tuple[HybridWorld | PressWorld, ...]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 State = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 Size = tuple[float, float, float]
-Quantity = Literal["corner", "node speed", "speed", "particle volume", "not finite"]
+Quantity = Literal["corner", "element length", "node speed", "speed", "particle volume", "not finite"]
 SENSORS = ("lower", "upper")  # gels by index
 
 
@@ -90,10 +90,12 @@ def element_volumes(state: State, thickness: float) -> Floats | None:
         return _determinant(_element_gradients(state, thickness))
 
 
-def shortest_element(state: State, thickness: float) -> float:
-    """The shortest gel element, along x, y or z of the lattice through its centre [mm]; `thickness` of a gel [mm]."""
+def element_lengths(state: State, thickness: float) -> Floats:
+    """(gels, nx, ny, nz) length of the gels' elements, the least of those along x, y and z of the lattice through their
+    centres [mm]; `thickness` of a gel [mm]."""
     h = thickness / (state["gel_displacement"].shape[3] - 1)
-    return float(h * np.sqrt((_element_gradients(state, thickness) ** 2).sum(axis=0)).min())
+    lengths: Floats = h * np.sqrt((_element_gradients(state, thickness) ** 2).sum(axis=0)).min(axis=0)
+    return lengths
 
 
 def _element_gradients(state: State, thickness: float) -> Floats:
@@ -128,6 +130,10 @@ def place_of_worst(quantity: Quantity, good: State, failed: State, gel: Size) ->
     if quantity == "corner":
         corners = corner_volumes(failed, gel[2] * 1e3)
         return "" if corners is None else _node(failed, _largest(-corners), gel)
+    if quantity == "element length":
+        if "gel_displacement" not in failed:
+            return ""
+        return _node(failed, _largest(-element_lengths(failed, gel[2] * 1e3)), gel)
     if quantity == "node speed" and "gel_velocity" in failed:
         return _node(good, _largest(np.abs(failed["gel_velocity"]).max(axis=-1)), gel)
     if quantity == "particle volume":

@@ -22,7 +22,7 @@ from tacsim.physics.controller import (
     move_on,
     run,
 )
-from tacsim.physics.diagnosis import shortest_element
+from tacsim.physics.diagnosis import element_lengths
 from tacsim.physics.gel import MM, GelFacts, GelState, gel_surface
 from tacsim.physics.health import LARGEST_COURANT, retried
 from tacsim.physics.inertia import Inertia, plan_in_time
@@ -130,7 +130,7 @@ class DrivenWorld(SingleWorld):
         with np.errstate(all="ignore"):  # what is not finite is told by others
             shortest = self._state.gels.shortest(self._index, self._gel.spacing)
             if shortest * LARGEST_COURANT < step:
-                shortest = shortest_element(self.arrays(), self._gel.thickness)
+                shortest = float(element_lengths(self.arrays(), self._gel.thickness).min())
         return step / max(shortest, 1e-6 * self._gel.spacing)
 
     def _damping(self) -> float:
@@ -154,6 +154,8 @@ class DrivenWorld(SingleWorld):
         if order.duration is not None:
             timed = plan_in_time(a, b, order.duration, self._true, max(self._gel.half))
         onward = self._plan_on(a, b if order.flow else a)  # or to where they are: a stop
+        if timed is None and not order.flow:
+            self.plan(a, b)  # raises ValueError for a way that is far too long, before a stop
 
         def after_stop(refine: int) -> Motion:
             self._change(self._scaled if timed is None else self._true)

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,11 @@ class SimulationDiverged(RuntimeError):
         self.dump: Path | None = None
         self.no_dump = ""  # why there is none
 
+    def of_launch(self, good: State, failed: State, where: Place) -> Self:
+        """Keeps what a dump wants of the launch that went wrong: the arrays before and after it, and the poses then."""
+        self.good, self.failed, self.poses = good, copies(failed), where.poses
+        return self
+
     def __str__(self) -> str:
         steps = f"even with 1/{self.refine} of the time step; " if self.refine > 1 else ""
         place = f" at {self.place}" if self.place else ""
@@ -118,10 +123,8 @@ class Health:
         if self.off_grid:
             return f"particles left the grid ({self.off_grid} particle substeps)", "speed"
         if self.courant > LARGEST_COURANT:
-            words = (
-                f"the time step is {self.courant:.3g} of what the pressure wave takes through the most squeezed element"
-            )
-            return f"{words} (limit {LARGEST_COURANT:g})", "corner"
+            words = f"the time step is {self.courant:.3g} of what the pressure wave takes through the most squeezed"
+            return f"{words} element or grid cell (limit {LARGEST_COURANT:g})", "element length"
         return None
 
 
@@ -143,9 +146,8 @@ def judged(arrays: State, good: State, health: Health, where: Place) -> Health:
     if complaint is None:
         return health
     words, quantity = complaint
-    failure = SimulationDiverged(words, str(where))
-    failure.quantity, failure.health, failure.poses = quantity, health, where.poses
-    failure.good, failure.failed = good, copies(arrays)
+    failure = SimulationDiverged(words, str(where)).of_launch(good, arrays, where)
+    failure.quantity, failure.health = quantity, health
     raise failure
 
 

@@ -300,10 +300,8 @@ class HybridWorld(DrivenWorld):
         found = gel_overlap(self._gel, self._state.gels.u[self._index, :, :, :, -1], last[:, :3], last[:, 3])
         most = GEL_OVERLAP * self._gel.thickness
         if found > most:
-            failure = SimulationDiverged(
+            raise SimulationDiverged(
                 f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",
                 str(prepared.where), "keep the sensors further apart, or use physics 'seed'", retry=False,
-            )  # fmt: skip
-            failure.good, failure.failed, failure.poses = prepared.good, copies(self.arrays()), prepared.where.poses
-            raise failure
+            ).of_launch(prepared.good, self.arrays(), prepared.where)  # fmt: skip
         return found

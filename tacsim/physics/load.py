@@ -115,12 +115,11 @@ def keep_loads(
                 return max(abs(error) for error in errors.values())
             for name in wrong:
                 axes[name].step(force(name), STEP * thickness)
-                if abs(axes[name].travel) > TRAVEL * thickness:
-                    break
-            else:
-                yield from go(share)
-                continue
-            break
+            beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness]
+            if beyond:
+                wrong = beyond
+                break
+            yield from go(share)
         name = wrong[0]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "

@@ -176,7 +176,7 @@ def plan_on(
 
 
 def _substeps(count: float, length: float, mach: float) -> int:
-    """The whole number for `count`. Raises ValueError for a way of `length` [mm] that takes MOST of them and more."""
+    """The whole number for `count`. Raises ValueError for a way of `length` [mm] that takes more than MOST of them."""
     if not count <= MOST:
         raise ValueError(
             f"a way of {length / MM:.3g} m at Mach {mach:.3g} would take {count:.2g} substeps (limit {MOST:,}); are "

@@ -235,7 +235,7 @@ class PressWorld(DrivenWorld):
         return None
 
     def prepare(self, launch: Launch) -> Prepared:
-        """Sets this environment's numbers for a launch."""
+        """Sets this environment's numbers for a launch. Raises SimulationDiverged: too much of a mesh to lay."""
         path = launch.path
         where = path.place(self._poses, launch.first, launch.last)
         good = copies(self.arrays())
@@ -243,7 +243,11 @@ class PressWorld(DrivenWorld):
         self._state.facts[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
         drive = relative_drive(both[:, 0], both[:, 1])
-        self._cover(drive)
+        try:
+            self._cover(drive)
+        except ValueError as error:
+            advice = "cut off of mesh and gel what cannot touch"
+            raise SimulationDiverged(str(error), str(where), advice, retry=False) from None
         return Prepared(launch, drive, where, good)
 
     def _cover(self, drive: np.ndarray) -> None:
@@ -303,7 +307,8 @@ class PressWorld(DrivenWorld):
                 f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
                 f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
             )
-            raise SimulationDiverged(cause, str(prepared.where), advice)
+            failure = SimulationDiverged(cause, str(prepared.where), advice, retry=False)
+            raise failure.of_launch(prepared.good, self.arrays(), prepared.where)
 
 
 def _require_resolved(geometry: Shape, gel: GelFacts) -> None:

@@ -14,9 +14,11 @@ from tacsim.physics.world import Order
 class Single:
     """What kernels change in place, through arrays that look into one another: a copy of it would be torn apart."""
 
+    _instead = "make_world(scene) and restore(world.snapshot())"  # what to do, in words
+
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Raises TypeError: both pickle and copy come here."""
-        raise TypeError("a world cannot be copied or pickled: make_world(scene) and restore(world.snapshot())")
+        raise TypeError(f"a {type(self).__name__} cannot be copied or pickled: {self._instead}")
 
 
 class SingleWorld(Single, ABC):

@@ -16,7 +16,7 @@ from tacsim.scene import GelSurface, Scene
 
 @dataclass(frozen=True, slots=True)
 class MoveStats:
-    """How one quasi-static motion went."""
+    """How one motion went."""
 
     substeps: int  # explicit substeps of motion and hold together
     hold: int  # of which hold
@@ -85,7 +85,9 @@ class World(Protocol):
         until settled, like every other motion, which first brings to rest what flows. Raises ValueError together with
         loads or a duration, and for `seed`.
 
-        Raises SimulationDiverged (tacsim.physics.health) when no step size gives a finite state.
+        Raises SimulationDiverged (tacsim.physics.health) when no step size gives a finite state; KeyError, TypeError or
+        ValueError for an order that makes no sense, before anything moves; RuntimeError while another motion is on its
+        way.
         """
         ...
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacsim import tiles
 from tacsim.interface import Pose
 from tacsim.physics import plasticine
 from tacsim.physics.batch import Batch
@@ -220,6 +221,29 @@ def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest
     assert "no memory for the grid round the particles (Unable to allocate)" in str(failure)
     grid = batch._state.particles
     assert grid.masses.shape[2] == grid.velocities.shape[1]
+
+
+@pytest.mark.cpu
+def test_one_whose_mesh_needs_too_many_nodes_is_told_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import trimesh
+
+    trimesh.creation.box((4.0, 4.0, 2.0)).export(tmp_path / "plate.stl")
+    plate, ball = (
+        Scene(body=None, indenter=Indenter(geometry=shape), gel=GEL)
+        for shape in (Mesh(path=str(tmp_path / "plate.stl")), Sphere(radius=3e-3))
+    )
+    batch, alone = Batch([plate, ball]), PressWorld(ball)
+    before = state(batch.worlds[0])
+    monkeypatch.setattr(tiles, "MAX_NODES", 1000)
+    down = [
+        {"indenter": Pose(world.pose("indenter").position - [0.0, 0.0, 0.4e-3])} for world in (*batch.worlds, alone)
+    ]
+    failure, stats = batch.move(down[:2])
+    assert isinstance(failure, SimulationDiverged) and failure.refine == 1  # no smaller step would help
+    assert "nodes 0.1 mm apart would be needed where it can touch; the limit is 1,000; " in str(failure)
+    assert state(batch.worlds[0]) == before
+    assert stats == alone.move(down[2])
+    assert_same([batch.worlds[1]], [alone])
 
 
 def test_loads_are_held_each_its_own_and_one_out_of_reach_is_told(fresh: Batch) -> None:

@@ -125,6 +125,18 @@ def test_other_motions_first_bring_it_to_rest() -> None:
         assert not world.snapshot()["rates"].any()
 
 
+def test_a_way_without_end_is_refused_before_what_flows_is_stopped() -> None:
+    """Else a batch would be on its way by then, and all of it be lost."""
+    batch = Batch([BALL, BALL])
+    first, second = batch.worlds
+    batch.move([nearer(first), nearer(second)], flow=True)
+    before = [{name: a.tobytes() for name, a in world.snapshot().items()} for world in batch.worlds]
+    with pytest.raises(ValueError, match="are the targets in metres") as refused:
+        batch.move([nearer(first), {"indenter": Pose(np.array([0.0, 0.0, 500.0]))}])
+    assert refused.value.__notes__ == ["in the motion of environment 1"]
+    assert [{name: a.tobytes() for name, a in world.snapshot().items()} for world in batch.worlds] == before
+
+
 def test_a_snapshot_on_the_way_goes_on_to_the_same_bits() -> None:
     world = squeezed()
     for _ in range(2):

@@ -91,7 +91,7 @@ def nothing(arrays: dict[str, np.ndarray]) -> None:
         (Health(1.0, 3, 1.0, 0.0, 0, 0.0), "left the grid (3 particle substeps)"),
         (
             Health(1.0, 0, 1.0, 0.0, 0, 0.0, 1.2),
-            "1.2 of what the pressure wave takes through the most squeezed element",
+            "1.2 of what the pressure wave takes through the most squeezed element or grid cell (limit 1)",
         ),
     ],
 )
@@ -277,6 +277,16 @@ def test_the_step_is_measured_against_the_most_squeezed_element(gradient: np.nda
         assert courant == pytest.approx(exact, rel=1e-4)
     else:
         assert exact - 1e-4 <= courant <= LARGEST_COURANT
+
+
+def test_the_most_squeezed_element_is_the_shortest_one_whatever_its_volume() -> None:
+    rest = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), axis=-1)
+    flat, small = (rest * (np.array(stretch) - 1.0) for stretch in ((0.3, 2.0, 2.0), (0.6, 0.6, 0.6)))
+    found = Health(1.0, 0, 1.0, 0.0, 0, 0.0, 1.2).complaint()
+    assert found is not None
+    for displacement, gel in (([flat, small], "lower"), ([small, flat], "upper")):
+        state = {"gel_displacement": np.array(displacement)}
+        assert f"of the {gel} gel" in diagnosis.place_of_worst(found[1], state, state, (4e-3, 4e-3, 4e-3))
 
 
 def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:

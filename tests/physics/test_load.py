@@ -1,10 +1,16 @@
 """Motion at a constant normal load."""
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tacsim.interface import Pose
-from tacsim.physics.load import LEAST, LoadNotReached
+from tacsim.physics.controller import Reading, run
+from tacsim.physics.load import LEAST, LoadNotReached, keep_loads
+from tacsim.physics.path import Path, plan
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import World, make_world
 from tacsim.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere
@@ -63,6 +69,27 @@ def test_loads_that_make_no_sense_are_refused() -> None:
         world.move({}, loads={"indenter": 0.3})
     with pytest.raises(ValueError, match="load of 'lower' is -1 N"):
         world.move({}, loads={"lower": -1.0})
+
+
+def test_the_sensor_that_went_too_far_is_named() -> None:
+    """Beside one that is wrong too, but in place: it sticks, and swings about its load."""
+    scene, rest = press().scene, Reading(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0.0, 0)
+    end = {"lower": Pose(), "upper": Pose()}
+
+    class Stuck:
+        def __init__(self) -> None:
+            self.scene, self.sensors = scene, tuple(end)
+
+        def wrench(self, name: str) -> NDArray[np.float64]:
+            force = 0.4 + math.copysign(0.1, end[name].position[2]) if name == "lower" else 0.0
+            return np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0])
+
+        def plan(self, start: Sequence[Pose], goal: Sequence[Pose]) -> Path:
+            return plan(start, goal, 0.03, 0.4, 10.0, 4.0)
+
+    motion = keep_loads(Stuck(), dict(end), end, {"lower": 0.4, "upper": 0.3}, 1, balanced=False)
+    with pytest.raises(LoadNotReached, match=r"'upper' does not reach a load of 0\.3 N: 0 N after \+2\.5 mm"):
+        run(motion, lambda *launch: rest)
 
 
 def test_a_way_that_would_take_for_ever_is_refused_with_a_load_too() -> None:

@@ -291,6 +291,11 @@ def test_a_tip_that_passes_between_the_contact_points_is_an_error(tmp_path: Path
     w = world(Mesh(path=str(tmp_path / "needle.stl")), preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
     move(w, (0, 0, -0.2e-3))
     before = w.snapshot()
-    with pytest.raises(SimulationDiverged, match=r"0\.4 mm deep .* no contact point .* such as 0\.5 mm, or a finer"):
+    with pytest.raises(
+        SimulationDiverged, match=r"0\.4 mm deep .* no contact point .* such as 0\.5 mm, or a finer"
+    ) as passed:
         move(w, (0, 0, -0.3e-3))
+    assert passed.value.refine == 1  # no smaller step would help
+    assert {"lower", "indenter"} == set(passed.value.poses)
+    assert passed.value.good.keys() == passed.value.failed.keys() == w.arrays().keys()  # for a dump
     assert all(before[name].tobytes() == a.tobytes() for name, a in w.snapshot().items())

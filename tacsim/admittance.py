@@ -19,7 +19,7 @@ from tacsim.rigfile import RepositionFacts, TaskFacts
 
 TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at its load rests
 PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
-# The stiffness changes at most by these factors a period, as forces are noisy; less towards soft, whose steps are longer
+# The stiffness changes at most by these factors a period: forces are noisy; less towards soft, whose steps are longer
 HARDER, SOFTER = 2.0, 1.25
 SMALLEST = 1e-6  # a shorter way tells no stiffness [m]
 REACH = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]

@@ -23,7 +23,7 @@ PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 PRESETS = {"draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3)}
 # Peak Mach number of motions between states of rest: what a tolerance asks for and what the elastic strain at yield
 # allows, within bounds (docs/decisions/0002).
-MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST, FASTEST = 3.0, 1.5, 0.001, 0.03
+MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST_MACH, FASTEST_MACH = 3.0, 1.5, 0.001, 0.03
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
@@ -222,8 +222,8 @@ class Scene(Facts):
             return settling.mach
         limit = math.inf if self.body is None else self.body.material.elastic_limit
         if not math.isfinite(limit):
-            return FASTEST
-        return min(max(min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRAIN * limit), SLOWEST), FASTEST)
+            return FASTEST_MACH
+        return min(max(min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRAIN * limit), SLOWEST_MACH), FASTEST_MACH)
 
     @property
     def spacing(self) -> float:

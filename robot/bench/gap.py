@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacsim.optics.spline import displacement_and_jacobian
+from tacsim.optics.surface import material_points
 from tacsim.physics.body_surface import surface_points
 from tacsim.pose import inverse, rotate, transform
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 MM = 1e3  # m -> mm, of a snapshot's lengths
 CELL = 2.0  # of the patch, in particle spacings
 FACING = 0.7  # least cosine between a particle's plane and the gel's surface
-ROUNDS = 20  # fixed-point steps for the material point under a point
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +71,8 @@ def _of_sensor(world: World, name: str, index: int, spacing: float) -> Gaps:
 
 def _from_gel(surface: GelSurface, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Material points (n, 2) [m] under `points` (n, 3) [m, sensor frame], distances (n,) [m] above, normals (n, 3)."""
-    at = points[:, :2]
-    for _ in range(ROUNDS):
-        displacement, jacobian = displacement_and_jacobian(surface, at)
-        at = points[:, :2] - displacement[:, :2]
+    at = material_points(surface, points[:, :2])
+    displacement, jacobian = displacement_and_jacobian(surface, at)
     along = jacobian + np.eye(3)[:, :2]
     normal = np.cross(along[:, :, 0], along[:, :, 1])
     normal /= np.linalg.norm(normal, axis=1)[:, None]

@@ -15,7 +15,7 @@ from robot.bench.runner import Case
 from tacsim.interface import Pose
 from tacsim.physics.layer import LayerContact, layer_contact
 from tacsim.physics.world import MoveStats
-from tacsim.scene import FASTEST, Box, Cylinder, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
+from tacsim.scene import FASTEST_MACH, Box, Cylinder, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
 from tacsim.shapes import extent
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
-USUAL = FASTEST  # the controller's default for what does not yield: a tenth of the shear wave's speed at nu 0.45
+USUAL = FASTEST_MACH  # the controller's default for what does not yield: a tenth of the shear wave's speed at nu 0.45
 # Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
 OTHERS = (0.015, 0.05, 0.1)
 

@@ -133,9 +133,20 @@ def write(
     """Writes a dump into a new folder below `folder` and returns it.
 
     poses: of the driven frames before the motion; before: the state then. Raises OSError, DumpError when there are
-    MOST_DUMPS already.
+    MOST_DUMPS already; nothing is left of a dump that could not be written whole.
     """
     place = _new(folder)
+    try:
+        _write(place, scene, poses, order, before, failure)
+    except BaseException:
+        shutil.rmtree(place, ignore_errors=True)
+        raise
+    return place
+
+
+def _write(
+    place: Path, scene: Scene, poses: Poses, order: Order, before: State, failure: SimulationDiverged
+) -> None:  # fmt: skip
     scene, mesh = _with_mesh(scene, MESH)
     if mesh is not None:
         shutil.copyfile(mesh, place / MESH)
@@ -163,7 +174,6 @@ def write(
     }
     np.savez_compressed(place / "state.npz", **arrays)  # type: ignore[arg-type]  # mypy takes a name for allow_pickle
     (place / "dump.json").write_text(facts.model_dump_json(indent=1) + "\n", encoding="utf-8")  # last: now it is whole
-    return place
 
 
 def _new(folder: Path) -> Path:

@@ -128,20 +128,15 @@ class Health:
         return None
 
 
-def attempt(arrays: State, launch: Callable[[], Health], where: Place) -> Health:
-    """Runs one launch of kernels, which changes `arrays` in place, and looks at what came out.
-
-    Raises SimulationDiverged if that is unphysical; whoever runs the motion (see `retried`) rolls back and retries.
-    """
-    return judged(arrays, copies(arrays), launch(), where)
-
-
 def copies(arrays: State) -> dict[str, NDArray[Any]]:
     return {name: a.copy(order="K") for name, a in arrays.items()}  # as they lie: particles' numbers are rows
 
 
 def judged(arrays: State, good: State, health: Health, where: Place) -> Health:
-    """`health` of a launch that changed `arrays` from `good` to what they are. Raises as `attempt` does."""
+    """`health` of a launch that changed `arrays` from `good` to what they are.
+
+    Raises SimulationDiverged if that is unphysical; whoever runs the motion (see `retried`) rolls back and retries.
+    """
     complaint = health.complaint() or _complaint(arrays)
     if complaint is None:
         return health
@@ -240,7 +235,7 @@ def _poses(world: Driven) -> dict[str, Pose]:
 
 def _dump(world: Driven, order: Order, before: State, failure: SimulationDiverged) -> None:
     """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
-    folder = os.environ.get("TACSIM_DUMPS")
+    folder = os.environ.get("TACSIM_DUMPS")  # tacsim.physics.dump.FOLDER, which is loaded only to write
     if folder is None:
         failure.no_dump = "set TACSIM_DUMPS to a folder to keep a replayable state"
     if not folder:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose, Truth
 from tacsim.physics.controller import Motion, Reading, Scheme, move_and_settle, run
-from tacsim.physics.health import Health, Place, SimulationDiverged, attempt, require_room, retried
+from tacsim.physics.health import Health, Place, SimulationDiverged, copies, judged, require_room, retried
 from tacsim.physics.layout import NUMBERS
 from tacsim.physics.load import keep_loads, require_loads
 from tacsim.physics.path import MM, Path, merged, plan
@@ -25,7 +25,7 @@ from tacsim.physics.single import SingleWorld
 from tacsim.physics.world import MoveStats, Order, put_back, taken
 from tacsim.runtime import launching, start
 from tacsim.sampling import body_points
-from tacsim.scene import FASTEST, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
+from tacsim.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 
 Float32 = NDArray[np.float32]
 
@@ -250,11 +250,13 @@ class SeedWorld(SingleWorld):
             self._launch(drive, path.step, x0, y0, health[0])
             return Health.read(health, path.step / self._smallest_cell(drive))
 
-        health = attempt(self.arrays(), launch, where)
+        good = copies(self.arrays())
+        health = judged(self.arrays(), good, launch(), where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
-            raise SimulationDiverged("every particle of the body left the grid", str(where), "move slower, or less far")
+            failure = SimulationDiverged("every particle of the body left the grid", str(where))
+            raise failure.of_launch(good, self.arrays(), where)
         scheme = Scheme(path.step, GEL_DAMPING, health.courant)
         overlap = self._overlap(path, last)
         return Reading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
@@ -285,7 +287,7 @@ class SeedWorld(SingleWorld):
         if len(body):
             low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
             high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
-        margin = MARGIN * self._dx + 2 * max(self._mach, FASTEST) * (last - first) * self._dt
+        margin = MARGIN * self._dx + 2 * max(self._mach, FASTEST_MACH) * (last - first) * self._dt
         room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
         require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
         layers = self._fit_layers(faces)

@@ -65,6 +65,17 @@ def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_dump_that_cannot_be_written_whole_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with dumps_in(tmp_path):
+        failure = press_through(PressWorld(SCENE))
+    assert failure.dump is None and "No space left on device" in str(failure)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(dump.FOLDER, str(tmp_path / "mine"))
     with dumps_in(tmp_path / "theirs"):

@@ -19,7 +19,8 @@ from tacsim.physics.health import (
     Health,
     Place,
     SimulationDiverged,
-    attempt,
+    copies,
+    judged,
     require_room,
     retried,
 )
@@ -63,11 +64,9 @@ class Particles:
             a[...] = state[name]
 
     def launch(self, change: Callable[[dict[str, np.ndarray]], Any], seen: Health = WELL) -> Health:
-        def kernels() -> Health:
-            change(self.state)
-            return seen
-
-        return attempt(self.state, kernels, HERE)
+        good = copies(self.state)
+        change(self.state)
+        return judged(self.state, good, seen, HERE)
 
 
 def set_to(name: str, index: tuple[int, ...], value: float) -> Callable[[dict[str, np.ndarray]], None]:

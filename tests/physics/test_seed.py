@@ -236,3 +236,11 @@ def test_gravity_is_refused() -> None:
     """Also where nobody has validated the scene."""
     with pytest.raises(ValueError, match="physics 'seed' has no gravity"):
         SeedWorld(scene().model_copy(update={"gravity": (0.0, 0.0, -9.81)}))
+
+
+def test_a_body_that_is_gone_leaves_its_states_for_a_dump(pressed):
+    pressed.arrays()["position"][-len(pressed._body_points()) :] += [1e3, 0.0, 0.0]
+    with pytest.raises(SimulationDiverged, match="every particle of the body left the grid") as caught:
+        pressed.move({})
+    assert caught.value.good["position"].shape == caught.value.failed["position"].shape
+    assert set(caught.value.poses) == {"lower", "upper"}

@@ -285,7 +285,7 @@ def poisoned(name: str, times: int) -> Callable[..., Any]:
 
 
 def with_nan(times: int) -> dict[str, Any]:
-    return {"hybrid.copies": times, "press.copies": times, "seed.attempt": times}
+    return {"hybrid.copies": times, "press.copies": times, "seed.copies": times}
 
 
 SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}

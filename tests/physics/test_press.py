@@ -170,6 +170,16 @@ def test_a_mesh_laid_on_its_side_presses_like_its_closed_form(tmp_path: Path) ->
     assert forces[1] == pytest.approx(forces[0], rel=1e-3) and forces[0] < -0.2
 
 
+def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> None:
+    """Each has as much room along each axis as the one that needs most there."""
+    state = world(brick(tmp_path, (2, 2, 2))[1], preset="draft")._state
+    counts = state.counts.copy()
+    laid = state._values = np.broadcast_to(np.float32(0), (1, 2**29, 1, 1))  # without memory
+    with pytest.raises(MemoryError, match="kernels count to"):
+        state.cover(0, np.zeros(3), np.ones(3))
+    assert state._values is laid and np.array_equal(state.counts, counts)
+
+
 def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

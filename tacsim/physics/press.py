@@ -263,11 +263,11 @@ class PressWorld(DrivenWorld):
         if mesh is None:
             return
         margin, half = MARGIN * self._gel.spacing, mesh.half * MM
-        for rows in drive[[0, -1], 0].astype(np.float64):
-            at = (self._surface_nodes() - rows[3]) @ rows[:3]
-            near = at[(np.abs(at) <= half + margin).all(axis=1)]
-            if len(near):
-                self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
+        nodes = self._surface_nodes()
+        at = np.concatenate([(nodes - rows[3]) @ rows[:3] for rows in drive[[0, -1], 0].astype(np.float64)])
+        near = at[(np.abs(at) <= half + margin).all(axis=1)]
+        if len(near):
+            self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
 
     def _surface_nodes(self) -> np.ndarray:
         """Where the nodes of the gel's surface are (n, 3) [mm], sensor frame."""

@@ -8,6 +8,7 @@ import pytest
 
 from tacsim import tiles
 from tacsim.interface import Pose
+from tacsim.physics import press
 from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.indenter import POINTS
 from tacsim.physics.layer import layer_contact
@@ -168,6 +169,20 @@ def test_a_mesh_laid_on_its_side_presses_like_its_closed_form(tmp_path: Path) ->
             assert w.move({"indenter": Pose(np.array([0, 0, height]), lying)}).settled
         forces.append(w.wrench("lower")[2])
     assert forces[1] == pytest.approx(forces[0], rel=1e-3) and forces[0] < -0.2
+
+
+def test_both_ends_of_a_launch_are_laid_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each alone would be allowed; the second must not stand in the place of the first."""
+    w = world(brick(tmp_path, (18, 5, 2))[1], preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+    drive = np.zeros((2, 1, 6, 3), np.float32)
+    drive[:, 0, :3] = np.eye(3)
+    drive[:, 0, 3] = (-7.0, 0.0, 1.0), (7.0, 0.0, 1.0)
+    for module in (press, tiles):
+        monkeypatch.setattr(module, "MAX_NODES", 8 * tiles.TILE**3)  # an end has 6 tiles, both and what is between 12
+    with pytest.raises(ValueError, match="192 x 64 x 32 nodes"):
+        w._cover(drive)
+    w._cover(drive[:1])
+    assert w._state._values.shape == (1, 96, 64, 32)
 
 
 def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ FloatArray = NDArray[np.float64]
 MAX_PARTICLES = 5_000_000
 MAX_NODES = 20_000_000
 MAX_MISFIT = 0.1  # how far the lattice of particles may miss the size or the volume of a shape, relative
+LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 BAND = 2  # grid spacings round a mesh in which the distance is exact
 REMEMBERED = 8  # distance grids of meshes in one process, the latest used; most have 1 to 10 MB
 
@@ -49,8 +50,12 @@ def extent(geometry: Shape) -> FloatArray:
 
 
 def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike) -> FloatArray:
-    """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those."""
+    """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those.
+
+    A face or edge within LEVEL of square to the direction is square to it, for rounding must not choose a corner.
+    """
     along = np.asarray(direction, dtype=np.float64)
+    along = np.where(np.abs(along) > LEVEL * np.linalg.norm(along), along, 0.0)
     match geometry:
         case Box():
             return np.asarray(np.sign(along) * np.array(geometry.size) / 2)

@@ -324,3 +324,12 @@ def test_a_tip_that_passes_between_the_contact_points_is_an_error(tmp_path: Path
     assert {"lower", "indenter"} == set(passed.value.poses)
     assert passed.value.good.keys() == passed.value.failed.keys() == w.arrays().keys()  # for a dump
     assert all(before[name].tobytes() == a.tobytes() for name, a in w.snapshot().items())
+
+
+def test_an_edge_that_passes_between_the_contact_points_is_an_error_though_it_ends_beside_the_gel() -> None:
+    """A plate on its edge, longer than the gel and tilted by rounding: its lowest corner is beside the gel."""
+    w = world(Box(size=(12e-3, 2e-3, 0.1e-3)), preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+    tilted = np.array([np.sin(np.pi / 4), 1e-7, 0.0, np.cos(np.pi / 4)])
+    w.move({"indenter": Pose(np.array([0, 0, 3e-3]), tilted)})
+    with pytest.raises(SimulationDiverged, match=r"0\.4 mm deep .* no contact point"):
+        w.move({"indenter": Pose(np.array([0, 0, 0.6e-3]), tilted)})

@@ -16,7 +16,7 @@ import trimesh
 from tacsim import shapes
 from tacsim.mesh import Axes, Surface, fingerprint, load_mesh, signed_distance_on_grid
 from tacsim.scene import Box, Cylinder, Mesh, Shape, Sphere
-from tacsim.shapes import distance, distance_grid, extent, particles, sample, volume
+from tacsim.shapes import distance, distance_grid, extent, farthest, particles, sample, volume
 
 MM = 1e-3
 WEDGE = np.array([[0, 0, 0], [6, 0, 0], [0, 4, 0], [0, 0, 3.0]])  # a right-angled tetrahedron: no symmetry at all
@@ -185,6 +185,17 @@ def test_distance_refuses_bad_points() -> None:
         distance(Sphere(), [[0.0, 0.0]])
     with pytest.raises(ValueError, match="finite"):
         distance(Sphere(), [[0.0, 0.0, np.nan]])
+
+
+def test_the_farthest_point_is_the_middle_of_a_face_that_rounding_tilts() -> None:
+    box, cylinder = Box(size=(2.0, 4.0, 6.0)), Cylinder(radius=1.0, height=4.0)
+    for noise in (0.0, 1e-7, -1e-7):
+        assert farthest(box, [noise, -1.0, noise]).tolist() == [0.0, -2.0, 0.0]
+        assert farthest(cylinder, [noise, noise, 2.0]).tolist() == [0.0, 0.0, 2.0]
+        assert farthest(cylinder, [-3.0, noise, noise]).tolist() == [-1.0, 0.0, 0.0]
+    assert farthest(box, [1e-3, -1.0, -1e-3]).tolist() == [1.0, -2.0, -3.0]
+    assert farthest(cylinder, [0.0, 1e-3, 1.0]).tolist() == [0.0, 1.0, 2.0]
+    assert farthest(Sphere(radius=2.0), [3.0, 0.0, -4.0]) == pytest.approx([1.2, 0.0, -1.6])
 
 
 # distance grid

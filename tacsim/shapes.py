@@ -76,7 +76,7 @@ def volume(geometry: Shape) -> float:
         case Cylinder():
             return float(np.pi * geometry.radius**2 * geometry.height)
         case Mesh():
-            return float(_centred(geometry).volume)
+            return float(centred(geometry).volume)
 
 
 def particles(geometry: Shape, spacing: float) -> FloatArray:
@@ -159,7 +159,7 @@ def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
             radial = np.hypot(at[:, 0], at[:, 1]) - geometry.radius
             return _outside_and_inside(np.stack([radial, np.abs(at[:, 2]) - geometry.height / 2], axis=1))
         case Mesh():
-            return signed_distance(make_surface(_centred(geometry)), at)
+            return signed_distance(make_surface(centred(geometry)), at)
 
 
 def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
@@ -170,7 +170,7 @@ def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
     """
     at = np.asarray(points, dtype=np.float64)
     if isinstance(geometry, Mesh):
-        return away_from_surface(make_surface(_centred(geometry)), at)
+        return away_from_surface(make_surface(centred(geometry)), at)
     step = 1e-6 * float(extent(geometry).max())
     sides = [distance(geometry, at + d) - distance(geometry, at - d) for d in step * np.eye(3)]
     gradient = np.stack(sides, axis=1) / (2 * step)
@@ -273,8 +273,11 @@ def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArra
     return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
 
 
-def _centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
-    """`expected`: fingerprint of the file, where what is made of it will be remembered by it."""
+def centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
+    """A mesh [m] in the shape's own frame; `expected`: fingerprint of its file, by which what is made is remembered.
+
+    Raises what :func:`tacsim.mesh.load_mesh` raises.
+    """
     mesh = load_mesh(geometry.path, geometry.scale, expected)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     return mesh
@@ -283,13 +286,13 @@ def _centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
 def _mesh_on_grid(
     geometry: Mesh, axes: tuple[FloatArray, FloatArray, FloatArray], band: float, expected: str | None = None
 ) -> FloatArray:
-    return signed_distance_on_grid(make_surface(_centred(geometry, expected)), axes, band)
+    return signed_distance_on_grid(make_surface(centred(geometry, expected)), axes, band)
 
 
 @lru_cache(maxsize=64)
 def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
     """Size of the bounding box (3,) [m]. content: fingerprint of the file."""
-    return tuple(float(side) for side in _centred(geometry, content).extents)
+    return tuple(float(side) for side in centred(geometry, content).extents)
 
 
 @lru_cache(maxsize=REMEMBERED)

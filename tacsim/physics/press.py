@@ -137,6 +137,7 @@ class PressState:
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
+        self._covered = 0  # how often these have changed: a device has its copy of them until they do
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
         self._laid: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # tiles at hand, of environments with a mesh
 
@@ -179,6 +180,7 @@ class PressState:
         self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
         self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
         self._laid[index] = first, end
+        self._covered += 1
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
@@ -186,8 +188,8 @@ class PressState:
         self.gels.refresh()
         if ON_DEVICE:
             run_press(
-                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self.facts, self.counts,
-                self.partial,
+                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self._covered, self.facts,
+                self.counts, self.partial,
             )  # fmt: skip
         else:
             run_team(

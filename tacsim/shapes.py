@@ -5,7 +5,7 @@ Everything here is in the shape's own frame: axes as in the scene, origin at the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -31,6 +31,7 @@ FloatArray = NDArray[np.float64]
 MAX_PARTICLES = 5_000_000
 MAX_NODES = 20_000_000
 MAX_MISFIT = 0.1  # how far the lattice of particles may miss the size or the volume of a shape, relative
+LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 BAND = 2  # grid spacings round a mesh in which the distance is exact
 REMEMBERED = 8  # distance grids of meshes in one process, the latest used; most have 1 to 10 MB
 
@@ -49,8 +50,12 @@ def extent(geometry: Shape) -> FloatArray:
 
 
 def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike) -> FloatArray:
-    """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those."""
+    """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those.
+
+    A face or edge within LEVEL of square to the direction is square to it, for rounding must not choose a corner.
+    """
     along = np.asarray(direction, dtype=np.float64)
+    along = np.where(np.abs(along) > LEVEL * np.linalg.norm(along), along, 0.0)
     match geometry:
         case Box():
             return np.asarray(np.sign(along) * np.array(geometry.size) / 2)
@@ -71,7 +76,7 @@ def volume(geometry: Shape) -> float:
         case Cylinder():
             return float(np.pi * geometry.radius**2 * geometry.height)
         case Mesh():
-            return float(_centred(geometry).volume)
+            return float(centred(geometry).volume)
 
 
 def particles(geometry: Shape, spacing: float) -> FloatArray:
@@ -101,7 +106,8 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     if isinstance(geometry, Cylinder):  # layers along z fit already; the disc decides
         inside = np.hypot(nodes[:, 0], nodes[:, 1]) <= geometry.radius
     elif isinstance(geometry, Mesh):
-        inside = _mesh_on_grid(geometry, (axes[0], axes[1], axes[2]), band=2 * spacing).ravel() <= 0
+        surface = make_surface(centred(geometry))
+        inside = signed_distance_on_grid(surface, (axes[0], axes[1], axes[2]), 2 * spacing).ravel() <= 0
     else:
         inside = distance(geometry, nodes) <= 0
     found: FloatArray = nodes[inside]
@@ -154,7 +160,7 @@ def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
             radial = np.hypot(at[:, 0], at[:, 1]) - geometry.radius
             return _outside_and_inside(np.stack([radial, np.abs(at[:, 2]) - geometry.height / 2], axis=1))
         case Mesh():
-            return signed_distance(make_surface(_centred(geometry)), at)
+            return signed_distance(make_surface(centred(geometry)), at)
 
 
 def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
@@ -165,7 +171,7 @@ def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
     """
     at = np.asarray(points, dtype=np.float64)
     if isinstance(geometry, Mesh):
-        return away_from_surface(make_surface(_centred(geometry)), at)
+        return away_from_surface(make_surface(centred(geometry)), at)
     step = 1e-6 * float(extent(geometry).max())
     sides = [distance(geometry, at + d) - distance(geometry, at - d) for d in step * np.eye(3)]
     gradient = np.stack(sides, axis=1) / (2 * step)
@@ -199,51 +205,22 @@ class DistanceGrid:
     spacing: float  # [m]
 
 
-def distance_grid(geometry: Shape, spacing: float, box: tuple[ArrayLike, ArrayLike] | None = None) -> DistanceGrid:
-    """Signed distance on a grid of `spacing` [m] that covers `box`: its lower and upper corner, (3,) each [m].
+def distance_grid(geometry: Mesh, spacing: float) -> DistanceGrid:
+    """Signed distance on a grid of `spacing` [m] that covers a mesh's bounding box and BAND spacings round it.
 
-    Without `box` it is the bounding box and two spacings round it; of a mesh that touches here and there see
-    :mod:`tacsim.tiles`. Node values are exact (float32) for the closed forms, and within 2 spacings of a mesh; further
-    away the sign is right and the value never too small, see :func:`tacsim.mesh.signed_distance_on_grid`. Interpolation
-    adds up to 3/8 spacing^2 / R at a surface of radius R, and a fraction of the spacing at sharp edges.
+    Node values are exact (float32) within BAND spacings of the surface; further away the sign is right and the value
+    never too small, see :func:`tacsim.mesh.signed_distance_on_grid`. Interpolation adds up to 3/8 spacing^2 / R at a
+    surface of radius R, and a fraction of the spacing at sharp edges. Of a mesh that touches here and there see
+    :mod:`tacsim.tiles`.
 
-    The grid of a mesh takes a second or more, so the process remembers the latest: asked again for the same nodes round
-    the same bytes of the same file, it gives the same object, whose arrays are read-only.
+    It takes a second or more, so the process remembers the latest: asked again for the same spacing and the same bytes
+    of the same file, it gives the same object, whose arrays are read-only.
 
-    Raises ValueError on a bad spacing or box, or more than 20,000,000 nodes; and what :func:`tacsim.mesh.load_mesh`
-    raises.
+    Raises ValueError on a bad spacing, or more than 20,000,000 nodes; and what :func:`tacsim.mesh.load_mesh` raises.
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise ValueError(f"grid spacing must be a positive length [m], got {spacing}")
-    if box is None:
-        half = extent(geometry) / 2 + 2 * spacing
-        box = (-half, half)
-    lower, upper = (np.array(corner, dtype=np.float64) for corner in box)
-    if lower.shape != (3,) or upper.shape != (3,) or not (np.isfinite([lower, upper]).all() and (upper > lower).all()):
-        raise ValueError(f"box must be (lower, upper) corners of 3 finite numbers [m], lower < upper; got {box}")
-    nodes = np.ceil((upper - lower) / spacing - 1e-9) + 1
-    if nodes.prod() > MAX_NODES:
-        raise ValueError(
-            f"a distance grid of {_name(geometry)} at {_mm(spacing)} would have {nodes.prod():,.0f} nodes, the limit "
-            f"is {MAX_NODES:,}; use a larger spacing, or a box round the tip that can touch"
-        )
-    counts = nodes.astype(int)
-    if isinstance(geometry, Mesh):
-        half, band = extent(geometry) / 2, BAND * spacing
-        if (lower > half + band).any() or (upper < -half - band).any():
-            raise ValueError(f"the box comes nowhere within {_mm(band)} of the {_name(geometry)}; put it round a part")
-        return _mesh_grid(geometry, fingerprint(geometry.path), tuple(lower), tuple(counts), spacing)
-    points = np.stack(np.meshgrid(*_axes(lower, counts, spacing), indexing="ij"), axis=-1)
-    values = distance(geometry, points.reshape(-1, 3)).reshape(points.shape[:3])
-    return DistanceGrid(values=values.astype(np.float32), origin=lower, spacing=spacing)
-
-
-def _axes(lower: Iterable[float], counts: Iterable[int], spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coordinates [m] of the nodes of a grid: `counts` (3,) of them from the corner `lower` (3,) [m] on."""
-    x, y, z = (
-        np.float64(start) + spacing * np.arange(n, dtype=np.float64) for start, n in zip(lower, counts, strict=True)
-    )
-    return x, y, z
+    return _mesh_grid(geometry, fingerprint(geometry.path), spacing)
 
 
 def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -268,32 +245,36 @@ def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArra
     return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
 
 
-def _centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
-    """`expected`: fingerprint of the file, where what is made of it will be remembered by it."""
+def centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
+    """A mesh [m] in the shape's own frame; `expected`: fingerprint of its file, by which what is made is remembered.
+
+    Raises what :func:`tacsim.mesh.load_mesh` raises.
+    """
     mesh = load_mesh(geometry.path, geometry.scale, expected)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     return mesh
 
 
-def _mesh_on_grid(
-    geometry: Mesh, axes: tuple[FloatArray, FloatArray, FloatArray], band: float, expected: str | None = None
-) -> FloatArray:
-    return signed_distance_on_grid(make_surface(_centred(geometry, expected)), axes, band)
-
-
 @lru_cache(maxsize=64)
 def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
     """Size of the bounding box (3,) [m]. content: fingerprint of the file."""
-    return tuple(float(side) for side in _centred(geometry, content).extents)
+    return tuple(float(side) for side in centred(geometry, content).extents)
 
 
 @lru_cache(maxsize=REMEMBERED)
-def _mesh_grid(
-    geometry: Mesh, content: str, lower: tuple[float, ...], counts: tuple[int, ...], spacing: float
-) -> DistanceGrid:
-    """`counts` (3,) nodes from the corner `lower` (3,) [m] on; read-only, for it is shared. content: see above."""
-    values = _mesh_on_grid(geometry, _axes(lower, counts, spacing), BAND * spacing, content).astype(np.float32)
-    origin = np.array(lower)
+def _mesh_grid(geometry: Mesh, content: str, spacing: float) -> DistanceGrid:
+    """Read-only, for it is shared. content: see above."""
+    mesh = centred(geometry, content)
+    half = np.asarray(mesh.extents, np.float64) / 2 + BAND * spacing
+    nodes = np.ceil(2 * half / spacing - 1e-9) + 1
+    if nodes.prod() > MAX_NODES:
+        raise ValueError(
+            f"a distance grid of {_name(geometry)} at {_mm(spacing)} would have {nodes.prod():,.0f} nodes, the limit "
+            f"is {MAX_NODES:,}; use a larger spacing"
+        )
+    x, y, z = (spacing * np.arange(n) - edge for n, edge in zip(nodes, half, strict=True))
+    values = signed_distance_on_grid(make_surface(mesh), (x, y, z), BAND * spacing).astype(np.float32)
+    origin = -half
     for array in (values, origin):
         array.setflags(write=False)
     return DistanceGrid(values, origin, spacing)

@@ -11,15 +11,20 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.mesh import FloatArray, fingerprint, load_mesh, make_surface, signed_distance_on_grid
+from tacsim.mesh import FloatArray, fingerprint, make_surface, signed_distance_on_grid
 from tacsim.scene import Mesh
-from tacsim.shapes import BAND, MAX_NODES, REMEMBERED
+from tacsim.shapes import BAND, MAX_NODES, REMEMBERED, centred
 
 Index = NDArray[np.int64]
 
 TILE = 32  # nodes along an edge
+KEPT = 2_000  # tiles in one process, of all meshes, the latest used: 260 MB; one grid has 610 at most
 PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
 PIECES = (4_000, 100_000)  # at least, about at most
+
+# By file, content, spacing and number, so that a tile keeps no mesh in memory; the oldest first. Worlds of several
+# threads come here one after the other (`tacsim.runtime.launching`).
+_kept: dict[tuple[Mesh, str, float, tuple[int, ...]], NDArray[np.float32]] = {}
 
 
 class TiledDistance:
@@ -27,8 +32,7 @@ class TiledDistance:
 
     def __init__(self, geometry: Mesh, content: str, spacing: float) -> None:
         """content: fingerprint of the file. Raises what :func:`tacsim.mesh.load_mesh` raises."""
-        mesh = load_mesh(geometry.path, geometry.scale, content)
-        mesh.apply_translation(-mesh.bounds.mean(axis=0))
+        mesh = centred(geometry, content)
         self.name = geometry.path
         self.spacing = spacing
         self.vertices: FloatArray = np.asarray(mesh.vertices, np.float64)  # (n, 3)
@@ -37,7 +41,7 @@ class TiledDistance:
         fewest, most = PIECES
         self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE * spacing) ** 2, fewest, most)))
         self._last = np.ceil((self.half - self.origin) / spacing + BAND).astype(np.int64) // TILE
-        self._tiles: dict[tuple[int, ...], NDArray[np.float32]] = {}
+        self._key = geometry, content, spacing
 
     def around(self, low: FloatArray, high: FloatArray) -> tuple[Index, Index]:
         """The first tile (3,) and the one after the last, along each axis, that points between two corners lie in."""
@@ -60,13 +64,17 @@ class TiledDistance:
         return found
 
     def _tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
-        if index not in self._tiles:
+        key = (*self._key, index)
+        tile = _kept.pop(key, None)
+        if tile is None:
             x, y, z = (
                 start + self.spacing * (n * TILE + np.arange(TILE)) for start, n in zip(self.origin, index, strict=True)
             )
-            exact = signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing)
-            self._tiles[index] = exact.astype(np.float32)
-        return self._tiles[index]
+            tile = signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing).astype(np.float32)
+        _kept[key] = tile
+        if len(_kept) > KEPT:
+            del _kept[next(iter(_kept))]
+        return tile
 
 
 def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:

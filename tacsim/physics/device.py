@@ -4,8 +4,8 @@ Threads of a device cannot meet inside a loop, so each phase of a substep is a l
 substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only
 the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
 
-Arrays stay on the device for a launch. Before it they are copied there, after it what has changed is copied back, so
-everybody else goes on working with NumPy.
+Arrays stay on the device for a launch. Before it they are copied there (distances from meshes only once they have
+changed), after it what has changed is copied back, so everybody else goes on working with NumPy.
 """
 
 from typing import Any
@@ -222,6 +222,7 @@ class Mirror:
 
     def __init__(self) -> None:
         self._there: dict[str, Any] = {}
+        self._versions: dict[str, int] = {}
 
     def room(self, name: str, dtype: Any, shape: tuple[int, ...]) -> Any:
         """An array that only the device uses; zeros at first."""
@@ -236,6 +237,13 @@ class Mirror:
         there = self.room(name, dtype, host.shape[:-1] if isinstance(dtype, type(vec4)) else host.shape)
         there.from_numpy(np.ascontiguousarray(host))
         return there
+
+    def kept(self, name: str, host: np.ndarray, dtype: Any, version: int) -> Any:
+        """The same of an array that seldom changes: copied only if it has another `version` than what is there."""
+        if self._versions.get(name) != version:
+            self.sent(name, host, dtype)
+            self._versions[name] = version
+        return self._there[name]
 
     def bring(self, **hosts: np.ndarray) -> None:
         """Copies back into these arrays what the device has by their names."""
@@ -255,12 +263,12 @@ class Mirror:
 @launching()
 def run_press(
     mirror: Mirror, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray, values: np.ndarray,
-    facts: np.ndarray, counts: np.ndarray, partial: np.ndarray,
+    version: int, facts: np.ndarray, counts: np.ndarray, partial: np.ndarray,
 ) -> None:  # fmt: skip
-    """One launch; the arrays are those of `PressState`."""
+    """One launch; the arrays are those of `PressState`. version: another whenever `values` has changed."""
     arguments = (
         mirror.sent("drive", drive, ti.f32), *mirror.send_gels(gels), mirror.sent("slip", slip, vec3),
-        mirror.sent("pressure", pressure, ti.f32), mirror.sent("values", values, ti.f32),
+        mirror.sent("pressure", pressure, ti.f32), mirror.kept("values", values, ti.f32, version),
         mirror.sent("facts", facts, ti.f32), mirror.sent("counts", counts, ti.i32),
         mirror.sent("partial", partial, ti.f32),
     )  # fmt: skip

@@ -39,7 +39,7 @@ from tacsim.physics.indenter import (
     indent,
 )
 from tacsim.physics.inertia import Inertia, kernel_second
-from tacsim.physics.lanes import ON_DEVICE, PARTS, Counts, Facts, Partial
+from tacsim.physics.lanes import MOST, ON_DEVICE, PARTS, Counts, Facts, Partial, aligned_zeros
 from tacsim.physics.layout import (
     BACKING,
     COUNTS,
@@ -72,6 +72,7 @@ CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points that an indenter may dip between them; a ball that just does not fit: 0.35
 MARGIN = 2.0  # elements round a mesh, or the part of a gel that lies there: nothing else touches in the next launch
+TOO_MUCH = "cut off of mesh and gel what cannot touch; worlds of a smaller batch have more room each"
 
 
 @ti.kernel
@@ -136,6 +137,7 @@ class PressState:
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._mirror = Mirror()
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
+        self._covered = 0  # how often these have changed: a device has its copy of them until they do
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
         self._laid: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # tiles at hand, of environments with a mesh
 
@@ -153,7 +155,8 @@ class PressState:
     def cover(self, index: int, low: np.ndarray, high: np.ndarray) -> None:
         """Has at hand the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
 
-        Raises ValueError for more nodes than there is memory for.
+        The memory of all environments grows if this one needs more. Raises ValueError for more nodes than one may have,
+        MemoryError where there is no memory for them; nothing has changed then.
         """
         mesh = self.meshes[index]
         assert mesh is not None
@@ -163,17 +166,21 @@ class PressState:
             if (first >= old[0]).all() and (end <= old[1]).all():
                 return
             both = np.minimum(first, old[0]), np.maximum(end, old[1])
-            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= MAX_NODES:
+            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= min(MAX_NODES, MOST // len(self._values)):
                 first, end = both
         values = mesh.values(first, end) * np.float32(MM)
-        if (np.array(values.shape) > self._values.shape[1:]).any():
-            more = np.maximum(np.array(values.shape) - self._values.shape[1:], 0)
-            self._values = np.pad(self._values, [(0, 0), *((0, int(n)) for n in more)])
+        held = self._values.shape[1:]
+        room = tuple(map(max, held, values.shape))
+        if room != held:
+            grown = aligned_zeros(len(self._values), *room)
+            grown[(slice(None), *map(slice, held))] = self._values
+            self._values = grown
         nx, ny, nz = values.shape
         self._values[index, :nx, :ny, :nz] = values
         self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
         self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
         self._laid[index] = first, end
+        self._covered += 1
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
@@ -181,8 +188,8 @@ class PressState:
         self.gels.refresh()
         if ON_DEVICE:
             run_press(
-                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self.facts, self.counts,
-                self.partial,
+                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self._covered, self.facts,
+                self.counts, self.partial,
             )  # fmt: skip
         else:
             run_team(
@@ -238,16 +245,18 @@ class PressWorld(DrivenWorld):
         """Sets this environment's numbers for a launch. Raises SimulationDiverged: too much of a mesh to lay."""
         path = launch.path
         where = path.place(self._poses, launch.first, launch.last)
-        good = copies(self.arrays())
         both = path.drive(launch.first, launch.last)
-        self._state.facts[self._index, STEP] = path.step
-        Health.clear(self._state.partial[self._index])
         drive = relative_drive(both[:, 0], both[:, 1])
         try:
             self._cover(drive)
         except ValueError as error:
-            advice = "cut off of mesh and gel what cannot touch"
-            raise SimulationDiverged(str(error), str(where), advice, retry=False) from None
+            raise SimulationDiverged(str(error), str(where), TOO_MUCH, retry=False) from None
+        except MemoryError as error:
+            cause = f"no memory for the distances from the indenter's mesh ({error})"
+            raise SimulationDiverged(cause, str(where), TOO_MUCH, retry=False) from None
+        good = copies(self.arrays())
+        self._state.facts[self._index, STEP] = path.step
+        Health.clear(self._state.partial[self._index])
         return Prepared(launch, drive, where, good)
 
     def _cover(self, drive: np.ndarray) -> None:
@@ -256,11 +265,11 @@ class PressWorld(DrivenWorld):
         if mesh is None:
             return
         margin, half = MARGIN * self._gel.spacing, mesh.half * MM
-        for rows in drive[[0, -1], 0].astype(np.float64):
-            at = (self._surface_nodes() - rows[3]) @ rows[:3]
-            near = at[(np.abs(at) <= half + margin).all(axis=1)]
-            if len(near):
-                self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
+        nodes = self._surface_nodes()
+        at = np.concatenate([(nodes - rows[3]) @ rows[:3] for rows in drive[[0, -1], 0].astype(np.float64)])
+        near = at[(np.abs(at) <= half + margin).all(axis=1)]
+        if len(near):
+            self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
 
     def _surface_nodes(self) -> np.ndarray:
         """Where the nodes of the gel's surface are (n, 3) [mm], sensor frame."""

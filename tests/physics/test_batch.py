@@ -11,7 +11,7 @@ import pytest
 
 from tacsim import tiles
 from tacsim.interface import Pose
-from tacsim.physics import plasticine
+from tacsim.physics import plasticine, press
 from tacsim.physics.batch import Batch
 from tacsim.physics.health import LARGEST_GRID, RETRIES, SimulationDiverged
 from tacsim.physics.hybrid import HybridWorld
@@ -224,7 +224,10 @@ def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest
 
 
 @pytest.mark.cpu
-def test_one_whose_mesh_needs_too_many_nodes_is_told_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("lacks", ["nodes", "memory"])
+def test_one_whose_mesh_needs_too_much_is_told_alone(
+    lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import trimesh
 
     trimesh.creation.box((4.0, 4.0, 2.0)).export(tmp_path / "plate.stl")
@@ -233,15 +236,25 @@ def test_one_whose_mesh_needs_too_many_nodes_is_told_alone(tmp_path: Path, monke
         for shape in (Mesh(path=str(tmp_path / "plate.stl")), Sphere(radius=3e-3))
     )
     batch, alone = Batch([plate, ball]), PressWorld(ball)
-    before = state(batch.worlds[0])
-    monkeypatch.setattr(tiles, "MAX_NODES", 1000)
+    before, counts, facts = state(batch.worlds[0]), batch._state.counts.copy(), batch._state.facts.copy()
+    if lacks == "nodes":
+        monkeypatch.setattr(tiles, "MAX_NODES", 1000)
+        words = "nodes 0.1 mm apart would be needed where it can touch; the limit is 1,000; "
+    else:
+        words = "no memory for the distances from the indenter's mesh (Unable to allocate 2 of "
+
+        def scarce(*shape: int) -> np.ndarray:
+            raise MemoryError(f"Unable to allocate {shape[0]} of {shape[1:]}")
+
+        monkeypatch.setattr(press, "aligned_zeros", scarce)
     down = [
         {"indenter": Pose(world.pose("indenter").position - [0.0, 0.0, 0.4e-3])} for world in (*batch.worlds, alone)
     ]
     failure, stats = batch.move(down[:2])
     assert isinstance(failure, SimulationDiverged) and failure.refine == 1  # no smaller step would help
-    assert "nodes 0.1 mm apart would be needed where it can touch; the limit is 1,000; " in str(failure)
+    assert words in str(failure) and "of a smaller batch have more room" in str(failure)
     assert state(batch.worlds[0]) == before
+    assert np.array_equal(batch._state.counts[0], counts[0]) and np.array_equal(batch._state.facts[0], facts[0])
     assert stats == alone.move(down[2])
     assert_same([batch.worlds[1]], [alone])
 

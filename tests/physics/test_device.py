@@ -21,20 +21,29 @@ from tacsim.physics.batch import Batch
 from tacsim.physics.controller import Launch
 from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.hybrid import HybridWorld
+from tacsim.physics.layout import SHAPE_FIRST
 from tacsim.physics.press import PressWorld
 from tacsim.physics.world import MoveStats, World
 from tacsim.runtime import available
-from tacsim.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Sphere
+from tacsim.scene import Body, BodyMaterial, Box, Gel, Indenter, Mesh, Scene, Shape, Sphere
 
 SECONDS = 600  # for one process; a first run compiles
 GEL = Gel(size=(5e-3, 4e-3, 2e-3))
 QUICK = {"mach": 0.1, "tolerance": 0.4, "max_substeps": 40}  # few substeps: a device that is a processor is slow
 
 
-def press(radius: float = 3e-3) -> Scene:
-    return Scene.model_validate(
-        {"body": None, "indenter": Indenter(geometry=Sphere(radius=radius)), "gel": GEL, "settling": QUICK}
-    )
+def press(geometry: Shape) -> Scene:
+    return Scene.model_validate({"body": None, "indenter": Indenter(geometry=geometry), "gel": GEL, "settling": QUICK})
+
+
+def egg(folder: Path) -> Mesh:
+    """So long that, over the middle of the gel, its first tiles are just out of reach."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(3)
+    mesh.apply_scale((7.65, 3.0, 2.0))
+    mesh.export(folder / "egg.stl")
+    return Mesh(path=str(folder / "egg.stl"))
 
 
 def squeeze(side: float, stress: float = 2e4) -> Scene:
@@ -60,15 +69,20 @@ def outcome(world: World, stats: MoveStats) -> dict[str, Any]:
     }
 
 
-def all_outcomes() -> dict[str, Any]:
+def all_outcomes(folder: Path) -> dict[str, Any]:
     """Every motion that is compared; and, as words, what is found unphysical in a launch."""
     found: dict[str, Any] = {}
 
     def note(name: str, facts: Mapping[str, Any]) -> None:
         found.update({f"{name}.{key}": value for key, value in facts.items()})
 
-    pressed = PressWorld(press())
+    pressed = PressWorld(press(Sphere(radius=3e-3)))
     note("press", outcome(pressed, pressed.move(closer(pressed, 0.35e-3, 0.1e-3))))
+    meshed = PressWorld(press(egg(folder)))
+    meshed.move(closer(meshed, 0.3e-3))
+    tiles = meshed._state.counts[0, SHAPE_FIRST]
+    note("mesh", outcome(meshed, meshed.move(closer(meshed, 0.05e-3, 0.2e-3))))
+    assert meshed._state.counts[0, SHAPE_FIRST] < tiles  # others were laid, and had to be sent
     # one environment alone would hide a wrong index of environments, equal bodies one of particles
     batch = Batch([squeeze(2e-3), squeeze(3e-3, 1e4)])
     first, second = batch.worlds
@@ -136,7 +150,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict
 def test_both_go_the_same_way(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     cpu, there = pair
     assert cpu.keys() == there.keys()
-    for name in ("press", "one", "other"):
+    for name in ("press", "mesh", "one", "other"):
         assert there[f"{name}.stats"] == pytest.approx(cpu[f"{name}.stats"], abs=1e-7)
         assert cpu[f"{name}.stats"][2] == 1, "not settled: compares nothing"
         largest = np.abs(cpu[f"{name}.wrench"][:, :3]).max()
@@ -170,6 +184,24 @@ def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]])
         assert str(found["invert.words"]).startswith("a gel element is inverted or crushed")
 
 
+SENT = """
+import numpy as np
+from tacsim.physics.device import Mirror
+from tacsim.runtime import start, ti
+start()
+mirror, host = Mirror(), np.ones((2, 3), np.float32)
+for version in (0, 0, 1):
+    print(mirror.kept("values", host, ti.f32, version).to_numpy().max())
+    host += 1
+print(mirror.kept("values", np.ones((4, 3), np.float32), ti.f32, 2).shape)
+"""
+
+
+def test_what_seldom_changes_is_sent_when_it_has() -> None:
+    done = subprocess.run([sys.executable, "-c", SENT], capture_output=True, text=True, timeout=SECONDS, check=True)
+    assert done.stdout.split("\n")[:4] == ["1.0", "1.0", "3.0", "(4, 3)"]
+
+
 WORLD = "from tacsim.physics.world import make_world; from tacsim.scene import Scene; make_world(Scene(physics={!r}))"
 
 
@@ -194,4 +226,4 @@ def test_a_device_that_will_not_do_is_refused(device: str, code: str, words: str
 
 
 if __name__ == "__main__":
-    np.savez(sys.argv[1], **all_outcomes())
+    np.savez(sys.argv[1], **all_outcomes(Path(sys.argv[1]).parent))

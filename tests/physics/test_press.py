@@ -8,6 +8,7 @@ import pytest
 
 from tacsim import tiles
 from tacsim.interface import Pose
+from tacsim.physics import press
 from tacsim.physics.health import SimulationDiverged
 from tacsim.physics.indenter import POINTS
 from tacsim.physics.layer import layer_contact
@@ -170,6 +171,30 @@ def test_a_mesh_laid_on_its_side_presses_like_its_closed_form(tmp_path: Path) ->
     assert forces[1] == pytest.approx(forces[0], rel=1e-3) and forces[0] < -0.2
 
 
+def test_both_ends_of_a_launch_are_laid_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each alone would be allowed; the second must not stand in the place of the first."""
+    w = world(brick(tmp_path, (18, 5, 2))[1], preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+    drive = np.zeros((2, 1, 6, 3), np.float32)
+    drive[:, 0, :3] = np.eye(3)
+    drive[:, 0, 3] = (-7.0, 0.0, 1.0), (7.0, 0.0, 1.0)
+    for module in (press, tiles):
+        monkeypatch.setattr(module, "MAX_NODES", 8 * tiles.TILE**3)  # an end has 6 tiles, both and what is between 12
+    with pytest.raises(ValueError, match="192 x 64 x 32 nodes"):
+        w._cover(drive)
+    w._cover(drive[:1])
+    assert w._state._values.shape == (1, 96, 64, 32)
+
+
+def test_the_grids_of_all_environments_together_are_bounded(tmp_path: Path) -> None:
+    """Each has as much room along each axis as the one that needs most there."""
+    state = world(brick(tmp_path, (2, 2, 2))[1], preset="draft")._state
+    counts = state.counts.copy()
+    laid = state._values = np.broadcast_to(np.float32(0), (1, 2**29, 1, 1))  # without memory
+    with pytest.raises(MemoryError, match="kernels count to"):
+        state.cover(0, np.zeros(3), np.ones(3))
+    assert state._values is laid and np.array_equal(state.counts, counts)
+
+
 def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,11 +211,11 @@ def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
         real = getattr(tiles, name)
         monkeypatch.setattr(tiles, name, lambda *given: (computed.append(name), real(*given))[1])
 
-    count("load_mesh")
+    count("centred")
     count("signed_distance_on_grid")
     first = world(write(3.0))
     move(first, (0, 0, -0.4e-3))
-    assert computed.count("load_mesh") == 1 and 1 <= computed.count("signed_distance_on_grid") <= 9
+    assert computed.count("centred") == 1 and 1 <= computed.count("signed_distance_on_grid") <= 9
     computed.clear()
     second = world(write(3.0))
     move(second, (0, 0, -0.4e-3))
@@ -198,7 +223,7 @@ def test_a_second_world_of_a_mesh_reads_the_file_but_computes_nothing_anew(
     assert first.wrench("lower")[2] < -0.01 and first.wrench("lower").tobytes() == second.wrench("lower").tobytes()
     third = world(write(2.0))
     move(third, (0, 0, -0.4e-3))
-    assert computed.count("load_mesh") == 1
+    assert computed.count("centred") == 1
     assert third.pose("indenter").position[2] == pytest.approx(1.7e-3, rel=0.01)
 
 
@@ -299,3 +324,12 @@ def test_a_tip_that_passes_between_the_contact_points_is_an_error(tmp_path: Path
     assert {"lower", "indenter"} == set(passed.value.poses)
     assert passed.value.good.keys() == passed.value.failed.keys() == w.arrays().keys()  # for a dump
     assert all(before[name].tobytes() == a.tobytes() for name, a in w.snapshot().items())
+
+
+def test_an_edge_that_passes_between_the_contact_points_is_an_error_though_it_ends_beside_the_gel() -> None:
+    """A plate on its edge, longer than the gel and tilted by rounding: its lowest corner is beside the gel."""
+    w = world(Box(size=(12e-3, 2e-3, 0.1e-3)), preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+    tilted = np.array([np.sin(np.pi / 4), 1e-7, 0.0, np.cos(np.pi / 4)])
+    w.move({"indenter": Pose(np.array([0, 0, 3e-3]), tilted)})
+    with pytest.raises(SimulationDiverged, match=r"0\.4 mm deep .* no contact point"):
+        w.move({"indenter": Pose(np.array([0, 0, 0.6e-3]), tilted)})

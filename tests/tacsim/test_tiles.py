@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from tacsim.mesh import fingerprint
+from tacsim import tiles
+from tacsim.mesh import fingerprint, signed_distance_on_grid
 from tacsim.scene import Mesh
 from tacsim.shapes import BAND, distance
 from tacsim.tiles import TILE, TiledDistance, tiled_distance
@@ -37,10 +38,13 @@ def test_distances_are_exact_near_the_surface_and_right_in_sign_elsewhere(mesh: 
     assert (np.sign(found) == np.sign(truth))[~near].all() and (np.abs(found)[~near] >= 0.99 * BAND * SPACING).all()
 
 
-def test_a_tile_is_the_same_whatever_it_is_laid_with(mesh: Mesh, tiled: TiledDistance) -> None:
+def test_a_tile_is_the_same_whatever_it_is_laid_with(
+    mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one, two = np.array([1, 0, 0]), np.array([2, 1, 1])
     alone = tiled.values(one, two)
-    other = TiledDistance(mesh, fingerprint(mesh.path), SPACING)  # which remembers none
+    monkeypatch.setattr(tiles, "_kept", {})
+    other = TiledDistance(mesh, fingerprint(mesh.path), SPACING)
     assert np.array_equal(other.values(np.zeros(3, int), two + 1)[TILE : 2 * TILE, :TILE, :TILE], alone)
 
 
@@ -50,6 +54,31 @@ def test_a_tile_far_from_the_surface_is_all_inside(tmp_path: Path) -> None:
     middle = np.array([2, 2, 2])
     values = tiled.values(middle, middle + 1)
     assert values.max() < -3e-3
+
+
+def test_the_latest_tiles_of_all_meshes_are_kept_and_others_are_laid_again_alike(
+    mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, end = np.array([1, 0, 0]), np.array([3, 2, 1])
+    smaller = tiled_distance(mesh.model_copy(update={"scale": 0.5e-3}), SPACING)
+    expected, other = tiled.values(first, end), smaller.values(first, first + 1)
+    laid: list[int] = []
+    monkeypatch.setattr(tiles, "signed_distance_on_grid", lambda *a: (laid.append(1), signed_distance_on_grid(*a))[1])
+    monkeypatch.setattr(tiles, "KEPT", 3)
+    monkeypatch.setattr(tiles, "_kept", {})
+
+    def lays(tiled: TiledDistance, first: np.ndarray, end: np.ndarray, expected: np.ndarray) -> int:
+        laid.clear()
+        assert np.array_equal(tiled.values(first, end), expected) and len(tiles._kept) <= 3
+        return len(laid)
+
+    assert lays(tiled, first, end, expected) == 4
+    second = np.array([1, 1, 0]), np.array([2, 2, 1]), expected[:TILE, TILE:]
+    assert lays(tiled, *second) == 0  # the first of the four is gone, this one is now the latest used
+    assert lays(smaller, first, first + 1, other) == 1
+    assert lays(tiled, *second) == 0
+    assert lays(tiled, first, first + 1, expected[:TILE, :TILE]) == 1
+    assert lays(tiled, first, end, expected) >= 2
 
 
 def test_a_grid_beyond_memory_is_refused(tiled: TiledDistance) -> None:

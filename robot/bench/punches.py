@@ -218,6 +218,7 @@ def cases(folder: Path) -> tuple[Case, ...]:
         Case(
             "real", CASE, "layer", f"{labels.pixel_pitch * 1e3:.3g} mm a pixel", partial(punch, folder, name),
             missing=lacking or ("" if name in there else f"no frame or no mesh of the punch '{name}' below {folder}"),
+            long=True,
         )
         for name in names
     )  # fmt: skip

@@ -142,4 +142,4 @@ def cases(folder: Path) -> tuple[Case, ...]:
     except BadData as error:
         return (lacking("real", CASE, str(error), resolution),)
     size = (*labels.gel_size, labels.gel_thickness[0])
-    return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size)),)
+    return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size), long=True),)

@@ -24,11 +24,11 @@ def mock_host(number: int) -> str:
     return f"127.{ROOM}.{os.getpid() % 250 + 1}.{number}"
 
 
-def rig_addresses(first: int = 11) -> list[str]:
-    """Overrides that give the rig `mock` addresses of this process's own, from number `first` on."""
+def rig_addresses() -> list[str]:
+    """Overrides that give the rig `mock` addresses of this process's own."""
     return [
         override
-        for number, name in enumerate(("lower", "upper"), start=first)
+        for number, name in enumerate(("lower", "upper"), start=11)
         for override in (
             f"arms.{name}.host={mock_host(number)}",
             f"sensors.{name}.source=http://{mock_host(number)}:8081/?action=stream",

@@ -516,6 +516,19 @@ for _name in ("lower", "upper"):
 TINY = ["scene.body.geometry.size=[4 mm, 4 mm, 4 mm]", "scene.gel.size=[8 mm, 8 mm, 2 mm]"]
 
 
+def test_arms_of_a_mock_rig_hold_the_loads_of_their_task() -> None:
+    """Before `simulated` is opened, whose arms have the same names."""
+    reposition = ["task=reposition", "task.touch_force=0.3 N", "task.loads={upper: 0.6 N}"]
+    with opened("mock", *SMALL, *TINY, *reposition, *rig_addresses(), "start.approach_step=0.2 mm") as found:
+        start = found.rig.reset().arms["upper"].pose
+        for count in range(1, 7):
+            asked = Pose(start.position + [count * 0.05e-3, 0.0, 0.0], start.quaternion)
+            observation, _ = found.rig.step(Action({"upper": asked}))
+        arm = observation.arms["upper"]
+    assert -arm.wrench[2] == pytest.approx(0.6, rel=0.05)
+    assert arm.pose.position[0] - start.position[0] == pytest.approx(0.3e-3, abs=10e-6)
+
+
 @pytest.fixture(scope="module")
 def simulated() -> Iterator[Opened]:
     with opened("mock", *SMALL, *TINY, *rig_addresses(), "start.approach_step=0.2 mm") as found:
@@ -554,18 +567,6 @@ def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
         start._facts = facts  # type: ignore[attr-defined]
     for name, pose in simulated.bench.start.items():
         assert simulated.rig.arms[name].state().pose.position == pytest.approx(pose.position, abs=50e-6)
-
-
-def test_arms_of_a_mock_rig_hold_the_loads_of_their_task() -> None:
-    reposition = ["task=reposition", "task.touch_force=0.3 N", "task.loads={upper: 0.6 N}"]
-    with opened("mock", *SMALL, *TINY, *reposition, *rig_addresses(21), "start.approach_step=0.2 mm") as found:
-        start = found.rig.reset().arms["upper"].pose
-        for count in range(1, 7):
-            asked = Pose(start.position + [count * 0.05e-3, 0.0, 0.0], start.quaternion)
-            observation, _ = found.rig.step(Action({"upper": asked}))
-        arm = observation.arms["upper"]
-    assert -arm.wrench[2] == pytest.approx(0.6, rel=0.05)
-    assert arm.pose.position[0] - start.position[0] == pytest.approx(0.3e-3, abs=10e-6)
 
 
 def test_a_killed_simulator_ends_the_episode(simulated: Opened) -> None:

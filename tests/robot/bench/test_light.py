@@ -141,7 +141,7 @@ def test_the_highest_face_of_a_mesh_is_the_punch(tmp_path: Path) -> None:
 
 
 def test_what_a_folder_lacks_is_said_and_is_no_failure(folder: Path) -> None:
-    cases = chosen(["real"], baselines=False, data=folder)
+    cases = chosen(["real"], baselines=False, long=True, data=folder)
     lacking = {(case.name, case.resolution): case.missing for case in cases if case.missing}
     words = " | ".join(lacking.values())
     assert "lost: no nowhere_*.png below" in words

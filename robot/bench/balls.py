@@ -159,14 +159,17 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
 
 
 def cases(folder: Path) -> tuple[Case, ...]:
-    """A case a set; one whose frames are not there says so. Raises ConfigError."""
+    """A case a set, all but the first long; one whose frames are not there says so. Raises ConfigError."""
+    sets = read_sets(folder)
+    there = [of for of in sets if is_there(folder, of)]
     return tuple(
         Case(
             "real", CASE, "tacsim", f"{of.pixel_pitch * 1e3:.3g} mm a pixel", partial(ball_presses, folder, of),
             cpu=True,
-            missing="" if is_there(folder, of) else f"{of.name}: no {of.wanted} below {folder}",
+            long=of in there[1:],
+            missing="" if of in there else f"{of.name}: no {of.wanted} below {folder}",
         )
-        for of in read_sets(folder)
+        for of in sets
     )  # fmt: skip
 
 

@@ -87,4 +87,4 @@ def incline(repeat: int) -> list[Measurement]:
     ]  # fmt: skip
 
 
-CASES = (Case("squeeze", "incline", "tacsim", "particles 0.5 mm, gel 1 mm", incline),)
+CASES = (Case("squeeze", "incline", "tacsim", "particles 0.5 mm, gel 1 mm", incline, long=True),)

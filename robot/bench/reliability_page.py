@@ -20,12 +20,12 @@ SAFETY = (
     "real arm was measured."
 )
 READING = (
-    "- **Measured** is the median of {repeat} repetitions, *worst* the worst of them; what must not happen at all is "
+    "- **Measured** is the median of {repeat}, *worst* the worst of them; what must not happen at all is "
     "summed over all. The verdict is on the median; *met, worst beyond* says that a repetition was not within it.\n"
     "- **An idle machine** is meant. Others that work on it are told above by the load; with a load near the number of "
     "cores or beyond it the times here say more about them than about us. The logic itself is tested in `make test`, "
     "counted in control periods, packages and registers, with configured time-outs and bounds ten times wider.\n"
-    "- **Rerun:** `tacsim bench robot --json benchmarks/reliability.json`, then `tacsim bench --from "
+    "- **Rerun:** `tacsim bench robot --long --json benchmarks/reliability.json`, then `tacsim bench --from "
     "benchmarks/reliability.json --docs docs`. `tacsim bench all` leaves this group out. ur_rtde has no wheel for "
     "Python 3.13; there only the guard and the camera are measured."
 )
@@ -41,7 +41,7 @@ def write_reliability(report: Report, folder: Path) -> Path:
 
 def markdown(report: Report) -> str:
     """The page. The same report gives the same text."""
-    rows = [row for row in report.results if row.group == "robot"]
+    rows, count = [row for row in report.results if row.group == "robot"], report.metadata.repeat
     parts = [
         "# Reliability",
         "Fifteen promises of arms and cameras, as figures. Written by `tacsim bench --from FILE --docs docs`; do not "
@@ -52,7 +52,7 @@ def markdown(report: Report) -> str:
         table(HEADER, lines(rows)),
         *_notes(rows),
         "## How to read and rerun",
-        READING.format(repeat=report.metadata.repeat),
+        READING.format(repeat=f"{count} repetition{'s' * (count > 1)}"),
         "## What a promise says, and which tests check its logic",
         "\n".join(_logic(number) for number in range(len(PROMISES))),
     ]

@@ -53,4 +53,4 @@ def touch_ball(touches: int, repeat: int) -> list[Measurement]:
     return [Measurement(timing, millimetres, "mm", "hidden truth, median", f"{SETS} sets", None, figures)]
 
 
-CASES = (Case("real", CASE, "tacsim", "24 touches", partial(touch_ball, 24), cpu=True),)
+CASES = (Case("real", CASE, "tacsim", "24 touches", partial(touch_ball, 24), long=True, cpu=True),)

@@ -46,7 +46,15 @@ def bench(
         Path | None,
         typer.Option("--data", metavar="DIR", help="Real frames, for the group real (or all): see docs/benchmarks.md."),
     ] = None,
-    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Timed repetitions; a case stops at 1 s of them.")] = 5,
+    repeat: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1000,
+            show_default="5; robot without --long: 1",
+            help="Timed repetitions; a case stops at 1 s of them (not robot).",
+        ),
+    ] = None,
     docs: Annotated[
         Path | None,
         typer.Option("--docs", metavar="DIR", help="Write the pages here: benchmarks.md, reliability.md."),
@@ -89,6 +97,8 @@ def bench(
 
             with busy("computing the limit of fine meshes"):
                 compute(notes.print)
+        if repeat is None:
+            repeat = 1 if group is Groups.robot and not long else 5
         reports = [_measure(group, repeat, baselines=baselines, long=long, data=data)]
     for report in reports:
         _show(report, titled=len(reports) > 1)

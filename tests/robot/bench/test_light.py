@@ -109,6 +109,19 @@ def test_presses_in_an_archive_are_the_same_presses(folder: Path, hidden: balls.
         balls.read_balls(tmp_path, packed)
 
 
+def test_only_the_first_set_that_is_there_is_calibrated_without_long(tmp_path: Path) -> None:
+    text = "sets:\n" + "".join(
+        f"  - {{name: {name}, frames: ['{name}_*.png'], backgrounds: [empty.png], ball_radius: 4 mm, "
+        "pixel_pitch: 0.05 mm}\n"
+        for name in ("none", "first", "second")
+    )
+    (tmp_path / balls.OWN).write_text(text, encoding="utf-8")
+    for name in ("first", "second"):
+        (tmp_path / f"{name}_0.png").touch()
+    of_sets = [(bool(case.missing), case.long) for case in balls.cases(tmp_path)]
+    assert of_sets == [(True, False), (False, False), (False, True)]
+
+
 def test_a_press_of_known_depth_is_simulated_from_it_alone(folder: Path) -> None:
     picture, height = depths.known_depth(folder, BALL, 1)
     assert picture.variant.endswith(": picture") and height.variant.endswith(": height")

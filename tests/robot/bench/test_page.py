@@ -99,6 +99,24 @@ def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
     assert tacsim("bench", "--repeat", "0").exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "repetitions"),
+    [(["robot"], 1), (["robot", "--long"], 5), (["press"], 5), (["robot", "--repeat", "3"], 3)],
+)
+def test_the_robot_is_measured_once_without_long(
+    monkeypatch: pytest.MonkeyPatch, report: Report, words: list[str], repetitions: int
+) -> None:
+    asked = []
+
+    def run(cases: object, repeat: int, **_: object) -> Report:
+        asked.append(repeat)
+        return report
+
+    monkeypatch.setattr("robot.bench.runner.run_cases", run)
+    assert tacsim("bench", *words).exit_code == 0
+    assert asked == [repetitions]
+
+
 def test_the_page_shows_figures_and_a_missed_one(report: Report) -> None:
     page = markdown(report)
     assert "| figure | measured | must | aim | verdict |" in page and "## How to read and rerun" in page

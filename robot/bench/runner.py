@@ -91,6 +91,8 @@ def run_cases(
             group = together[0].group
             group_seconds[group] = group_seconds.get(group, 0.0) + time.perf_counter() - started
     groups = list(dict.fromkeys(case.group for case in cases))
+    order = {tuple(_names(case).values()): number for number, case in enumerate(cases)}
+    rows.sort(key=lambda row: order[row.group, row.case, row.method, row.resolution])
     return Report(
         metadata=Metadata(
             date=datetime.now(UTC).replace(microsecond=0),
@@ -117,16 +119,12 @@ def _names(case: Case) -> dict[str, Any]:
 
 
 def _apart(cases: Sequence[Case]) -> list[list[Case]]:
-    """Our own cases of a group share a process, since loading the kernels takes longer than most of them run; another
-    method gets one of its own, and so does every long case."""
-    parts: list[list[Case]] = []
+    """Our own short cases of a group share a process, since loading the kernels takes longer than most of them run;
+    another method gets one of its own, and so does every long case."""
+    parts: dict[object, list[Case]] = {}
     for case in cases:
-        last = parts[-1][-1] if parts else None
-        if case.short and last is not None and last.short and last.group == case.group:
-            parts[-1].append(case)
-        else:
-            parts.append([case])
-    return parts
+        parts.setdefault(case.group if case.short else case, []).append(case)
+    return list(parts.values())
 
 
 class _Worker:

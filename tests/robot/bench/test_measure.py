@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,10 @@ from pydantic import ValidationError
 
 from robot.bench import cache, measure
 from robot.bench.cases import CASES, chosen, description
-from robot.bench.measure import Timing, forget_peak_memory, peak_memory, timed
+from robot.bench.measure import Measurement, Timing, forget_peak_memory, peak_memory, timed
 from robot.bench.press import layer_press
 from robot.bench.runner import Case, Stopped, run_cases
-from robot.bench.schema import GROUPS, Report, Row, json_schema
+from robot.bench.schema import GROUPS, Group, Report, Row, json_schema
 
 
 def test_the_first_run_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,6 +91,23 @@ def test_a_report_says_how_long_each_group_took() -> None:
     assert list(facts.group_seconds) == ["press", "materials"]  # other methods and long rows of ours do not count
     assert 0 < sum(facts.group_seconds.values()) < facts.seconds
     assert "group_seconds" not in json_schema()["$defs"]["Metadata"]["required"]  # older reports have none
+
+
+def test_short_cases_of_a_group_share_a_process_wherever_they_stand(tmp_path: Path) -> None:
+    def told(name: str, group: Group = "press", **of: bool) -> Case:
+        return Case(group, name, "tacsim", "", partial(tell_process, tmp_path / name), **of)
+
+    cases = [told("a"), told("long", long=True), told("b"), told("peer", baseline=True), told("c", "scenes"), told("d")]
+    report = run_cases(cases, 1, baselines=True, long=True)
+    assert not report.failures and [row.case for row in report.results] == [case.name for case in cases]
+    process = {case.name: (tmp_path / case.name).read_text(encoding="ascii") for case in cases}
+    assert process["a"] == process["b"] == process["d"]
+    assert len(set(process.values())) == 4
+
+
+def tell_process(path: Path, repeat: int) -> list[Measurement]:
+    path.write_text(str(os.getpid()), encoding="ascii")
+    return [Measurement(Timing((1.0,), 1.0), 0.0, "%", "nothing")]
 
 
 def test_a_stop_ends_the_running_case_at_once() -> None:

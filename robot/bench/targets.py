@@ -171,8 +171,9 @@ TARGETS: tuple[Target, ...] = (
     Target("control step, draft, two images: flowing", "ms", 30, 10, _step("seconds", "0.1 mm, flowing", 1e3)),
     Target("... force, 20 of them in a row", "% rms", None, 5, _step("error", "0.1 mm, flowing")),
     Target("control step, draft, two images: each one settled", "ms", 30, 10, _step("seconds", "0.1 mm, settled", 1e3),
-           remark="72 substeps of 1.2 ms, 40 of the way and 32 of the hold, and 9 ms of images; 8 substeps are the "
-           "shortest hold, so a substep would have to cost a third. Steps that need not settle flow, with 10"),
+           remark="72 substeps, 1.2 ms each on a quiet machine, 40 of the way and 32 of the hold, and 9 ms of images; "
+           "8 are the shortest hold, so a substep would have to cost a third. Steps that need not settle flow, with "
+           "10"),
     Target("... force, 20 settled ones in a row", "% rms", None, 5, _step("error", "0.1 mm, settled")),
     Target("a second world is ready", "ms", 50, None, pick("second_ms", "second_world")),
     Target("gel force, oedometer", "%", 0.1, 0.01, pick("error", "oedometer")),

@@ -46,7 +46,7 @@ test-all: test
 
 # Without a device nothing was tested, which must not look like a pass: 77, as automake's tests say "skipped".
 test-gpu: $(DEV)
-	@TACSIM_DEVICE=cuda $(BIN)/python -c 'from tacsim.runtime import start; start()' >/dev/null 2>&1 || { \
+	@TACSIM_DEVICE=cuda $(BIN)/python -c 'from tacsim.compute.runtime import start; start()' >/dev/null 2>&1 || { \
 	  echo "make test-gpu: Taichi finds no CUDA device (or no driver) on this machine, so nothing was tested."; exit 77; }
 	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q tests/physics $(ARGS)
 	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench all --long --json benchmarks/gpu/report.json

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from calibration.errors import Unusable
-from calibration.inverse import InverseModel
-from calibration.view import GelView
+from calibration.height.inverse import InverseModel
+from calibration.lens.view import GelView
 from tacsim.config import ConfigError, load
-from tacsim.hardware import Placement
-from tacsim.optics.geometry import CameraNoise, Lighting, Markers, SensorGeometry, SensorModel
-from tacsim.optics.photometric import PhotometricModel
-from tacsim.quantity import Facts, Length, Time
+from tacsim.models.hardware import Placement
+from tacsim.models.photometric import PhotometricModel
+from tacsim.models.quantity import Config, Length, Time
+from tacsim.models.sensor import CameraNoise, Lighting, Markers, SensorGeometry, SensorModel
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
@@ -42,7 +42,7 @@ class BadBundle(Unusable):
     """A calibration that cannot be used: which, why, and what to do."""
 
 
-class Residual(Facts):
+class Residual(Config):
     """How well one press is predicted by a calibration made without it."""
 
     frame: str
@@ -53,7 +53,7 @@ class Residual(Facts):
     angle: float  # of the normal in contact [degrees]
 
 
-class Provenance(Facts):
+class Provenance(Config):
     """Where a calibration comes from."""
 
     made: str  # date and time, ISO 8601
@@ -64,7 +64,7 @@ class Provenance(Facts):
     warnings: tuple[str, ...] = ()
 
 
-class Calibration(Facts):
+class Calibration(Config):
     """Everything that is known of one sensor."""
 
     format: Literal[1, 2, 3]

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.drift import DriftFinder, size_of
-from calibration.gradient import from_model
-from calibration.inverse import PolynomialSlopes
-from calibration.lens import Rectification, from_corners, from_geometry, from_view
-from calibration.markers import MarkerFlow, marker_grid, require_no_markers
+from calibration.height.gradient import from_model
+from calibration.height.inverse import PolynomialSlopes
+from calibration.height.surface import SurfaceFinder, seen_box, view, window
+from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view
+from calibration.lens.view import GelView
+from calibration.markers.flow import MarkerFlow, marker_grid, require_no_markers
 from calibration.reference import (
     LOST,
     LOST_COLOUR,
@@ -25,14 +27,12 @@ from calibration.reference import (
     exchanged,
     make_reference,
 )
-from calibration.surface import SurfaceFinder, seen_box, view, window
-from calibration.view import GelView
-from tacsim.hardware import CameraSensorFacts
+from tacsim.control.contact_signal import CONTACT_DIFFERENCE, CONTACT_HEIGHT
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
-from tacsim.optics.geometry import CanonicalGrid, Markers, SensorGeometry, SensorModel
+from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.rig import ReplaySensorConfig
+from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry, SensorModel
 from tacsim.optics.grid import canonical_cells, canonical_image
-from tacsim.rigfile import ReplaySensorFacts
-from tacsim.touch import CONTACT_DIFFERENCE, CONTACT_HEIGHT
 
 
 class NoReference(RuntimeError):
@@ -288,30 +288,31 @@ def for_calibrated(
     return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 
 
-def for_recorded(facts: ReplaySensorFacts, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
+def for_recorded(config: ReplaySensorConfig, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, or through the
     four corners of the gel.
 
-    Raises calibration.lens.BadCorners, calibration.bundle.BadBundle.
+    Raises calibration.lens.rectification.BadCorners, calibration.bundle.BadBundle.
     """
-    if facts.calibration is not None:
-        return _of_bundle(facts.calibration, image_shape, grid)
-    seen = from_corners(facts.corners, facts.size, image_shape, canonical_image(grid))
+    if config.calibration is not None:
+        return _of_bundle(config.calibration, image_shape, grid)
+    seen = from_corners(config.corners, config.size, image_shape, canonical_image(grid))
     return FrameNormaliser(seen, grid, drifts=True)
 
 
-def for_camera(facts: CameraSensorFacts, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+def for_camera(config: CameraSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a sensor that a camera sees: by its calibration, by its model, or through the four corners of
     the gel. Only the last finds no height. `gel_size`: x, y of a model's gel [m].
 
-    Raises calibration.bundle.BadBundle, ValueError for a model without inverse, calibration.lens.BadCorners.
+    Raises calibration.bundle.BadBundle, ValueError for a model without inverse,
+    calibration.lens.rectification.BadCorners.
     """
-    if facts.calibration is not None:
-        return _of_bundle(facts.calibration, (facts.height, facts.width), grid)
-    if facts.model is not None:
-        return for_pictures(facts.model, gel_size, grid)
-    shape = (facts.height, facts.width)
-    return FrameNormaliser(from_corners(facts.corners, facts.size, shape, canonical_image(grid)), grid, drifts=True)
+    if config.calibration is not None:
+        return _of_bundle(config.calibration, (config.height, config.width), grid)
+    if config.model is not None:
+        return for_pictures(config.model, gel_size, grid)
+    shape = (config.height, config.width)
+    return FrameNormaliser(from_corners(config.corners, config.size, shape, canonical_image(grid)), grid, drifts=True)
 
 
 def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:

@@ -11,22 +11,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calibration.errors import naming
-from tacsim.admittance import held_loads
 from tacsim.config import LoadedRig, load_rig
-from tacsim.hardware import CameraSensorFacts
+from tacsim.control.admittance import held_loads
 from tacsim.interface import Arm, Normaliser, SensorSpec, TactileFrame
+from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.rig import Rig
-from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts, RigFacts, SimArmFacts, SimSensorFacts
 
 if TYPE_CHECKING:
     from calibration.normaliser import FrameNormaliser
-    from tacsim.env import TacsimEnv
-    from tacsim.guard import GelWatch
-    from tacsim.optics.geometry import CanonicalGrid
-    from tacsim.physics.world import World
+    from tacsim.control.gel_monitor import GelWatch
+    from tacsim.gym.env import TacsimEnv
+    from tacsim.models.scene import Scene
+    from tacsim.models.sensor import CanonicalGrid
+    from tacsim.physics.worlds.world import World
     from tacsim.record.replay import ReplayClock, ReplaySensor
-    from tacsim.scene import Scene
-    from tacsim.sensor import SimClock, SimSensor
+    from tacsim.sim.sensor import SimClock, SimSensor
 
 RIG_ATTACHMENT = "rig.yaml"  # of an episode: the resolved rig file it was recorded with
 
@@ -41,7 +41,7 @@ SENSOR_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"camera", "sim"
 
 
 def open_rig(
-    rig: str | Path | LoadedRig | RigFacts,
+    rig: str | Path | LoadedRig | RigConfig,
     *,
     task: str | None = None,
     overrides: Sequence[str] = (),
@@ -61,20 +61,20 @@ def open_rig(
         DeviceError: an arm, a camera or a mock of them cannot be opened (robot.errors).
         EpisodeError: a recording cannot be read.
     """
-    if isinstance(rig, (LoadedRig, RigFacts)):
+    if isinstance(rig, (LoadedRig, RigConfig)):
         if task is not None or overrides:
             raise TypeError("open_rig: task and overrides belong to load_rig; this rig is loaded already")
-        facts = rig.facts if isinstance(rig, LoadedRig) else rig
+        config = rig.config if isinstance(rig, LoadedRig) else rig
     else:
-        facts = load_rig(rig, task=task, overrides=overrides).facts
-    _check_parts(facts)
-    if dry_run and facts.clock != "wall":
-        raise CannotOpen(f"rig '{facts.name}': a dry run is for hardware; this rig moves no real or mock arm")
-    if facts.clock == "wall":
-        from robot.wall import open_wall
+        config = load_rig(rig, task=task, overrides=overrides).config
+    _check_parts(config)
+    if dry_run and config.clock != "wall":
+        raise CannotOpen(f"rig '{config.name}': a dry run is for hardware; this rig moves no real or mock arm")
+    if config.clock == "wall":
+        from robot.rig.hardware_rig import open_wall
 
-        return open_wall(facts, confirm, dry_run=dry_run)
-    return _open_sim(facts) if facts.clock == "sim" else _open_replay(facts)
+        return open_wall(config, confirm, dry_run=dry_run)
+    return _open_sim(config) if config.clock == "sim" else _open_replay(config)
 
 
 def make_env(
@@ -84,148 +84,152 @@ def make_env(
     render_mode: str | None = None,
 ) -> TacsimEnv:
     """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters."""
-    from tacsim.env import TacsimEnv
+    from tacsim.gym.env import TacsimEnv
     from tacsim.tasks import make_task
 
-    facts = load_rig(rig, task=task, overrides=overrides).facts
-    if facts.task is None:
-        raise CannotOpen(f"rig '{facts.name}' has no task; an environment needs one")
-    opened = open_rig(facts)
+    config = load_rig(rig, task=task, overrides=overrides).config
+    if config.task is None:
+        raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
+    opened = open_rig(config)
     try:
-        return TacsimEnv(opened, make_task(facts.task), render_mode)
+        return TacsimEnv(opened, make_task(config.task), render_mode)
     except BaseException:
         opened.close()
         raise
 
 
-def check_sensors(facts: RigFacts) -> None:
+def check_sensors(config: RigConfig) -> None:
     """Raises what opening the rig would raise over what its cameras show: CannotOpen, calibration.errors.Unusable."""
-    _check_parts(facts)
-    cameras = {name: each for name, each in facts.sensors.items() if isinstance(each, CameraSensorFacts)}
+    _check_parts(config)
+    cameras = {name: each for name, each in config.sensors.items() if isinstance(each, CameraSensorConfig)}
     if cameras:
-        from robot.wall import camera_normaliser
+        from robot.rig.hardware_rig import camera_normaliser
 
         for name, camera in cameras.items():
-            camera_normaliser(name, camera, facts)
+            camera_normaliser(name, camera, config)
 
 
-def _check_parts(facts: RigFacts) -> None:
+def _check_parts(config: RigConfig) -> None:
     """All parts of a rig go by one clock, and every recorded sensor names its recording."""
     parts: dict[str, tuple[str, set[str]]] = {
-        f"arms.{name}": (arm.driver, ARM_DRIVERS[facts.clock]) for name, arm in facts.arms.items()
+        f"arms.{name}": (arm.driver, ARM_DRIVERS[config.clock]) for name, arm in config.arms.items()
     }
-    parts |= {f"sensors.{name}": (sensor.driver, SENSOR_DRIVERS[facts.clock]) for name, sensor in facts.sensors.items()}
+    parts |= {
+        f"sensors.{name}": (sensor.driver, SENSOR_DRIVERS[config.clock]) for name, sensor in config.sensors.items()
+    }
     for key, (driver, allowed) in parts.items():
         if driver not in allowed:
             raise CannotOpen(
-                f"rig '{facts.name}': {key} has driver '{driver}', which cannot go by clock '{facts.clock}'; "
+                f"rig '{config.name}': {key} has driver '{driver}', which cannot go by clock '{config.clock}'; "
                 f"give it driver '{' or '.join(sorted(allowed))}', or change the clock"
             )
-    for name, sensor in facts.sensors.items():
-        if isinstance(sensor, CameraSensorFacts) and sensor.model is not None:
+    for name, sensor in config.sensors.items():
+        if isinstance(sensor, CameraSensorConfig) and sensor.model is not None:
             shown = sensor.model.geometry
             if (shown.width, shown.height) != (sensor.width, sensor.height):
                 raise CannotOpen(
-                    f"rig '{facts.name}': sensors.{name} delivers {sensor.width} x {sensor.height} px (width, height), "
-                    f"its model '{sensor.model.name}' shows {shown.width} x {shown.height}; make them alike"
+                    f"rig '{config.name}': sensors.{name} delivers {sensor.width} x {sensor.height} px "
+                    f"(width, height), its model '{sensor.model.name}' shows {shown.width} x {shown.height}; make them alike"
                 )
-        if isinstance(sensor, ReplaySensorFacts) and sensor.source is None:
+        if isinstance(sensor, ReplaySensorConfig) and sensor.source is None:
             key = f"sensors.{name}.source"
-            raise CannotOpen(f"rig '{facts.name}': {key}: no recording given; name one with --set {key}=PATH")
+            raise CannotOpen(f"rig '{config.name}': {key}: no recording given; name one with --set {key}=PATH")
 
 
-def _open_sim(facts: RigFacts) -> Rig:
+def _open_sim(config: RigConfig) -> Rig:
     """One World seen as sensors, arms and a clock."""
     from calibration.normaliser import for_simulated
-    from tacsim.physics.world import make_world
-    from tacsim.sensor import SimArm, SimClock, SimStart
-    from tacsim.threads import at_once
+    from tacsim.compute.threads import at_once
+    from tacsim.physics.worlds.world import make_world
+    from tacsim.sim.sensor import SimArm, SimClock, SimStart
 
-    scene = facts.scene
+    scene = config.scene
     if scene is None:
-        raise CannotOpen(f"rig '{facts.name}' simulates, but has no scene; give scene, or a task (which has one)")
-    if facts.motion != "settled" and scene.physics == "seed":
+        raise CannotOpen(f"rig '{config.name}' simulates, but has no scene; give scene, or a task (which has one)")
+    if config.motion != "settled" and scene.physics == "seed":
         raise CannotOpen(
-            f"rig '{facts.name}': physics 'seed' settles every motion, so it can't go by motion '{facts.motion}'; use "
-            "physics 'hybrid', or motion 'settled'"
+            f"rig '{config.name}': physics 'seed' settles every motion, so it can't go by motion '{config.motion}'; "
+            "use physics 'hybrid', or motion 'settled'"
         )
-    frames = _driven_frames(facts, scene)
-    models = {name: sensor for name, sensor in facts.sensors.items() if isinstance(sensor, SimSensorFacts)}
+    frames = _driven_frames(config, scene)
+    models = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, SimSensorConfig)}
     world = make_world(scene)
-    clock = SimClock(world, facts.period, facts.motion)
-    sensors = {name: _sim_sensor(world, clock, name, sensor, facts) for name, sensor in models.items()}
+    clock = SimClock(world, config.period, config.motion)
+    sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
     arms: dict[str, Arm] = {}
-    for name, arm in facts.arms.items():
-        assert isinstance(arm, SimArmFacts)
+    for name, arm in config.arms.items():
+        assert isinstance(arm, SimArmConfig)
         limits = arm.limits
         speed = arm.speed if limits is None else min(arm.speed, limits.speed)
         turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
-        apart = [(frames[other], distance) for other, distance in facts.kept_out(name).items()]
-        arms[name] = SimArm(world, clock, frames[name], speed * facts.period, turn_rate * facts.period, limits, apart)
-    task = facts.task
+        apart = [(frames[other], distance) for other, distance in config.kept_out(name).items()]
+        arms[name] = SimArm(world, clock, frames[name], speed * config.period, turn_rate * config.period, limits, apart)
+    task = config.task
     return Rig(
-        name=facts.name,
+        name=config.name,
         sensors=sensors,
         arms=arms,
         clock=clock,
         normalisers={
-            name: for_simulated(sensor.model, scene.gel.size[:2], facts.canonical) for name, sensor in models.items()
+            name: for_simulated(sensor.model, scene.gel.size[:2], config.canonical) for name, sensor in models.items()
         },
         start=SimStart(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
         gather=at_once,
-        watch=_gel_watch(facts, sensors),
-        held=held_loads(facts.task),
+        watch=_gel_watch(config, sensors),
+        held=held_loads(config.task),
     )
 
 
-def _gel_watch(facts: RigFacts, sensors: Mapping[str, SimSensor]) -> GelWatch | None:
-    from tacsim.guard import GelWatch
+def _gel_watch(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelWatch | None:
+    from tacsim.control.gel_monitor import GelWatch
 
     limits = {
-        name: arm.limits for name, arm in facts.arms.items() if isinstance(arm, SimArmFacts) and arm.limits is not None
+        name: arm.limits
+        for name, arm in config.arms.items()
+        if isinstance(arm, SimArmConfig) and arm.limits is not None
     }
     try:
         return GelWatch({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
     except ValueError as failure:
-        raise CannotOpen(f"rig '{facts.name}': {failure}") from None
+        raise CannotOpen(f"rig '{config.name}': {failure}") from None
 
 
-def _driven_frames(facts: RigFacts, scene: Scene) -> dict[str, str]:
+def _driven_frames(config: RigConfig, scene: Scene) -> dict[str, str]:
     """Which frame of the world each arm moves: the sensor it carries, or the indenter."""
     there = ", ".join(scene.sensors)
-    for name in facts.sensors:
+    for name in config.sensors:
         if name not in scene.sensors:
-            raise CannotOpen(f"rig '{facts.name}': scene '{scene.name}' has no sensor '{name}'; it has {there}")
-    frames = {sensor.arm: name for name, sensor in facts.sensors.items() if sensor.arm is not None}
+            raise CannotOpen(f"rig '{config.name}': scene '{scene.name}' has no sensor '{name}'; it has {there}")
+    frames = {sensor.arm: name for name, sensor in config.sensors.items() if sensor.arm is not None}
     if scene.indenter is not None:
         frames.setdefault("indenter", "indenter")
-    for name in facts.arms:
+    for name in config.arms:
         if name not in frames:
             raise CannotOpen(
-                f"rig '{facts.name}': arms.{name} carries no sensor; name it in sensors.NAME.arm, or leave it out"
+                f"rig '{config.name}': arms.{name} carries no sensor; name it in sensors.NAME.arm, or leave it out"
             )
-    carried = [sensor.arm for sensor in facts.sensors.values()]
+    carried = [sensor.arm for sensor in config.sensors.values()]
     doubled = sorted({arm for arm in carried if arm is not None and carried.count(arm) > 1})
     if doubled:
-        raise CannotOpen(f"rig '{facts.name}': arms.{doubled[0]} carries several sensors; a simulated arm carries one")
+        raise CannotOpen(f"rig '{config.name}': arms.{doubled[0]} carries several sensors; a simulated arm carries one")
     return frames
 
 
-def _sim_sensor(world: World, clock: SimClock, name: str, facts: SimSensorFacts, rig: RigFacts) -> SimSensor:
+def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfig, rig: RigConfig) -> SimSensor:
     from tacsim.optics.noise import noise_source
     from tacsim.optics.render import Renderer
     from tacsim.optics.surface import surface_map
-    from tacsim.sensor import SimSensor
+    from tacsim.sim.sensor import SimSensor
 
     assert rig.scene is not None
-    model = facts.model
+    model = config.model
     spec = SensorSpec(
         image_shape=(model.geometry.height, model.geometry.width),
         height=True,
         flow=model.markers is not None,
-        arm=facts.arm,
+        arm=config.arm,
     )
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
     render = Renderer(model, rig.scene.gel.size[:2])
@@ -246,19 +250,19 @@ class _Rewind:
         """A recording is as it is."""
 
 
-def _open_replay(facts: RigFacts) -> Rig:
+def _open_replay(config: RigConfig) -> Rig:
     """Recorded sensors and arms. The control period is that of the recording."""
     from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor
 
     there = {
-        name: arm for name, arm in facts.arms.items() if isinstance(arm, ReplayArmFacts) and arm.source is not None
+        name: arm for name, arm in config.arms.items() if isinstance(arm, ReplayArmConfig) and arm.source is not None
     }
     recorded = {
         name: sensor if sensor.arm in there else sensor.model_copy(update={"arm": None})
-        for name, sensor in facts.sensors.items()
-        if isinstance(sensor, ReplaySensorFacts)
+        for name, sensor in config.sensors.items()
+        if isinstance(sensor, ReplaySensorConfig)
     }
-    clock = ReplayClock(_common_period(facts.name, recorded))
+    clock = ReplayClock(_common_period(config.name, recorded))
     with ExitStack() as stack:
         sensors: dict[str, ReplaySensor] = {}
         normalisers: dict[str, Normaliser] = {}
@@ -266,7 +270,7 @@ def _open_replay(facts: RigFacts) -> Rig:
             sensors[name] = source = ReplaySensor(sensor, name, clock)
             stack.callback(source.close)
             with naming(f"sensors.{name}"):
-                normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, facts.canonical)
+                normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, config.canonical)
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
@@ -275,7 +279,7 @@ def _open_replay(facts: RigFacts) -> Rig:
             arms[name] = ReplayArm(arm, name, clock)
             stack.callback(arms[name].close)
         rig = Rig(
-            name=facts.name,
+            name=config.name,
             sensors=sensors,
             arms=arms,
             clock=clock,
@@ -286,7 +290,7 @@ def _open_replay(facts: RigFacts) -> Rig:
         return rig
 
 
-def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
+def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float:
     from tacsim.record.replay import recorded_period
 
     periods = {name: recorded_period(sensor, name) for name, sensor in sensors.items()}
@@ -300,19 +304,19 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorFacts]) -> float:
 
 
 def _replay_normaliser(
-    facts: ReplaySensorFacts, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
+    config: ReplaySensorConfig, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
 ) -> FrameNormaliser:
     """By the corners of the rig file; without them by what an episode says of its own sensor."""
     from calibration.normaliser import for_recorded, for_simulated
 
-    original = None if facts.corners is not None else _recorded_rig(Path(facts.source or ""))
+    original = None if config.corners is not None else _recorded_rig(Path(config.source or ""))
     sensor = None if original is None else original.sensors.get(name)
-    if original is not None and original.scene is not None and isinstance(sensor, SimSensorFacts):
+    if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
         return for_simulated(sensor.model, original.scene.gel.size[:2], grid)
-    return for_recorded(sensor if isinstance(sensor, ReplaySensorFacts) else facts, image_shape, grid)
+    return for_recorded(sensor if isinstance(sensor, ReplaySensorConfig) else config, image_shape, grid)
 
 
-def _recorded_rig(source: Path) -> RigFacts | None:
+def _recorded_rig(source: Path) -> RigConfig | None:
     """The rig that an episode was recorded with; None where it is not known."""
     from tacsim.record.sources import EPISODES, episode_meta
 
@@ -324,4 +328,4 @@ def _recorded_rig(source: Path) -> RigFacts | None:
     with tempfile.TemporaryDirectory() as folder:  # an empty folder: the text can refer to nothing beside it
         path = Path(folder) / RIG_ATTACHMENT
         path.write_bytes(text)
-        return load_rig(path).facts
+        return load_rig(path).config

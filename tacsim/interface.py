@@ -218,7 +218,7 @@ class Normaliser(Protocol):
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How far the last observation is to be trusted; see tacsim.record.trust. Empty where that is no question."""
+        """How far the last observation is to be trusted; see tacsim.report.trust. Empty where that is no question."""
         ...
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, Self
 
+from tacsim.compute.threads import one_by_one
 from tacsim.interface import (
     Action,
     Arm,
@@ -23,10 +24,9 @@ from tacsim.interface import (
     Truth,
 )
 from tacsim.limits import check_action
-from tacsim.threads import one_by_one
 
 if TYPE_CHECKING:
-    from tacsim.admittance import Admittance
+    from tacsim.control.admittance import Admittance
 
 
 class Start(Protocol):
@@ -52,7 +52,7 @@ class Rig:
         truth: the body as only a simulation knows it; None on rigs without.
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
         read_timeout: how long to wait for a frame [s].
-        gather: how the sensors are read: one by one, or all at once where that is faster (tacsim.threads).
+        gather: how the sensors are read: one by one, or all at once where that is faster (tacsim.compute.threads).
         beside: closes what the rig needs besides sensors and arms, after them.
         watch: looks at what is touched before anybody acts on it, and raises what ends the episode.
         held: normal forces that arms hold, whatever the actions ask along the z of their sensors; None: none.

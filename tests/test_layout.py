@@ -87,7 +87,7 @@ def test_importing_is_light(module: str) -> None:
 
 def test_only_runtime_imports_taichi() -> None:
     found = {name(path) for path, tree in TREES.items() if "taichi" in map(top, imports(tree))}
-    assert found == {"tacsim/runtime.py"}
+    assert found == {"tacsim/compute/runtime.py"}
 
 
 def test_opencv_and_ur_rtde_are_imported_inside_functions() -> None:
@@ -175,5 +175,5 @@ def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
     assert {top(entry.partition("/")[0]) for entry in carried} == {
         *PACKAGES,
         "tacsim-0",  # tacsim-0.1.0.dist-info
-        "tacsim_gymnasium",  # the .pth of tacsim/gymnasium_plugin.py
+        "tacsim_gymnasium",  # the .pth of tacsim/gym/plugin.py
     }

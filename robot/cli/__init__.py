@@ -7,14 +7,14 @@ from typing import Annotated
 import typer
 
 from robot.cli.bench import bench
-from robot.cli.calibrate import calibrate
+from robot.cli.calibrate.latency import latency
+from robot.cli.calibrate.lens import lens
+from robot.cli.calibrate.poses import hand_eye, touch
+from robot.cli.calibrate.sensor import calibrate
 from robot.cli.compare import compare
 from robot.cli.debug import debug
+from robot.cli.doctor import doctor, schema
 from robot.cli.errors import Guarded
-from robot.cli.frames import hand_eye, touch
-from robot.cli.latency import latency
-from robot.cli.lens import lens
-from robot.cli.look import doctor, schema
 from robot.cli.mock import mock
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce

@@ -14,7 +14,7 @@ from robot.cli.interrupt import Interrupt
 from robot.cli.output import busy, notes, progress, results, say_files
 
 if TYPE_CHECKING:
-    from robot.bench.schema import Report
+    from benchmarks.harness.schema import Report
 
 
 class Groups(StrEnum):
@@ -93,7 +93,7 @@ def bench(
         if docs is not None:
             _refuse_a_page_of_a_device()
         if renew:
-            from robot.bench.limit import renew as compute
+            from benchmarks.truth.limit import renew as compute
 
             with busy("computing the limit of fine meshes"):
                 compute(notes.print)
@@ -112,13 +112,13 @@ def bench(
             json_.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
             written.append(json_)
             if physics:
-                from robot.bench.picture import PICTURE, draw
+                from benchmarks.pages.picture import PICTURE, draw
 
                 draw(report.results, json_.with_name(PICTURE))
                 written.append(json_.with_name(PICTURE))
         if docs is not None:
-            from robot.bench.page import write_page
-            from robot.bench.reliability_page import write_reliability
+            from benchmarks.pages.page import write_page
+            from benchmarks.reliability.page import write_reliability
 
             written += write_page(report, docs, devices) if physics else []
             written += [write_reliability(report, docs)] if "robot" in measured else []
@@ -130,7 +130,7 @@ def bench(
 def _read(path: Path) -> Report:
     from pydantic import ValidationError
 
-    from robot.bench.schema import Report
+    from benchmarks.harness.schema import Report
 
     try:
         return Report.model_validate_json(path.read_bytes())
@@ -144,7 +144,7 @@ def _read(path: Path) -> Report:
 
 
 def _refuse_a_page_of_a_device() -> None:
-    from robot.bench.runner import backend
+    from benchmarks.harness.runner import backend
 
     if backend() != "cpu":
         words = f"TACSIM_DEVICE is '{backend()}', but a page needs the CPU's report too: use --json now, then --from"
@@ -165,10 +165,10 @@ def _for_a_page(reports: Sequence[Report], paths: Sequence[Path]) -> list[Report
 
 def _measure(group: Groups, repeat: int, *, baselines: bool, long: bool, data: Path | None) -> Report:
     with busy("loading"):
-        from robot.bench.cases import chosen
-        from robot.bench.labels import BadData
-        from robot.bench.runner import Case, Stopped, run_cases
-        from robot.bench.schema import GROUPS
+        from benchmarks.cases.real.labels import BadData
+        from benchmarks.cases.registry import chosen
+        from benchmarks.harness.runner import Case, Stopped, run_cases
+        from benchmarks.harness.schema import GROUPS
 
     if group is Groups.real and data is None:
         raise typer.BadParameter("the group real needs frames of a real sensor: --data DIR", param_hint="--data")
@@ -203,7 +203,7 @@ def _show(report: Report, *, titled: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from robot.bench.page import COLUMNS, cells, setting
+    from benchmarks.pages.page import COLUMNS, cells, setting
 
     table = Table(box=None, padding=(0, 1))
     for column in COLUMNS:

@@ -13,9 +13,9 @@ from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, p
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
-    from calibration.compare import Comparison
-    from calibration.invariance import Report
-    from calibration.sides import Side
+    from calibration.compare.compare import Comparison
+    from calibration.compare.frame_set import Side
+    from calibration.compare.invariance import Report
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 LENGTHS = ("height_rmse", "surface_radius", "surface_centroid", "marker_error")  # figures that may carry a unit
@@ -71,11 +71,11 @@ def compare(
     """
     folder = new_directory(out, "compare")
     with busy("loading"):
-        from calibration.compare import Options, Pairing
-        from calibration.compare import compare as run
-        from calibration.comparison_report import figures, write
-        from calibration.lens import BadCorners
-        from calibration.sides import BadSide
+        from calibration.compare.compare import Options, Pairing
+        from calibration.compare.compare import compare as run
+        from calibration.compare.frame_set import BadSide
+        from calibration.compare.report import figures, write
+        from calibration.lens.rectification import BadCorners
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
     bundles = [None if path is None else _calibration(path) for path in (calibration_a, calibration_b)]
     try:
@@ -120,7 +120,7 @@ def _calibration(path: Path) -> Calibration:
 
 
 def _read(path: Path, reference: Path | None, sensor: str) -> Side:
-    from calibration.sides import read_side
+    from calibration.compare.frame_set import read_side
 
     with busy(f"reading {path}"):
         return read_side(path, reference, sensor)
@@ -128,7 +128,7 @@ def _read(path: Path, reference: Path | None, sensor: str) -> Side:
 
 def _metric(side: Side, bundle: Calibration | None) -> Side:
     """The side through lens and perspective of its calibration, where that has a view."""
-    from calibration.sides import through_view
+    from calibration.compare.frame_set import through_view
 
     return side if bundle is None or bundle.view is None else through_view(side, bundle.view)
 
@@ -143,15 +143,15 @@ def _is_scene(a: str) -> bool:
 def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) -> Side:
     """A's frames by the simulator."""
     from calibration.bundle import sensor_model
-    from calibration.sides import BadSide
+    from calibration.compare.frame_set import BadSide
     from tacsim.config import load_scene
-    from tacsim.optics.geometry import CanonicalGrid
+    from tacsim.models.sensor import CanonicalGrid
 
     if bundle is None:
         raise BadSide("a scene is seen through the light of B: give B's calibration (--calibration-b)")
     scene = load_scene(name, ["preset=standard", *overrides])
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
-    from robot.twin_press import press_like
+    from robot.studies.matched_press import press_like
 
     with progress() as bar:
         row = bar.add_task("pressing", total=None)
@@ -168,7 +168,7 @@ def _straight(
     a: Side, b: Side, texts: tuple[str | None, str | None], bundles: list[Calibration | None]
 ) -> tuple[Side, Side]:
     """Both sides seen straight on, where the corners of the gel are given: B's size counts."""
-    from calibration.sides import BadSide, rectangle, through_corners
+    from calibration.compare.frame_set import BadSide, rectangle, through_corners
 
     corners = [None if text is None else _corners(text) for text in texts]
     for side, given, bundle in zip("ab", corners, bundles, strict=True):
@@ -195,7 +195,7 @@ def _corners(text: str) -> Corners:
 
 
 def _invariance(result: Comparison, calibration: Calibration | None) -> Report:
-    from calibration.invariance import invariance
+    from calibration.compare.invariance import invariance
 
     with progress() as bar:
         row = bar.add_task("invariance", total=None)
@@ -204,8 +204,8 @@ def _invariance(result: Comparison, calibration: Calibration | None) -> Report:
 
 def _limits(texts: list[str] | None, option: str) -> list[Limit]:
     """Parsed METRIC=VALUE. A length may carry its unit."""
-    from calibration.comparison_report import names
-    from tacsim.quantity import parse
+    from calibration.compare.report import names
+    from tacsim.models.quantity import parse
 
     found = []
     for text in texts or []:
@@ -248,7 +248,7 @@ def _show(result: Comparison, report: Report | None) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from calibration.comparison_report import rows, shown, verdict
+    from calibration.compare.report import rows, shown, verdict
 
     console = Console(width=None if results.is_terminal else 160, highlight=False)
     table = Table(box=None, padding=(0, 1), title=f"{len(result.pairs)} pairs", title_justify="left")

@@ -11,8 +11,8 @@ from robot.cli.errors import FAILED
 from robot.cli.output import busy, results, say_files
 
 if TYPE_CHECKING:
-    from robot.debug import Replay
-    from tacsim.physics.dump import Dump
+    from robot.studies.dump_view import Replay
+    from tacsim.physics.failure.dump import Dump
 
 
 def debug(
@@ -27,8 +27,8 @@ def debug(
     Example: tacsim debug runs/first/diverged/00
     """
     with busy("reading"):
-        from robot import debug as dumps
-        from tacsim.physics.dump import read
+        from robot.studies import dump_view as dumps
+        from tacsim.physics.failure.dump import read
 
         found = read(dump)
         world = dumps.open_world(found)
@@ -47,23 +47,23 @@ def debug(
 
 
 def _print_facts(dump: Dump) -> None:
-    facts = dump.facts
-    results.print(f"cause     {facts.cause}", markup=False)
-    if facts.place:
-        results.print(f"at        {facts.place}", markup=False)
-    results.print(f"where     {facts.where}", markup=False)
-    if facts.refine > 1:
-        results.print(f"retried   down to 1/{facts.refine} of the time step")
-    made = ", ".join(f"{name} {version}" for name, version in facts.versions.items())
-    results.print(f"written   {facts.time}, {made}", markup=False)
-    results.print(f"advice    {facts.advice}", markup=False)
+    info = dump.info
+    results.print(f"cause     {info.cause}", markup=False)
+    if info.place:
+        results.print(f"at        {info.place}", markup=False)
+    results.print(f"where     {info.where}", markup=False)
+    if info.refine > 1:
+        results.print(f"retried   down to 1/{info.refine} of the time step")
+    made = ", ".join(f"{name} {version}" for name, version in info.versions.items())
+    results.print(f"written   {info.time}, {made}", markup=False)
+    results.print(f"advice    {info.advice}", markup=False)
 
 
 def _print_table(rows: list[tuple[str, dict[str, str]]]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from robot.debug import TITLES
+    from robot.studies.dump_view import TITLES
 
     shown = [moment for moment in TITLES if any(moment in values for _, values in rows)]
     table = Table("", *(TITLES[moment] for moment in shown), box=None, padding=(0, 2, 0, 0))

@@ -40,11 +40,11 @@ class Guarded(TyperGroup):
 def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
     from calibration.errors import Unusable
+    from robot.deploy.policy import PolicyNotFound
     from robot.open import CannotOpen
-    from robot.policy import PolicyNotFound
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
-    from tacsim.physics.dump import DumpError
+    from tacsim.physics.failure.dump import DumpError
 
     if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, Unusable, DumpError)):
         return str(error), UNUSABLE
@@ -70,7 +70,7 @@ def _refused(error: Exception) -> bool:
     module = str(trace.tb_frame.f_globals.get("__name__", "") if trace is not None else "")
     in_words = type(error) is ValueError or (isinstance(error, FileNotFoundError) and error.errno is None)
     ours = in_words and module.partition(".")[0] in OURS
-    return ours or (type(error) is RuntimeError and module == "tacsim.runtime")
+    return ours or (type(error) is RuntimeError and module == "tacsim.compute.runtime")
 
 
 def complain(message: str) -> None:

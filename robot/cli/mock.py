@@ -35,10 +35,10 @@ def mock(
 
     Example: tacsim mock --arms 2 --cameras 2
     """
-    from robot.kinematics import MODELS
+    from robot.arm.kinematics import MODELS
     from robot.mock import MockArms, MockCamera
-    from robot.mock.controller import PORTS
-    from robot.mock.door import DOOR_PORT
+    from robot.mock.ur.fault_client import DOOR_PORT
+    from robot.mock.ur.wire.controller import PORTS
 
     if model not in MODELS:
         raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(MODELS)}", param_hint="--model")

@@ -105,7 +105,7 @@ def quantity(kind: str) -> Callable[[str], float]:
     """Parser of an option that is a length, an angle ... with or without unit."""
 
     def parse(text: str) -> float:
-        from tacsim.quantity import parse as parse_quantity
+        from tacsim.models.quantity import parse as parse_quantity
 
         try:
             return parse_quantity(text, kind)

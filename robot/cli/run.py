@@ -15,7 +15,7 @@ from robot.cli.interrupt import Interrupt
 from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results, writing
 
 if TYPE_CHECKING:
-    from robot.deploy import EpisodeFacts
+    from robot.deploy.control_loop import EpisodeSetup
     from tacsim.config import LoadedRig
     from tacsim.interface import Policy
     from tacsim.record.episode import Episode, EpisodeMeta, Step
@@ -55,8 +55,8 @@ def run(
     from tacsim.config import load_rig
 
     loaded = load_rig(rig, task=task, overrides=set_ or [])
-    own_task = loaded.facts.task
-    folder = new_directory(out, loaded.facts.name if own_task is None else own_task.kind)
+    own_task = loaded.config.task
+    folder = new_directory(out, loaded.config.name if own_task is None else own_task.kind)
     if steps is None:
         steps = NO_END if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
@@ -75,19 +75,19 @@ def _run(
 ) -> bool:
     """Runs and reports the episode; True when it or its recording failed."""
     with busy("loading"):
-        from robot.deploy import EpisodeFacts
+        from robot.deploy.control_loop import EpisodeSetup
+        from robot.deploy.policy import load_policy
         from robot.open import open_rig
-        from robot.policy import load_policy
-        from tacsim.physics.dump import dumps_in
+        from tacsim.physics.failure.dump import dumps_in
         from tacsim.tasks import make_task
     if not notes.is_terminal:
         notes.print(STARTING)
-    task = None if loaded.facts.task is None else make_task(loaded.facts.task)
-    facts = EpisodeFacts(policy, seed, {"rig.yaml": loaded.text.encode()})
+    task = None if loaded.config.task is None else make_task(loaded.config.task)
+    config = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()})
     with dumps_in(folder / "diverged"), open_rig(loaded, confirm=ask, dry_run=dry_run) as rig:
         acting = load_policy(policy, task, rig.spec)
-        with Recording(folder, loaded.facts.canonical.pitch) as recording:
-            episode, failure = _drive(rig, acting, task, steps, facts, recording, interrupt)
+        with Recording(folder, loaded.config.canonical.pitch) as recording:
+            episode, failure = _drive(rig, acting, task, steps, config, recording, interrupt)
     for problem in (failure, recording.problem(len(episode.steps))):
         if problem:
             complain(problem)
@@ -108,23 +108,23 @@ def _drive(
     policy: Policy,
     task: Task | None,
     steps: int,
-    facts: EpisodeFacts,
+    config: EpisodeSetup,
     recording: Recording,
     interrupt: Interrupt,
 ) -> tuple[Episode, str]:
     """The episode, shown by a progress bar, and what ended it too early ("" when nothing did)."""
-    from robot.deploy import EpisodeFailed, run_episode
+    from robot.deploy.control_loop import EpisodeFailed, run_episode
 
     with progress() as bar:
         row = bar.add_task(STARTING, total=None)
         known = None if steps == NO_END else steps
 
         def show(step: Step) -> None:
-            bar.update(row, description=task.facts.kind if task else rig.name, total=known, completed=step.index)
+            bar.update(row, description=task.config.kind if task else rig.name, total=known, completed=step.index)
 
         try:
             return run_episode(
-                rig, policy, task, steps, facts=facts, recorder=recording.open, on_step=show, stop=interrupt
+                rig, policy, task, steps, setup=config, recorder=recording.open, on_step=show, stop=interrupt
             ), ""
         except EpisodeFailed as failed:
             return failed.episode, str(failed)
@@ -193,7 +193,7 @@ def replay(
 
 def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     """Writes the report and ends with the table."""
-    from tacsim.report import end_table, summary, write_report
+    from tacsim.report.report import end_table, summary, write_report
 
     with busy("writing the report"), writing(folder):
         paths = write_report(episode, folder)

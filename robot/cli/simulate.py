@@ -26,8 +26,8 @@ from robot.cli.output import (
 )
 
 if TYPE_CHECKING:
-    from tacsim.figure4 import Trial
-    from tacsim.scene import Scene, Shape
+    from tacsim.models.scene import Scene, Shape
+    from tacsim.report.figure4 import Trial
 
 
 class Preset(StrEnum):
@@ -81,20 +81,20 @@ def press(
     scene = _with_indenter(scene, _geometry(indenter, radius, height, size, scale))
     sensor = load_sensor("ideal")
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
-        from robot import press as presses
-        from tacsim.physics.dump import dumps_in
+        from robot.studies import press as presses
+        from tacsim.physics.failure.dump import dumps_in
 
         motion = presses.Press(depth, slide, twist)
         with dumps_in(folder / "diverged"):
             pressed = presses.press(scene, sensor, motion)
-    facts = presses.facts_of(scene, motion, pressed, sensor)
+    config = presses.facts_of(scene, motion, pressed, sensor)
     with writing(make(folder)):
-        presses.write(folder, pressed, facts)
-    results.print(f"force            {facts['force']:.4f} N")
-    results.print(f"contact radius   {facts['contact_radius'] * 1e3:.3f} mm")
-    results.print(f"deepest          {facts['deepest'] * 1e3:.3f} mm")
-    if not facts["settled"]:
-        held = "not held" if facts["residual"] is None else f"relative residual {facts['residual']:.2g}"
+        presses.write(folder, pressed, config)
+    results.print(f"force            {config['force']:.4f} N")
+    results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
+    results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
+    if not config["settled"]:
+        held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {held}; raise settling.max_substeps")
     say_files(*sorted(folder.iterdir()))
 
@@ -102,7 +102,7 @@ def press(
 def _geometry(indenter: str, radius: float, height: float, size: tuple[float, ...], scale: float) -> Shape:
     from pydantic import TypeAdapter, ValidationError
 
-    from tacsim.scene import Shape
+    from tacsim.models.scene import Shape
 
     known: dict[str, dict[str, Any]] = {
         "sphere": {"radius": radius},
@@ -141,9 +141,9 @@ def reproduce(
     folder = new_directory(out, "reproduce")
     schemes = ["seed", "hybrid"] if physics is Physics.both else [physics.value]
     with busy("loading"):
-        from robot import reproduce as experiment
-        from tacsim.figure4 import figure4
-        from tacsim.physics.dump import dumps_in
+        from robot.studies import experiment
+        from tacsim.physics.failure.dump import dumps_in
+        from tacsim.report.figure4 import figure4
 
     # The longest first, so that no processor waits for it at the end.
     wanted = [(task, scheme) for scheme in schemes for task in ("reposition", "squeeze")]
@@ -168,7 +168,7 @@ def reproduce(
 
 def _judge(trials: dict[str, dict[str, Trial]]) -> bool:
     """Prints a line a trial; True when any of them failed."""
-    from robot.reproduce import shortcomings
+    from robot.studies.experiment import shortcomings
 
     failed = False
     for task, schemes in trials.items():

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from robot.mock.controller import SERIAL as MOCK_SERIAL
-from robot.mock.door import Door, DoorError, Input, Inputs, MockState
-from robot.mock.ur import MockArms, MockError, MockUR
+from robot.mock.ur.fault_client import Door, DoorError, Input, Inputs, MockState
+from robot.mock.ur.handle import MockArms, MockError, MockUR
+from robot.mock.ur.wire.controller import SERIAL as MOCK_SERIAL
 
 if TYPE_CHECKING:
-    from robot.mock.camera import MockCamera, MockCameraState
+    from robot.mock.camera.camera import MockCamera, MockCameraState
 
 __all__ = [
     "MOCK_SERIAL",
@@ -32,9 +32,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Cameras are imported when asked for: `python -m robot.mock.camera` must not find itself imported already."""
+    """Cameras are imported when asked for: `python -m robot.mock.camera.camera` must not find itself imported
+    already."""
     if name in ("MockCamera", "MockCameraState"):
-        from robot.mock import camera
+        from robot.mock.camera import camera
 
         return getattr(camera, name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -16,21 +16,21 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, cast
 
-from robot.kinematics import MODELS
-from robot.mock.arm import HOME, PERIOD
-from robot.mock.controller import SERIAL, Controller, Facts
-from robot.mock.door import DOOR_PORT
-from robot.mock.faults import FaultDoor
-from robot.mock.ur import VERSION, check_hosts
-from robot.realtime import CONTROLLER, ask_for_realtime
+from robot.arm.kinematics import MODELS
+from robot.arm.realtime import CONTROLLER, ask_for_realtime
+from robot.mock.ur.fault_client import DOOR_PORT
+from robot.mock.ur.fault_server import FaultDoor
+from robot.mock.ur.handle import VERSION, check_hosts
+from robot.mock.ur.machine.arm import HOME, PERIOD
+from robot.mock.ur.wire.controller import SERIAL, Controller, ControllerConfig
 
 if TYPE_CHECKING:
-    from tacsim.hardware import Model
+    from tacsim.models.hardware import Model
 
 CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
 
 
-def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> None:
+def serve(all_facts: Sequence[ControllerConfig], door_port: int, *, with_parent: bool) -> None:
     """Runs controllers until the input ends (`with_parent`) or SIGTERM or SIGINT comes. Raises OSError for ports."""
     ended: list[str] = []
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -39,12 +39,12 @@ def serve(all_facts: Sequence[Facts], door_port: int, *, with_parent: bool) -> N
         controllers: list[Controller] = []
         doors: list[FaultDoor] = []
         try:
-            for facts in all_facts:
-                controllers.append(Controller(facts, selector))
+            for config in all_facts:
+                controllers.append(Controller(config, selector))
                 doors.append(FaultDoor(controllers[-1], selector, door_port))
             if with_parent:
                 _watch_input(selector, lambda: ended.append("input"))
-            sys.stdout.write(json.dumps({"ready": [facts.host for facts in all_facts]}) + "\n")
+            sys.stdout.write(json.dumps({"ready": [config.host for config in all_facts]}) + "\n")
             sys.stdout.flush()
             _loop(selector, controllers, doors, ended, os.getppid() if with_parent else None)
         finally:
@@ -129,11 +129,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tuple(float(angle) for angle in text.split(","))
             for text in _for_each(given.joints or [",".join(map(repr, HOME))], given.hosts, "postures")
         ]
-        facts = [
-            Facts(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial)
+        config = [
+            ControllerConfig(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial)
             for host, model, joints in zip(given.hosts, models, postures, strict=True)
         ]
-        serve(facts, given.door_port, with_parent=given.with_parent)
+        serve(config, given.door_port, with_parent=given.with_parent)
     except (OSError, ValueError) as error:
         message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         sys.stdout.write(json.dumps({"error": message}) + "\n")

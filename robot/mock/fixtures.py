@@ -12,8 +12,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from robot.mock.camera import MockCamera
-from robot.mock.ur import MockUR
+from robot.mock.camera.camera import MockCamera
+from robot.mock.ur.handle import MockUR
 from tacsim.rig import Rig
 
 ROOM = 31  # second number of the addresses

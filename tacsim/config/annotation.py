@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 
 from tacsim.config.document import Node
 from tacsim.config.kinds import kind_of, names
-from tacsim.quantity import UNITS, Quantity, units_text
+from tacsim.models.quantity import UNITS, Quantity, units_text
 
 _BOUNDS = ((Gt, "gt", ">"), (Ge, "ge", ">="), (Lt, "lt", "<"), (Le, "le", "<="))
 

@@ -12,9 +12,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from tacsim.config.errors import did_you_mean
-from tacsim.optics.geometry import SensorModel
-from tacsim.rigfile import RepositionFacts, RigFacts, SqueezeFacts, TaskFacts
-from tacsim.scene import BodyMaterial, GelMaterial, Scene
+from tacsim.models.rig import RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
+from tacsim.models.scene import BodyMaterial, GelMaterial, Scene
+from tacsim.models.sensor import SensorModel
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")
 
@@ -32,8 +32,8 @@ class Kind:
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("rig", "rigs", (RigFacts,), RigFacts),
-        Kind("task", "tasks", (SqueezeFacts, RepositionFacts), TaskFacts),
+        Kind("rig", "rigs", (RigConfig,), RigConfig),
+        Kind("task", "tasks", (SqueezeConfig, RepositionConfig), TaskConfig),
         Kind("scene", "scenes", (Scene,), Scene),
         Kind("sensor", "sensors", (SensorModel,), SensorModel),
         Kind("material", "materials", (GelMaterial, BodyMaterial), GelMaterial | BodyMaterial),

@@ -16,10 +16,10 @@ from tacsim.config.kinds import NotFound, is_name, kind_of, named
 from tacsim.config.messages import report_errors
 from tacsim.config.overrides import Override, apply, parse_override
 from tacsim.config.references import read_file
-from tacsim.hardware import UrArmFacts, loosened
-from tacsim.optics.geometry import SensorModel
-from tacsim.rigfile import RigFacts, TaskFacts
-from tacsim.scene import Scene
+from tacsim.models.hardware import UrArmConfig, loosened
+from tacsim.models.rig import RigConfig, TaskConfig
+from tacsim.models.scene import Scene
+from tacsim.models.sensor import SensorModel
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -28,7 +28,7 @@ Model = TypeVar("Model", bound=BaseModel)
 class LoadedRig:
     """A rig file, resolved."""
 
-    facts: RigFacts
+    config: RigConfig
     text: str  # all of it in one YAML text, every default and reference written out; load_rig reads it back to `facts`
     sources: tuple[Path, ...]  # the files it was read from
 
@@ -43,40 +43,40 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     Raises ConfigError with every problem found; overrides that loosen the limits of a real arm are one.
     """
     reading = Reading()
-    root = _open(RigFacts, rig, reading)
+    root = _open(RigConfig, rig, reading)
     if task is not None:
         place = Place(f"--task {task}")
-        root = apply(root, RigFacts, Override(("task",), Node(task, place, Path.cwd(), text=task)), reading)
+        root = apply(root, RigConfig, Override(("task",), Node(task, place, Path.cwd(), text=task)), reading)
     given = [parsed for text in overrides if (parsed := parse_override(text, reading)) is not None]
     of_task = [override for override in given if override.path[0] == "task"]
     of_rest = [override for override in given if override.path[0] != "task"]
     for override in of_task:
-        root = apply(root, RigFacts, override, reading)
+        root = apply(root, RigConfig, override, reading)
         if override.path[:2] == ("task", "scene") and _has(root, "scene"):
             what = f"this rig has a scene of its own, which is used; say {'.'.join(override.path[1:])}"
             reading.report(override.place, ".".join(override.path), what)
     own_scene = _has(root, "scene") or any(override.path[0] == "scene" for override in of_rest)
     root = _adopt_scene(root)
     for override in of_rest:
-        root = apply(root, RigFacts, override, reading)
+        root = apply(root, RigConfig, override, reading)
     root = _anchored(_settle_scene(root, own_scene, reading))
-    facts = _validate(RigFacts, root, reading)
-    if overrides and any(isinstance(arm, UrArmFacts) and arm.mock is None for arm in facts.arms.values()):
-        _require_limits(facts, load_rig(rig, task=task).facts)
+    config = _validate(RigConfig, root, reading)
+    if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
+        _require_limits(config, load_rig(rig, task=task).config)
     text = "# A rig, resolved: every reference and default written out, SI units.\n" + dump(
-        facts.model_dump(mode="json")
+        config.model_dump(mode="json")
     )
-    return LoadedRig(facts, text, tuple(dict.fromkeys(reading.sources)))
+    return LoadedRig(config, text, tuple(dict.fromkeys(reading.sources)))
 
 
-def _require_limits(facts: RigFacts, file: RigFacts) -> None:
+def _require_limits(config: RigConfig, file: RigConfig) -> None:
     """The limits of real arms are those of the file, or narrower: a file is looked over, a command line is typed."""
     problems: list[str] = []
-    for name, arm in facts.arms.items():
+    for name, arm in config.arms.items():
         there = file.arms.get(name)
-        if isinstance(arm, UrArmFacts) and isinstance(there, UrArmFacts) and arm.mock is None:
+        if isinstance(arm, UrArmConfig) and isinstance(there, UrArmConfig) and arm.mock is None:
             problems += [f"arms.{name}.{what}" for what in loosened(there, arm)]
-    kept = {frozenset(apart.arms): apart.distance for apart in facts.keep_out}
+    kept = {frozenset(apart.arms): apart.distance for apart in config.keep_out}
     problems += [
         f"keep_out of {' and '.join(apart.arms)}: less than {apart.distance:g} m"
         for apart in file.keep_out
@@ -124,7 +124,7 @@ def _adopt_scene(root: Node) -> Node:
     task = root.items.get("task")
     if _has(root, "scene") or task is None or not task.items:
         return root
-    scene = task.items.get("scene") or from_plain(default(TaskFacts, task, "scene"), task.place, task.folder)
+    scene = task.items.get("scene") or from_plain(default(TaskConfig, task, "scene"), task.place, task.folder)
     return root if scene.is_empty else replace(root, value={**root.items, "scene": scene})
 
 
@@ -148,8 +148,8 @@ def _settle_scene(root: Node, own_scene: bool, reading: Reading) -> Node:
 
 def load(model: type[Model], source: str | Path, overrides: Sequence[str] = ()) -> Model:
     """Reads one configuration file into its model; `source` is a name of that kind, or a path. Raises ConfigError."""
-    facts: Model = _load(model, source, overrides)
-    return facts
+    config: Model = _load(model, source, overrides)
+    return config
 
 
 def load_scene(source: str | Path, overrides: Sequence[str] = ()) -> Scene:
@@ -162,10 +162,10 @@ def load_sensor(source: str | Path, overrides: Sequence[str] = ()) -> SensorMode
     return load(SensorModel, source, overrides)
 
 
-def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskFacts:
+def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskConfig:
     """Reads a task of any kind. Raises ConfigError."""
-    facts: TaskFacts = _load(TaskFacts, source, overrides)
-    return facts
+    config: TaskConfig = _load(TaskConfig, source, overrides)
+    return config
 
 
 def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
@@ -191,11 +191,11 @@ def _open(annotation: Any, source: str | Path, reading: Reading) -> Node:
 
 def _validate(annotation: Any, root: Node, reading: Reading) -> Any:
     """The model of a tree. Raises ConfigError with every problem, those of reading included."""
-    facts = None
+    config = None
     if not root.broken:
         try:
-            facts = TypeAdapter(annotation).validate_json(as_json(root), strict=True)
+            config = TypeAdapter(annotation).validate_json(as_json(root), strict=True)
         except ValidationError as error:
             report_errors(error, root, annotation, reading)
     reading.raise_problems()
-    return facts
+    return config

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.optics.geometry import CanonicalGrid, SensorGeometry
+from tacsim.models.sensor import CanonicalGrid, SensorGeometry
 
 
 @dataclass(frozen=True, slots=True)

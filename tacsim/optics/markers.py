@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.optics.geometry import Markers, SensorGeometry
+from tacsim.models.scene import GelSurface
+from tacsim.models.sensor import Markers, SensorGeometry
 from tacsim.optics.spline import displacement_and_jacobian
-from tacsim.scene import GelSurface
 
 INK = 0.06  # what a dot leaves of the light [-]
 

@@ -14,7 +14,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.optics.geometry import CameraNoise, SensorModel
+from tacsim.models.sensor import CameraNoise, SensorModel
 
 Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]

@@ -1,5 +1,5 @@
 """Gel surface -> RGB image: by Phong shading, the method of Gomes et al. (RA-L 2021) that the seed paper uses, or by a
-calibrated polynomial (tacsim.optics.photometric) where the sensor has one.
+calibrated polynomial (tacsim.models.photometric) where the sensor has one.
 
 Camera and lights stand behind the gel, on its -z side. There a surface pressed in by `height` has the unit normal
 
@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.optics.geometry import Light, Lighting, SensorModel
+from tacsim.models.photometric import PhotometricLight, places_in_image
+from tacsim.models.scene import GelSurface
+from tacsim.models.sensor import Light, Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.markers import check_fits, marker_transmission
-from tacsim.optics.photometric import PhotometricLight, places_in_image
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, look_up
-from tacsim.scene import GelSurface
 
 Float32 = NDArray[np.float32]
 

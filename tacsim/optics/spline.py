@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from tacsim.scene import GelSurface
+from tacsim.models.scene import GelSurface
 
 Float64 = NDArray[np.float64]
 

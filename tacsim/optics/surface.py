@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from tacsim.interface import SurfaceMap
-from tacsim.optics.geometry import CanonicalGrid, Markers
+from tacsim.models.scene import GelSurface
+from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.spline import displacement_and_jacobian, line_matrices
-from tacsim.scene import GelSurface
 
 Float32 = NDArray[np.float32]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import ArmState, EndOfEpisode, Pose, SensorSpec, TactileFrame
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError
 from tacsim.record.gripper import finger_states, read_columns
 from tacsim.record.images import read_image, reference_image
@@ -31,7 +32,6 @@ from tacsim.record.sources import (
     video_images,
     video_rate,
 )
-from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts
 
 
 class ReplayClock:
@@ -68,10 +68,10 @@ class ReplaySensor:
     Raises EpisodeError when the source is missing, empty, unreadable, too large, or has no such sensor.
     """
 
-    def __init__(self, facts: ReplaySensorFacts, name: str, clock: ReplayClock) -> None:
-        self._facts, self._name, self._clock = facts, name, clock
-        self._path = _source(facts.source, f"sensors.{name}")
-        self._reference = None if facts.reference is None else read_image(Path(facts.reference))
+    def __init__(self, config: ReplaySensorConfig, name: str, clock: ReplayClock) -> None:
+        self._facts, self._name, self._clock = config, name, clock
+        self._path = _source(config.source, f"sensors.{name}")
+        self._reference = None if config.reference is None else read_image(Path(config.reference))
         self._frames = Cursor(self._open(), str(self._path))
         self._first, _ = _first(self._frames, self._path)
         rows, columns, _ = self._first.image.shape
@@ -83,7 +83,7 @@ class ReplaySensor:
             )
         surface = self._first.surface
         flow = surface is not None and surface.flow is not None
-        self.spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=facts.arm)
+        self.spec = SensorSpec(image_shape=(rows, columns), height=surface is not None, flow=flow, arm=config.arm)
 
     def read(self, timeout: float) -> TactileFrame:
         """The frame of this tick, at once. Raises EndOfEpisode after the last, EpisodeError for an unreadable one."""
@@ -131,9 +131,9 @@ class ReplayArm:
     Raises EpisodeError when the source is missing, empty, unreadable, or has no such arm or column.
     """
 
-    def __init__(self, facts: ReplayArmFacts, name: str, clock: ReplayClock) -> None:
-        self._facts, self._name, self._clock = facts, name, clock
-        self._path = _source(facts.source, f"arms.{name}")
+    def __init__(self, config: ReplayArmConfig, name: str, clock: ReplayClock) -> None:
+        self._facts, self._name, self._clock = config, name, clock
+        self._path = _source(config.source, f"arms.{name}")
         self._states = Cursor(self._open(), str(self._path))
         _first(self._states, self._path)
 
@@ -171,16 +171,16 @@ class ReplayArm:
         return lambda: ((state, 0.0) for state in states)
 
 
-def recorded_period(facts: ReplaySensorFacts, name: str) -> float:
+def recorded_period(config: ReplaySensorConfig, name: str) -> float:
     """Time between two frames of a recording [s]: what the rig's period should be. Raises EpisodeError.
 
     An episode knows it, most videos do; for the others `fps` of the rig file counts.
     """
-    path = _source(facts.source, f"sensors.{name}")
+    path = _source(config.source, f"sensors.{name}")
     if path.suffix.lower() in EPISODES:
         return episode_meta(path).spec.period
     rate = video_rate(path) if path.suffix.lower() in VIDEOS and path.is_file() else None
-    return 1.0 / (facts.fps if rate is None else rate)
+    return 1.0 / (config.fps if rate is None else rate)
 
 
 def _first(cursor: Cursor[T], path: Path) -> T:

@@ -169,10 +169,10 @@ class Recorder:
         return self._schemas[schema]
 
     def _finish(self) -> None:
-        facts = {"steps": str(self._written), "dropped": str(self._dropped)}
+        config = {"steps": str(self._written), "dropped": str(self._dropped)}
         if self._error is not None:
-            facts["error"] = str(self._error)
-        self._writer.add_metadata(CLOSE, sealed(facts))
+            config["error"] = str(self._error)
+        self._writer.add_metadata(CLOSE, sealed(config))
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tacsim.rigfile import SqueezeFacts, TaskFacts
+from tacsim.models.rig import SqueezeConfig, TaskConfig
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
 from tacsim.tasks.task import Axis, Outcome, Task, judge, tolerance
@@ -10,6 +10,6 @@ from tacsim.tasks.task import Axis, Outcome, Task, judge, tolerance
 __all__ = ["Axis", "Outcome", "Reposition", "Squeeze", "Task", "judge", "make_task", "tolerance"]
 
 
-def make_task(facts: TaskFacts) -> Task:
+def make_task(config: TaskConfig) -> Task:
     """The task that the facts describe."""
-    return Squeeze(facts) if isinstance(facts, SqueezeFacts) else Reposition(facts)
+    return Squeeze(config) if isinstance(config, SqueezeConfig) else Reposition(config)

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from tacsim import pose as se3
+from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
-from tacsim.touch import contact_signal
 
 TARGET = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
 CLOSE = 0.1e-3  # how far each sensor closes in a control period [m]
@@ -22,7 +22,7 @@ class Grip:
 
     Args:
         spec: of the rig; says which arm carries which sensor.
-        target: contact signal (tacsim.touch) that ends the closing [-].
+        target: contact signal (tacsim.control.contact_signal) that ends the closing [-].
         step: how far each sensor closes in a control period [m].
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
-from tacsim.rigfile import RepositionFacts
+from tacsim.models.rig import RepositionConfig
 from tacsim.tasks.task import Axis
 
 REACHED = 0.02e-3  # the scripted policy holds when its estimate is this near the goal [m]
@@ -20,7 +20,7 @@ LEAST_FORCE = 0.01  # normal force below which there is no contact to speak of [
 class Reposition:
     """distance = ||position - goal||_2, position = centre of mass minus its value at reset, world x and y."""
 
-    facts: RepositionFacts
+    config: RepositionConfig
 
     @property
     def needs(self) -> Needs:
@@ -32,10 +32,10 @@ class Reposition:
 
     def distance(self, truth: Truth, start: Truth) -> float:
         moved = truth.position[:2] - start.position[:2]
-        return math.hypot(moved[0] - self.facts.goal[0], moved[1] - self.facts.goal[1])
+        return math.hypot(moved[0] - self.config.goal[0], moved[1] - self.config.goal[1])
 
     def scripted(self, *, through: bool = False) -> Policy:
-        return ScriptedReposition(self.facts, through)
+        return ScriptedReposition(self.config, through)
 
 
 class ScriptedReposition:
@@ -45,8 +45,8 @@ class ScriptedReposition:
     lost it feels nothing, and holds. With `through` it goes on beyond the goal, straight and at the full rate.
     """
 
-    def __init__(self, facts: RepositionFacts, through: bool) -> None:
-        self._goal, self._rate, self._through = np.array(facts.goal), facts.max_step / 2, through
+    def __init__(self, config: RepositionConfig, through: bool) -> None:
+        self._goal, self._rate, self._through = np.array(config.goal), config.max_step / 2, through
         self._start: FloatArray | None = None
         self._reached = False
 

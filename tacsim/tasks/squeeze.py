@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacsim.interface import Action, Needs, Observation, Policy, Pose, TactileObservation, Truth
-from tacsim.rigfile import SqueezeFacts
+from tacsim.models.rig import SqueezeConfig
 from tacsim.tasks.task import Axis
 
 REACHED = 0.01e-3  # the scripted policy holds when its estimate is this near the goal [m]
@@ -17,7 +17,7 @@ REACHED = 0.01e-3  # the scripted policy holds when its estimate is this near th
 class Squeeze:
     """distance = |height - goal|, height = z-extent of the body."""
 
-    facts: SqueezeFacts
+    config: SqueezeConfig
 
     @property
     def needs(self) -> Needs:
@@ -28,10 +28,10 @@ class Squeeze:
         return (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (0.0, 0.0, 1.0)))
 
     def distance(self, truth: Truth, start: Truth) -> float:
-        return abs(truth.height - self.facts.goal)
+        return abs(truth.height - self.config.goal)
 
     def scripted(self, *, through: bool = False) -> Policy:
-        return ScriptedSqueeze(self.facts, through)
+        return ScriptedSqueeze(self.config, through)
 
 
 class ScriptedSqueeze:
@@ -40,8 +40,8 @@ class ScriptedSqueeze:
     The last step is shortened to end at the goal. With `through` it then goes on at the full rate.
     """
 
-    def __init__(self, facts: SqueezeFacts, through: bool) -> None:
-        self._goal, self._rate, self._through = facts.goal, facts.max_step / 2, through
+    def __init__(self, config: SqueezeConfig, through: bool) -> None:
+        self._goal, self._rate, self._through = config.goal, config.max_step / 2, through
         self._reached = False
 
     @property

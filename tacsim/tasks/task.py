@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tacsim.interface import Needs, Policy, Truth
-from tacsim.rigfile import TaskFacts
+from tacsim.models.rig import TaskConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Task(Protocol):
     """A goal for the body between the sensors. Immutable: the state of an episode is in the two truths."""
 
     @property
-    def facts(self) -> TaskFacts: ...
+    def config(self) -> TaskConfig: ...
     @property
     def needs(self) -> Needs:
         """What judging needs of a rig; a policy names its own needs."""
@@ -51,12 +51,12 @@ class Outcome:
 
 def judge(task: Task, truth: Truth, start: Truth) -> Outcome:
     """Distance, reward, success and score of `truth`, in an episode that began at `start`."""
-    facts, distance = task.facts, float(task.distance(truth, start))
+    config, distance = task.config, float(task.distance(truth, start))
     return Outcome(
         distance=distance,
-        reward=-distance / facts.reward_scale,
-        success=distance <= facts.success,
-        score=tolerance(distance, bounds=(0.0, facts.success), margin=facts.reward_scale),
+        reward=-distance / config.reward_scale,
+        success=distance <= config.success,
+        score=tolerance(distance, bounds=(0.0, config.success), margin=config.reward_scale),
     )
 
 

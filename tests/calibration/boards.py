@@ -10,8 +10,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from calibration.board import Board, parse_board
-from calibration.view import Lens
+from calibration.lens.board import Board, parse_board
+from calibration.lens.view import Lens
 from tacsim import pose as se3
 from tacsim.interface import Pose
 

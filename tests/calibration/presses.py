@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.circle import dent_slope
-from tacsim.optics.geometry import Light, Lighting
+from calibration.light.circle import dent_slope
+from tacsim.models.sensor import Light, Lighting
 from tacsim.optics.render import shade
 
 ROWS, COLUMNS = 200, 260

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from calibration.ballpress import calibrate_light
 from calibration.bundle import Calibration, Provenance
-from calibration.sides import Shot, Side
-from tacsim.optics.geometry import SensorGeometry
+from calibration.compare.frame_set import Shot, Side
+from calibration.light.ball_press import calibrate_light
+from tacsim.models.sensor import SensorGeometry
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
 PLACES = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50)]

@@ -18,14 +18,14 @@ from calibration.bundle import (
     sensor_model,
     write_bundle,
 )
-from calibration.inverse import TERMS, InverseModel
-from calibration.lens import to_metric
+from calibration.height.inverse import TERMS, InverseModel
+from calibration.lens.rectification import to_metric
+from calibration.lens.view import GelView, pinhole, view_of_corners
 from calibration.normaliser import for_calibrated, for_camera
-from calibration.view import GelView, pinhole, view_of_corners
-from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame
-from tacsim.optics.geometry import CameraNoise, CanonicalGrid, SensorGeometry
-from tacsim.optics.photometric import PhotometricModel
+from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.photometric import PhotometricModel
+from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry
 from tacsim.optics.render import Renderer
 from tests.tacsim.optics.surfaces import dent, flat
 
@@ -51,8 +51,8 @@ def calibration(serial: str = "gs-42") -> Calibration:
     )
 
 
-def camera(bundle: Path, width: int = 160, height: int = 120) -> CameraSensorFacts:
-    return CameraSensorFacts(driver="camera", source="x", calibration=str(bundle), width=width, height=height)
+def camera(bundle: Path, width: int = 160, height: int = 120) -> CameraSensorConfig:
+    return CameraSensorConfig(driver="camera", source="x", calibration=str(bundle), width=width, height=height)
 
 
 @pytest.fixture

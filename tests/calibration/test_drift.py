@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calibration.ballpress import normal_angle
 from calibration.drift import THIN, Drift, DriftFinder
-from calibration.inverse import to_normal
+from calibration.height.inverse import to_normal
+from calibration.light.ball_press import normal_angle
 from calibration.normaliser import FrameNormaliser, for_calibrated, for_camera, for_pictures, for_simulated
 from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, exchanged
-from tacsim.hardware import CameraSensorFacts
 from tacsim.interface import TactileFrame, TactileObservation
-from tacsim.optics.geometry import CanonicalGrid, SensorModel
+from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tests.calibration.presses import COLUMNS, PITCH, ROWS, HiddenSensor, Made
@@ -148,8 +148,8 @@ def test_a_large_contact_is_no_drift_and_a_simulation_has_none() -> None:
 
 def test_a_sensor_without_slopes_is_watched_by_its_colour() -> None:
     corners = ((0.0, 0.0), (319.0, 0.0), (319.0, 239.0), (0.0, 239.0))
-    facts = CameraSensorFacts(driver="camera", source="x", corners=corners, width=320, height=240)
-    normalise = for_camera(facts, (1.0, 1.0), GRID)
+    config = CameraSensorConfig(driver="camera", source="x", corners=corners, width=320, height=240)
+    normalise = for_camera(config, (1.0, 1.0), GRID)
     image = Renderer(SensorModel(), (20e-3, 20e-3))(dent()).astype(float)
     normalise.take_reference(frame(Renderer(SensorModel(), (20e-3, 20e-3))(flat())))
     normalise(frame(image), 0.0)
@@ -225,10 +225,10 @@ def _middle(view: np.ndarray) -> np.ndarray:
 def test_the_drift_is_taken_off_where_no_slopes_are_known_too() -> None:
     """A gel that does not fill the canonical image: what is not seen stays without change."""
     corners = ((0.0, 0.0), (319.0, 0.0), (319.0, 239.0), (0.0, 239.0))
-    facts = CameraSensorFacts(
+    config = CameraSensorConfig(
         driver="camera", source="x", corners=corners, size=(20e-3, 15e-3), width=320, height=240
     )  # fmt: skip
-    normalise = for_camera(facts, (1.0, 1.0), GRID)
+    normalise = for_camera(config, (1.0, 1.0), GRID)
     render = Renderer(SensorModel(texture=0.0), (20e-3, 15e-3))
     normalise.take_reference(frame(render(flat())))
     plain = normalise(frame(render(dent())), 0.0)

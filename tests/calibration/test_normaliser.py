@@ -4,13 +4,13 @@ import pytest
 
 from calibration.normaliser import FrameNormaliser, NoReference, for_recorded, for_simulated
 from calibration.reference import UnusableReference
+from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import SurfaceMap, TactileFrame
-from tacsim.optics.geometry import CanonicalGrid, Markers, SensorModel
+from tacsim.models.rig import ReplaySensorConfig
+from tacsim.models.scene import GelSurface
+from tacsim.models.sensor import CanonicalGrid, Markers, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
-from tacsim.rigfile import ReplaySensorFacts
-from tacsim.scene import GelSurface
-from tacsim.touch import contact_signal
 from tests.tacsim.optics.surfaces import dent, flat
 
 GEL = (20e-3, 20e-3)
@@ -111,12 +111,12 @@ def test_a_camera_at_an_angle_gives_the_same_observation_as_the_simulation() -> 
     camera_from_image = cv2.getPerspectiveTransform(extent, np.array(corners, dtype=np.float32))
     smooth = SensorModel(texture=0.0)
     render = Renderer(smooth, GEL)
-    facts = ReplaySensorFacts(driver="replay", corners=corners, size=(20e-3, 15e-3))
+    config = ReplaySensorConfig(driver="replay", corners=corners, size=(20e-3, 15e-3))
     seen = []
     for normalise, photograph in (
         (for_simulated(smooth, (20e-3, 15e-3), GRID), lambda image: image),
         (
-            for_recorded(facts, (480, 640), GRID),
+            for_recorded(config, (480, 640), GRID),
             lambda image: cv2.warpPerspective(image, camera_from_image, (640, 480)),
         ),
     ):

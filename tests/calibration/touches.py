@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.touch import Touch
+from calibration.poses.ball_touch import Touch
 from tacsim import pose as se3
 from tacsim.interface import Pose
 

@@ -18,17 +18,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.deploy import EpisodeFacts, run_episode
+from robot.deploy.control_loop import EpisodeSetup, run_episode
 from robot.mock.fixtures import rig_addresses
 from robot.open import RIG_ATTACHMENT, open_rig
 from tacsim.config import load_rig
+from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Pose, RigSpec
 from tacsim.limits import ActionError
 from tacsim.record.writer import Recorder
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
 from tacsim.tasks.grip import Grip
-from tacsim.touch import contact_signal
 
 STEPS = 3
 PERIOD = 0.1  # of every rig here [s]
@@ -57,17 +57,17 @@ def open_episode(folder: Path) -> Rig:
     """A replay of an episode that the simulation recorded."""
     path = folder / "episode.mcap"
     loaded = load_rig("sim", overrides=[*SMALL, *PICTURE])
-    assert loaded.facts.task is not None
-    task = make_task(loaded.facts.task)
+    assert loaded.config.task is not None
+    task = make_task(loaded.config.task)
     recorders: list[Recorder] = []
     with open_rig(loaded) as rig:
-        facts = EpisodeFacts("scripted", 0, {RIG_ATTACHMENT: loaded.text.encode()})
+        config = EpisodeSetup("scripted", 0, {RIG_ATTACHMENT: loaded.text.encode()})
         run_episode(
             rig,
             task.scripted(),
             task,
             STEPS + 1,
-            facts=facts,
+            config=config,
             recorder=lambda meta: recorders.append(Recorder(path, meta)) or recorders[0],  # type: ignore[func-returns-value]
         )
     recorders[0].close()

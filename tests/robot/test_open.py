@@ -164,10 +164,10 @@ def test_facts_that_are_loaded_take_no_more_overrides() -> None:
         open_rig(load_rig("sim"), overrides=["period=1 s"])
 
 
-@pytest.mark.parametrize("first", ["", "import tacsim.gymnasium_plugin as p; p.install()\n"])
+@pytest.mark.parametrize("first", ["", "import tacsim.gym.plugin as p; p.install()\n"])
 def test_gymnasium_finds_the_environments_without_an_import(first: str) -> None:
     """In a fresh process, with a small scene: by the module in the id, and by what the installed .pth runs at start."""
-    module = "" if first else "tacsim.env:"
+    module = "" if first else "tacsim.gym.env:"
     program = (
         f"{first}import gymnasium, sys\n"
         f"env = gymnasium.make('{module}tacsim/Squeeze-v0', overrides={SMALL!r})\n"
@@ -181,10 +181,10 @@ def test_gymnasium_finds_the_environments_without_an_import(first: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("module", ["tacsim.encode", "tacsim.env", "gymnasium"])
+@pytest.mark.parametrize("module", ["tacsim.gym.encode", "tacsim.gym.env", "gymnasium"])
 def test_any_of_ours_may_import_gymnasium_first(module: str) -> None:
     """Registration runs inside `import gymnasium`: it must not need a module of ours that is half imported."""
-    program = f"import tacsim.gymnasium_plugin as p; p.install()\nimport {module}, gymnasium\n"
+    program = f"import tacsim.gym.plugin as p; p.install()\nimport {module}, gymnasium\n"
     program += "assert 'tacsim/Squeeze-v0' in gymnasium.registry\n"
     done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -193,7 +193,7 @@ def test_any_of_ours_may_import_gymnasium_first(module: str) -> None:
 def test_importing_the_top_floor_loads_nothing_heavy() -> None:
     heavy = ("taichi", "cv2", "rtde_control")
     program = (
-        "import sys, robot.open, robot.deploy, robot.policy, tacsim.env, tacsim.sensor\n"
+        "import sys, robot.open, robot.deploy.control_loop, robot.deploy.policy, tacsim.gym.env, tacsim.sim.sensor\n"
         f"print([name for name in {heavy!r} if name in sys.modules])\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)

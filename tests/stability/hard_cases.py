@@ -22,10 +22,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics import diagnosis, health, hybrid, press, seed
-from tacsim.physics.health import RETRIES, SimulationDiverged
-from tacsim.physics.world import MoveStats, World, make_world
-from tacsim.scene import Body, BodyMaterial, Box, Cylinder, Gel, GelMaterial, Indenter, Mesh, Scene, Settling, Sphere
+from tacsim.models.scene import (
+    Body,
+    BodyMaterial,
+    Box,
+    Cylinder,
+    Gel,
+    GelMaterial,
+    Indenter,
+    Mesh,
+    Scene,
+    Settling,
+    Sphere,
+)
+from tacsim.physics.failure import diagnosis, health
+from tacsim.physics.failure.health import RETRIES, SimulationDiverged
+from tacsim.physics.seed import world as seed_world
+from tacsim.physics.worlds import hybrid, press
+from tacsim.physics.worlds.world import MoveStats, World, make_world
 
 Targets = Mapping[str, Pose]
 Motions = Callable[[World], Iterator[Targets]]
@@ -43,7 +57,7 @@ BOTH, PRESS = ("hybrid", "seed"), ("press",)
 class Outcome:
     kind: str  # finite, diverged, refused
     words: str = ""
-    facts: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -378,7 +392,7 @@ def run(name: str, physics: str) -> Outcome:
     while name == "endless":
         time.sleep(1.0)
     case = CASES[name]
-    modules = {"hybrid": hybrid, "press": press, "seed": seed}
+    modules = {"hybrid": hybrid, "press": press, "seed": seed_world}
     with ExitStack() as stack:
         for target, value in case.patch.items():
             module, _, attribute = target.partition(".")
@@ -451,7 +465,7 @@ def _assert_consistent(world: World, stats: MoveStats, targets: Targets) -> None
 
 def _facts(world: World, stats: list[MoveStats]) -> dict[str, float]:
     state, truth = world.snapshot(), world.truth()
-    facts = {
+    figures = {
         "force": -float(world.wrench("lower")[2]),
         "torque": float(world.wrench("lower")[5]),
         "settled": float(stats[-1].settled),
@@ -466,12 +480,12 @@ def _facts(world: World, stats: list[MoveStats]) -> dict[str, float]:
     elements = diagnosis.element_volumes(state, world.scene.gel.size[2] * 1e3)  # type: ignore[attr-defined]
     for name, values in (("particle", volumes), ("element", elements)):
         if values is not None:
-            facts |= {f"least {name}": float(values.min()), f"most {name}": float(values.max())}
+            figures |= {f"least {name}": float(values.min()), f"most {name}": float(values.max())}
     if truth is not None:
-        facts |= {
+        figures |= {
             "height": truth.height,
             "x": float(truth.position[0]),
             "upper force": -float(world.wrench("upper")[2]),
             "upper torque": float(world.wrench("upper")[5]),
         }
-    return facts
+    return figures

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from case_worker import CaseDied, Worker
 from hard_cases import CASES, Outcome
 
-Facts = dict[str, float]
+Config = dict[str, float]
 LONG = {"loaded rest, long": 600, "unstressed rest, long": 400, "unstressed rest, long, press": 100}  # [s]
 SECONDS = 60.0
 
@@ -30,20 +30,20 @@ def worker() -> Iterator[Worker]:
         yield opened
 
 
-def balanced(f: Facts) -> bool:
+def balanced(f: Config) -> bool:
     return f["settled"] == 1 and abs(f["force"] - f["upper force"]) <= 0.02 * abs(f["force"])
 
 
-def keeps(least: float, most: float) -> Callable[[Facts], bool]:
+def keeps(least: float, most: float) -> Callable[[Config], bool]:
     """Forces balance, and particles keep their volume within these ratios."""
     return lambda f: balanced(f) and least < f["least particle"] and f["most particle"] < most
 
 
-def still(f: Facts) -> bool:
+def still(f: Config) -> bool:
     return f["drift"] == 0.0 and f["force"] == 0.0 and f["residual"] == 0.0
 
 
-def released(f: Facts, force: float, dent: float) -> bool:
+def released(f: Config, force: float, dent: float) -> bool:
     """After the third move sensors are free of force, up to `force` [N], and gels flat, up to `dent` [m]."""
     return f["force 3"] <= force and f["dent 3"] <= dent
 
@@ -55,7 +55,7 @@ def sliding_torque(force: float, friction: float, side: float) -> float:
 
 
 # What must come out, by case and physics: a judgement of the facts of a finite end, or a text of the error.
-EXPECTED: dict[str, dict[str, Callable[[Facts], bool] | str]] = {
+EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     "elastic, nu 0.45, to half": {"hybrid": keeps(0.7, 1.1), "seed": keeps(0.4, 1.1)},
     "elastic, nu 0.49, to half": {"hybrid": keeps(0.85, 1.1), "seed": keeps(0.6, 1.2)},
     "elastic, nu 0.499, to half": {"hybrid": keeps(0.95, 1.05), "seed": keeps(0.8, 1.1)},
@@ -200,7 +200,7 @@ def test_hard_case(worker: Worker, name: str, physics: str) -> None:
     expected = EXPECTED[name][physics]
     if callable(expected):
         assert outcome.kind == "finite", outcome
-        assert expected(outcome.facts), outcome.facts
+        assert expected(outcome.figures), outcome.figures
     else:
         assert outcome.kind == "diverged", outcome
         assert expected in outcome.words
@@ -220,7 +220,7 @@ def test_a_step_beyond_the_limit_changes_no_result(
     outcomes: Callable[[str, str], Outcome], name: str, physics: str, tolerance: float
 ) -> None:
     """A press: its springs are as soft as the constant, patched here, says; a shorter step alone leaves them so."""
-    kept, violated = (outcomes(name.format(how), physics).facts for how in ("kept", "violated"))
+    kept, violated = (outcomes(name.format(how), physics).figures for how in ("kept", "violated"))
     assert violated["force"] == pytest.approx(kept["force"], rel=tolerance)
 
 

@@ -11,9 +11,9 @@ import pytest
 from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Pose, Truth
-from tacsim.physics.world import MoveStats
+from tacsim.models.scene import GelSurface, Scene
+from tacsim.physics.worlds.world import MoveStats
 from tacsim.rig import Rig
-from tacsim.scene import GelSurface, Scene
 
 HEIGHT, RADIUS, GAP = 10e-3, 0.25e-3, 0.5e-3  # of the body; of a particle; between gel and body at first [m]
 GEL, BODY = 5e3, 5e3  # stiffness of one gel and of the body [N/m]
@@ -126,7 +126,7 @@ def open_springs(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]
             worlds.append(SpringWorld(scene))
             return worlds[-1]
 
-        monkeypatch.setattr("tacsim.physics.world.make_world", make)
+        monkeypatch.setattr("tacsim.physics.worlds.world.make_world", make)
         rig = open_rig(load_rig("sim", task=task, overrides=[*SMALL, *overrides]))
         rig.world = worlds[-1]  # type: ignore[attr-defined]
         opened.append(rig)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from robot.mock import Door, MockUR
-from robot.mock.client import loopback_host
+from robot.mock.wire_client import loopback_host
 
 
 @pytest.fixture(scope="module")

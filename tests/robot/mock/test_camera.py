@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot import stamp
+from robot.camera import stamp
 from robot.errors import DeviceError, DeviceNotConnectedError
-from robot.mock.camera import MockCamera
+from robot.mock.camera.camera import MockCamera
 
 HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # parallel sessions stay apart
 WAIT = 20.0  # for what must come, however slow the machine [s]
@@ -354,7 +354,7 @@ def test_a_killed_process_is_said(camera: MockCamera) -> None:
 
 def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     with MockCamera(host=HOST) as camera:
-        monkeypatch.setattr("robot.mock.camera.ANSWER_TIMEOUT", 0.5)  # not before: to start takes longer
+        monkeypatch.setattr("robot.mock.camera.camera.ANSWER_TIMEOUT", 0.5)  # not before: to start takes longer
         os.kill(camera.pid, signal.SIGSTOP)
         with pytest.raises(DeviceNotConnectedError, match="it has ended"):
             camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
@@ -362,7 +362,7 @@ def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch
 
 def test_ends_with_its_parent() -> None:
     code = (
-        "import time; from robot.mock.camera import MockCamera\n"
+        "import time; from robot.mock.camera.camera import MockCamera\n"
         f"camera = MockCamera(host={HOST!r}); print(camera.pid, flush=True); time.sleep(100)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
@@ -374,7 +374,7 @@ def test_ends_with_its_parent() -> None:
 
 
 def test_nonsense_on_standard_input_gets_an_answer() -> None:
-    command = [sys.executable, "-m", "robot.mock.camera", "--host", HOST]
+    command = [sys.executable, "-m", "robot.mock.camera.camera", "--host", HOST]
     lines = b'nonsense\n{"fly": 1}\n{"push": 3}\nabc{}\n{"state": true}\n'
     done = subprocess.run(command, input=lines, capture_output=True, timeout=WAIT)
     answers = done.stdout.decode().splitlines()

@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from robot.camera import Camera
+from robot.camera.camera import Camera
 from robot.mock import Door
-from robot.mock.client import TIMEOUT, loopback_host
-from tacsim.hardware import CameraSensorFacts
+from robot.mock.wire_client import TIMEOUT, loopback_host
+from tacsim.models.hardware import CameraSensorConfig
 
 START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 
@@ -41,8 +41,8 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
         said = [process.stdout.readline() for _ in range(3)]
         url = f"http://{host}:8090/?action=stream"
         assert said[1].strip() == f"camera at {url}"
-        facts = CameraSensorFacts(driver="camera", source=url, width=320, height=240, stamped=True, max_age=10.0)
-        with Camera(facts, "finger", TIMEOUT) as camera:
+        config = CameraSensorConfig(driver="camera", source=url, width=320, height=240, stamped=True, max_age=10.0)
+        with Camera(config, "finger", TIMEOUT) as camera:
             assert camera.read(TIMEOUT).image.shape == (240, 320, 3)
         process.send_signal(signal.SIGINT)
         assert process.wait(TIMEOUT) == 128 + signal.SIGINT

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from robot.mock import Door, DoorError, MockUR
-from robot.mock.client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, loopback_host
-from robot.mock.controller import PORTS
+from robot.mock.ur.wire.controller import PORTS
+from robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, loopback_host
 
 
 def until(done: Callable[[], bool], what: str) -> None:
@@ -330,7 +330,7 @@ def test_reset_makes_it_as_new(mock: MockUR, door: Door) -> None:
 
 
 def test_calls_to_a_door_that_is_not_there() -> None:
-    from robot.mock.client import loopback_host
+    from robot.mock.wire_client import loopback_host
 
     with pytest.raises(DoorError, match=r"127\.21\..*:30020, state: .*refused"):
         Door(loopback_host(200)).state()

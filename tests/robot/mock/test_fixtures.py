@@ -16,9 +16,9 @@ ROOT = Path(__file__).resolve().parents[3]
 THEIRS = """
 import numpy as np
 import pytest
-from robot.camera import Camera
+from robot.camera.camera import Camera
 from tacsim.config import load_rig
-from tacsim.hardware import CameraSensorFacts
+from tacsim.models.hardware import CameraSensorFacts
 
 
 def test_the_controller_is_there_and_can_be_broken(mock_ur):
@@ -60,12 +60,12 @@ def test_it_works_as_a_plugin_of_somebody_elses_tests(tmp_path: Path) -> None:
 
 
 def test_addresses_are_of_loopback_and_of_this_process() -> None:
-    facts = load_rig("mock", overrides=rig_addresses()).facts
-    hosts = [arm.host for arm in facts.arms.values()]  # type: ignore[union-attr]
+    config = load_rig("mock", overrides=rig_addresses()).config
+    hosts = [arm.host for arm in config.arms.values()]  # type: ignore[union-attr]
     assert len(set(hosts)) == 2
     assert all(host.startswith(mock_host(1).rpartition(".")[0] + ".") and host.startswith("127.") for host in hosts)
-    for name, host in zip(facts.arms, hosts, strict=True):
-        assert f"//{host}:" in facts.sensors[name].source  # type: ignore[union-attr, operator]
+    for name, host in zip(config.arms, hosts, strict=True):
+        assert f"//{host}:" in config.sensors[name].source  # type: ignore[union-attr, operator]
 
 
 @pytest.mark.parametrize("number", [1, 254])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.mock.hertz import GAP, RADIUS, HertzBench, dent
-from robot.mock.twin import Twin, TwinError
+from robot.mock.cell.hertz import GAP, RADIUS, HertzBench, dent
+from robot.mock.cell.sim_server import Twin, TwinError
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import Pose
-from tacsim.optics.geometry import CameraNoise, CanonicalGrid, SensorModel
+from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorModel
 from tacsim.optics.surface import surface_map
 
 START: dict[str, Pose] = {}  # of the sensors
@@ -18,7 +18,7 @@ START: dict[str, Pose] = {}  # of the sensors
 
 @pytest.fixture(scope="module")
 def bench() -> HertzBench:
-    scene = load_rig("mock").facts.scene
+    scene = load_rig("mock").config.scene
     assert scene is not None
     made = HertzBench(scene, {"lower": SensorModel(), "upper": SensorModel()}, CanonicalGrid())
     START.update(made.poses())
@@ -77,7 +77,7 @@ def test_a_ball_does_not_go_through_the_gel(bench: HertzBench) -> None:
 
 
 def test_its_process_says_what_is_wrong() -> None:
-    scene = load_rig("mock").facts.scene
+    scene = load_rig("mock").config.scene
     assert scene is not None
     with pytest.raises(TwinError, match="has no sensor 'left'; it has lower, upper"):
         Twin(scene, {"left": SensorModel()}, CanonicalGrid(), "hertz")
@@ -90,7 +90,7 @@ def test_its_process_says_what_is_wrong() -> None:
 
 
 def test_a_camera_with_noise_shows_another_picture_each_time_and_the_same_surface(bench: HertzBench) -> None:
-    scene = load_rig("mock").facts.scene
+    scene = load_rig("mock").config.scene
     assert scene is not None
     noisy = SensorModel(noise=CameraNoise(deviation=(2, 2, 2)))
     made = HertzBench(scene, {"lower": SensorModel(), "upper": noisy}, CanonicalGrid())

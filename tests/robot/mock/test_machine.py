@@ -8,12 +8,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from robot.kinematics import matrix, motion, pose
-from robot.mock.arm import PERIOD, Arm
-from robot.mock.client import control_script
-from robot.mock.commands import REALTIME
-from robot.mock.load import GRAVITY, Wall
-from robot.mock.machine import Machine, Mode, Runtime, Safety
+from robot.arm.kinematics import matrix, motion, pose
+from robot.mock.ur.machine.arm import PERIOD, Arm
+from robot.mock.ur.machine.commands import REALTIME
+from robot.mock.ur.machine.load import GRAVITY, Wall
+from robot.mock.ur.machine.machine import Machine, Mode, Runtime, Safety
+from robot.mock.wire_client import control_script
 from tacsim.interface import FloatArray
 
 DOWN = (-0.4, -0.2, 0.3, 0.0, math.pi, 0.0)

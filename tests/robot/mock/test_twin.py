@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.mock import twin as twins
-from robot.mock.twin import LARGEST, Twin, TwinError, read_message, write_message
+from robot.mock.cell import sim_server as twins
+from robot.mock.cell.sim_server import LARGEST, Twin, TwinError, read_message, write_message
 from tacsim.config import load_rig
 from tacsim.interface import Pose
-from tacsim.rigfile import RigFacts, SimSensorFacts
+from tacsim.models.rig import RigConfig, SimSensorConfig
 
 PATIENCE = 60.0  # for anything that has to happen [s]
 SMALL = [
@@ -97,7 +97,7 @@ def test_what_is_no_message_is_a_value_error(pipe: io.BytesIO) -> None:
 
 STAND_IN = """
 import json, os, signal, sys, time
-from robot.mock.twin import read_message, write_message
+from robot.mock.cell.sim_server import read_message, write_message
 while (message := read_message(sys.stdin.buffer)) is not None:
     said, _ = message
     if said["do"] == "open":
@@ -116,9 +116,9 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, act: str) -> Twin:
         return start([sys.executable, "-c", code], **options)  # type: ignore[call-overload,no-any-return]
 
     monkeypatch.setattr(twins.subprocess, "Popen", other)
-    facts = load_rig("mock", overrides=SMALL).facts
-    assert facts.scene is not None
-    return Twin(facts.scene, {}, facts.canonical)
+    config = load_rig("mock", overrides=SMALL).config
+    assert config.scene is not None
+    return Twin(config.scene, {}, config.canonical)
 
 
 @pytest.mark.parametrize(
@@ -161,19 +161,19 @@ def test_after_ctrl_c_no_old_answer_is_taken_for_a_new_one(monkeypatch: pytest.M
 
 
 @pytest.fixture(scope="module")
-def facts() -> RigFacts:
-    return load_rig("mock", overrides=SMALL).facts
+def config() -> RigConfig:
+    return load_rig("mock", overrides=SMALL).config
 
 
 @pytest.fixture(scope="module")
-def twin(facts: RigFacts) -> Iterator[Twin]:
-    assert facts.scene is not None
+def twin(config: RigConfig) -> Iterator[Twin]:
+    assert config.scene is not None
     models = {
         name: sensor.model
-        for name, sensor in facts.sensors.items()
-        if not isinstance(sensor, SimSensorFacts) and sensor.model is not None  # type: ignore[union-attr]
+        for name, sensor in config.sensors.items()
+        if not isinstance(sensor, SimSensorConfig) and sensor.model is not None  # type: ignore[union-attr]
     }
-    with Twin(facts.scene, models, facts.canonical) as running:
+    with Twin(config.scene, models, config.canonical) as running:
         yield running
 
 
@@ -190,7 +190,7 @@ def touching(twin: Twin) -> float:
     return 0.5 * (twin.initial["upper"].position[2] - twin.initial["lower"].position[2] - 4e-3)
 
 
-def test_a_bench_answers_with_pictures_surfaces_forces_and_truth(twin: Twin, facts: RigFacts) -> None:
+def test_a_bench_answers_with_pictures_surfaces_forces_and_truth(twin: Twin, config: RigConfig) -> None:
     clear = twin.place(twin.initial)
     assert set(clear.images) == set(clear.surfaces) == set(clear.wrenches) == {"lower", "upper"}
     assert clear.images["upper"].shape == (30, 40, 3)
@@ -238,7 +238,7 @@ def test_the_process_ends_with_its_parent() -> None:
     """Its standard input ends; nothing else tells it."""
     code = (
         "import subprocess, sys, time\n"
-        "child = subprocess.Popen([sys.executable, '-m', 'robot.mock.twin'], stdin=subprocess.PIPE)\n"
+        "child = subprocess.Popen([sys.executable, '-m', 'robot.mock.cell.sim_server'], stdin=subprocess.PIPE)\n"
         "print(child.pid, flush=True); time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import pytest
 
 from robot.mock import DoorError, MockArms, MockError, MockUR
-from robot.mock.client import TIMEOUT, ControlClient, loopback_host
+from robot.mock.wire_client import TIMEOUT, ControlClient, loopback_host
 
 
 def until(done: Callable[[], bool], what: str) -> None:
@@ -141,7 +141,7 @@ def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
     with MockUR(loopback_host(20), ready_timeout=60) as mock:
         for watchdog in (False, True):
             code = (
-                "import sys, time; from robot.mock.client import ControlClient\n"
+                "import sys, time; from robot.mock.wire_client import ControlClient\n"
                 f"client = ControlClient({mock.host!r})\n"
                 f"if {watchdog}: client.call(35, [10.0])\n"
                 "client.write(10, [0, 0, -0.01, 0, 0, 0, 0.5, 0]); print('moves', flush=True); \n"

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.kinematics import Kinematics, matrix, motion
+from robot.arm.kinematics import Kinematics, matrix, motion
 from robot.mock import MOCK_SERIAL, MockUR
-from robot.mock.arm import HOME
+from robot.mock.ur.machine.arm import HOME
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python"

@@ -13,13 +13,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.kinematics import Kinematics, matrix
+from robot.arm.kinematics import Kinematics, matrix
 from robot.mock import MOCK_SERIAL, Door, MockUR
-from robot.mock.arm import HOME
-from robot.mock.client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
-from robot.mock.controller import MAX_CLIENTS, PORTS
-from robot.mock.fields import INPUTS, OUTPUTS
-from robot.mock.rtde import BadPackage, package, packages
+from robot.mock.ur.machine.arm import HOME
+from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
+from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
+from robot.mock.ur.wire.rtde import BadPackage, package, packages
+from robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 
 
 def until(done: Callable[[], bool], what: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tacsim.scene import GelSurface
+from tacsim.models.scene import GelSurface
 
 Displacement = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 

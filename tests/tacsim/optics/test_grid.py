@@ -1,6 +1,6 @@
 import numpy as np
 
-from tacsim.optics.geometry import CanonicalGrid, SensorGeometry
+from tacsim.models.sensor import CanonicalGrid, SensorGeometry
 from tacsim.optics.grid import PixelGrid, canonical_cells, canonical_image, image_grid
 
 
@@ -19,8 +19,8 @@ def test_default_image_is_centred() -> None:
 
 
 def test_canonical_pixels_share_the_area_of_their_cell() -> None:
-    facts = CanonicalGrid(rows=16, columns=24, pitch=0.25e-3, image_scale=3)
-    cells, pixels = canonical_cells(facts), canonical_image(facts)
+    config = CanonicalGrid(rows=16, columns=24, pitch=0.25e-3, image_scale=3)
+    cells, pixels = canonical_cells(config), canonical_image(config)
     assert pixels.shape == (48, 72)
     np.testing.assert_allclose(pixels.x.reshape(24, 3).mean(axis=1), cells.x, atol=1e-12)
     np.testing.assert_allclose(pixels.y.reshape(16, 3).mean(axis=1), cells.y, atol=1e-12)

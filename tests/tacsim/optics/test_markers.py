@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tacsim.optics.geometry import Markers, SensorGeometry, SensorModel
+from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
 from tacsim.optics.markers import (
     check_fits,
     marker_coverage,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tacsim.optics.geometry import CameraNoise, SensorModel
+from tacsim.models.sensor import CameraNoise, SensorModel
 from tacsim.optics.noise import NoiseSource, noise_source
 from tacsim.optics.render import Renderer
 from tests.tacsim.optics.surfaces import flat

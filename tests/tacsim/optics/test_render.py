@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tacsim.optics.geometry import Light, Lighting, SensorGeometry, SensorModel
+from tacsim.models.sensor import Light, Lighting, SensorGeometry, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid
 from tacsim.optics.render import (
     STEEPEST,

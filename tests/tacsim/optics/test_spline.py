@@ -1,8 +1,8 @@
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from tacsim.models.scene import GelSurface
 from tacsim.optics.spline import displacement_and_jacobian, line_matrices, spline_weights
-from tacsim.scene import GelSurface
 
 
 def _random_surface() -> GelSurface:

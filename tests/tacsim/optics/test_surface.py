@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tacsim.optics.geometry import CanonicalGrid, Markers, SensorGeometry
+from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry
 from tacsim.optics.grid import PixelGrid, canonical_cells, image_grid
 from tacsim.optics.spline import displacement_and_jacobian
 from tacsim.optics.surface import SurfaceFolded, material_points, sample_surface, surface_map

@@ -181,11 +181,11 @@ def test_what_is_no_episode_says_so(tmp_path: Path, meta: EpisodeMeta) -> None:
 
 
 def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: EpisodeMeta) -> None:
-    facts = encode_meta(replace(meta, attachments={}))
+    config = encode_meta(replace(meta, attachments={}))
     with (tmp_path / "zstd.mcap").open("wb") as file:
         stock = Writer(file, compression=CompressionType.ZSTD)
         stock.start()
-        stock.add_metadata(META, facts)
+        stock.add_metadata(META, config)
         stock.add_message(stock.register_channel("/step", "json", 0), 0, b"{}", 0)
         stock.finish()
     with pytest.raises(EpisodeError, match="mcap decompress"):
@@ -193,7 +193,7 @@ def test_other_formats_and_compressed_chunks_are_named(tmp_path: Path, meta: Epi
     with (tmp_path / "new.mcap").open("wb") as file:
         stock = Writer(file, compression=CompressionType.NONE)
         stock.start()
-        changed = {key: value for key, value in facts.items() if key != "crc32"} | {"format": "2"}
+        changed = {key: value for key, value in config.items() if key != "crc32"} | {"format": "2"}
         stock.add_metadata(META, sealed(changed))
         stock.finish()
     with pytest.raises(EpisodeError, match="episode format '2'"):

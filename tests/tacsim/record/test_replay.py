@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Arm, Clock, EndOfEpisode, Pose, TactileFrame, TactileSource
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError, EpisodeMeta, Step
 from tacsim.record.images import encode_png, reference_attachments
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
 from tacsim.record.writer import Recorder
-from tacsim.rigfile import ReplayArmFacts, ReplaySensorFacts
 
 
-def sensor_facts(source: Path | None, **more: object) -> ReplaySensorFacts:
-    return ReplaySensorFacts(driver="replay", source=None if source is None else str(source), **more)
+def sensor_facts(source: Path | None, **more: object) -> ReplaySensorConfig:
+    return ReplaySensorConfig(driver="replay", source=None if source is None else str(source), **more)
 
 
-def arm_facts(source: Path | None, **more: object) -> ReplayArmFacts:
-    return ReplayArmFacts(driver="replay", source=None if source is None else str(source), **more)
+def arm_facts(source: Path | None, **more: object) -> ReplayArmConfig:
+    return ReplayArmConfig(driver="replay", source=None if source is None else str(source), **more)
 
 
 @pytest.fixture
@@ -128,8 +128,8 @@ def test_the_only_sensor_of_an_episode_goes_by_any_name(
     spec = replace(meta.spec, sensors={"side": meta.spec.sensors["side"]}, arms=("upper",))
     step = make_step(0)
     blank = TactileFrame(np.full((24, 32, 3), 9, np.uint8), 0.0, 0)
-    facts = replace(meta, spec=spec, attachments=reference_attachments({"side": blank}))
-    with Recorder(tmp_path / "one.mcap", facts) as recorder:
+    config = replace(meta, spec=spec, attachments=reference_attachments({"side": blank}))
+    with Recorder(tmp_path / "one.mcap", config) as recorder:
         recorder.write(replace(step, frames={"side": step.frames["side"]}, arms={"upper": step.arms["upper"]}))
     sensor = ReplaySensor(sensor_facts(tmp_path / "one.mcap"), "finger", ReplayClock(0.1))
     assert np.array_equal(sensor.read(0).image, step.frames["side"].image)

@@ -62,10 +62,10 @@ def test_episode_comes_back_bit_for_bit(tmp_path: Path, meta: EpisodeMeta, make_
 
 @pytest.mark.parametrize("goal", [None, 7e-3, (0.1, 0.2, 0.3)])
 def test_facts_that_may_be_missing(tmp_path: Path, meta: EpisodeMeta, goal: float | tuple[float, ...] | None) -> None:
-    facts = replace(meta, goal=goal, task=None, attachments={}, versions={})
-    record(tmp_path / "e.mcap", facts, [])
+    config = replace(meta, goal=goal, task=None, attachments={}, versions={})
+    record(tmp_path / "e.mcap", config, [])
     episode = read_episode(tmp_path / "e.mcap")
-    assert same(episode.meta, facts)
+    assert same(episode.meta, config)
     assert episode.complete
     assert episode.steps == []
 

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.deploy import run_episode
+from robot.deploy.control_loop import run_episode
 from tacsim.interface import Action, Observation
-from tacsim.rigfile import RepositionFacts, SqueezeFacts
+from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.tasks import make_task
 from tacsim.tasks.grip import Grip
 from tacsim.tasks.reposition import centre_of_pressure, felt_position
 from tacsim.tasks.squeeze import felt_height
 
-SQUEEZE = SqueezeFacts(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
-REPOSITION = RepositionFacts(kind="reposition", goal=(2e-3, -1e-3), max_step=0.2e-3)
+SQUEEZE = SqueezeConfig(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
+REPOSITION = RepositionConfig(kind="reposition", goal=(2e-3, -1e-3), max_step=0.2e-3)
 
 
 def test_squeeze_reaches_the_goal_then_holds(open_springs: Any) -> None:
@@ -44,8 +44,8 @@ def test_squeeze_closes_alike_and_no_faster_than_half_of_max_step(open_springs: 
 
 def test_squeeze_shares_the_last_step_between_both_sensors(open_springs: Any) -> None:
     observation = open_springs().reset()
-    facts = SqueezeFacts(kind="squeeze", goal=felt_height(observation) - 0.06e-3, max_step=0.2e-3)
-    action = make_task(facts).scripted()(observation)
+    config = SqueezeConfig(kind="squeeze", goal=felt_height(observation) - 0.06e-3, max_step=0.2e-3)
+    action = make_task(config).scripted()(observation)
     for name, way in (("lower", 0.03e-3), ("upper", -0.03e-3)):
         target = action.tool[name]
         assert target is not None
@@ -54,8 +54,8 @@ def test_squeeze_shares_the_last_step_between_both_sensors(open_springs: Any) ->
 
 def test_through_passes_the_goal_at_the_goal(open_springs: Any) -> None:
     """The reward rises to a peak at the goal, then falls for good, at the full rate."""
-    facts = SqueezeFacts(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
-    rig, task = open_springs(), make_task(facts)
+    config = SqueezeConfig(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
+    rig, task = open_springs(), make_task(config)
     episode = run_episode(rig, task.scripted(through=True), task, 25)
     rewards = [step.reward for step in episode.steps]
     peak = int(np.argmax(rewards))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Truth
-from tacsim.rigfile import RepositionFacts, SqueezeFacts
+from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.tasks import judge, make_task, tolerance
 
 
@@ -17,7 +17,7 @@ def truth(height: float = 10e-3, x: float = 0.0, y: float = 0.0) -> Truth:
 
 
 def test_squeeze_counts_the_height_only() -> None:
-    task = make_task(SqueezeFacts(kind="squeeze", goal=7e-3, reward_scale=2e-3, success=0.1e-3))
+    task = make_task(SqueezeConfig(kind="squeeze", goal=7e-3, reward_scale=2e-3, success=0.1e-3))
     outcome = judge(task, truth(height=6.5e-3, x=1e-3), truth())
     assert outcome.distance == pytest.approx(0.5e-3)
     assert outcome.reward == pytest.approx(-0.25)
@@ -26,14 +26,14 @@ def test_squeeze_counts_the_height_only() -> None:
 
 
 def test_reposition_counts_the_way_in_the_plane_since_reset() -> None:
-    task = make_task(RepositionFacts(kind="reposition", goal=(2e-3, 1e-3)))
+    task = make_task(RepositionConfig(kind="reposition", goal=(2e-3, 1e-3)))
     outcome = judge(task, truth(height=3e-3, x=6e-3, y=2e-3), truth(x=1e-3, y=-2e-3))
     assert outcome.distance == pytest.approx(math.hypot(5e-3 - 2e-3, 4e-3 - 1e-3))
     assert judge(task, truth(x=3e-3, y=-1e-3), truth(x=1e-3, y=-2e-3)).distance == pytest.approx(0.0, abs=1e-12)
 
 
 def test_score_is_one_within_success_and_a_tenth_one_scale_further() -> None:
-    task = make_task(SqueezeFacts(kind="squeeze", goal=7e-3, reward_scale=1e-3, success=0.1e-3))
+    task = make_task(SqueezeConfig(kind="squeeze", goal=7e-3, reward_scale=1e-3, success=0.1e-3))
     assert judge(task, truth(height=7.1e-3 - 1e-12), truth()).score == 1.0
     assert judge(task, truth(height=8.1e-3), truth()).score == pytest.approx(0.1)
 

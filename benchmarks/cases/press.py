@@ -1,0 +1,235 @@
+"""Press group: a rigid indenter on one gel, against the limit of fine meshes, closed forms and the FFT layer solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.runner import Case
+from benchmarks.truth.limit import GRID_PITCH, load_limit, rms, surface_profile
+from tacsim.geometry.shapes import extent
+from tacsim.interface import Pose
+from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
+from tacsim.physics.oracle.layer import LayerContact, layer_contact
+from tacsim.physics.worlds.world import MoveStats
+
+if TYPE_CHECKING:
+    from tacsim.physics.worlds.press import PressWorld
+
+Float64 = NDArray[np.float64]
+
+RADIUS = 4e-3  # of the ball [m]
+DEPTH = 1e-3  # of the ball's tip below the undeformed surface [m]
+LIMIT = "limit of h = 0.25 and 0.125 mm"
+LAYER = "FFT elastic layer"
+FORCE_DEPTHS = (0.1e-3, 0.3e-3)
+FORCE_RATIOS = (0.45, 0.49)  # Poisson
+SLIDE, SLIDES = 0.5e-3, 20  # a plate slides so far at a time [m], and so often at most
+STAYS = 1e-3  # relative change of the force ratio in one slide
+
+
+def press_scene(
+    geometry: Shape, element: float, *, nu: float = 0.45, friction: float = 0.6, **settling: float
+) -> Scene:  # fmt: skip
+    """A gel of 20 x 20 x 4 mm, E = 0.145 MPa, under an indenter; the controller's defaults unless said (`settling`),
+    but a hold as long as it takes."""
+    return Scene.model_validate(
+        {
+            "body": None,
+            "indenter": Indenter(geometry=geometry, friction=friction),
+            "gel": Gel(material=GelMaterial(poisson_ratio=nu)),
+            "element_size": element,
+            "settling": {"max_substeps": 100_000, **settling},
+        }
+    )
+
+
+def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
+    """A new world, its indenter's tip driven to `depth` [m] below the undeformed gel."""
+    from tacsim.physics.worlds.press import PressWorld
+
+    assert scene.indenter is not None
+    world = PressWorld(scene)
+    pose = world.pose("indenter")
+    height = float(extent(scene.indenter.geometry)[2]) / 2 - depth
+    stats = world.move({"indenter": Pose(np.array([*pose.position[:2], height]), pose.quaternion)})
+    return world, stats
+
+
+USUAL = FASTEST_MACH  # the controller's default for what does not yield: a tenth of the shear wave's speed at nu 0.45
+# Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
+OTHERS = (0.015, 0.05, 0.1)
+
+
+def profile(world: PressWorld) -> Float64:
+    return surface_profile(world.surface("lower"))
+
+
+def sphere_press(element: float, repeat: int) -> list[Measurement]:
+    """Scene to settled surface at the controller's defaults, against the limit of fine meshes."""
+    timing, (world, stats) = timed(partial(press, press_scene(Sphere(radius=RADIUS), element), DEPTH), repeat)
+    difference = profile(world) - load_limit().profile
+    return [
+        Measurement(
+            timing, rms(difference) * 1e6, "µm rms", LIMIT, substeps=stats.substeps,
+            figures={"largest_um": _largest(difference), "residual": stats.residual, "overlap_um": stats.overlap * 1e6},
+            note="" if stats.settled else "not settled",
+        )
+    ]  # fmt: skip
+
+
+def quasi_static(repeat: int) -> list[Measurement]:
+    """The same mesh at the default tolerance against one converged; and at two speeds."""
+    ball, element = Sphere(radius=RADIUS), 0.5e-3
+    timing, (usual, stats) = timed(partial(press, press_scene(ball, element), DEPTH), repeat)
+    reference, _ = press(press_scene(ball, element, mach=0.02, tolerance=1e-5), DEPTH)
+    difference = profile(usual) - profile(reference)
+    forces = [abs(float(w.wrench("lower")[2])) for w in (usual, reference)]
+    rows = [
+        Measurement(
+            timing, rms(difference) * 1e6, "µm rms", "same mesh, Mach 0.02, tolerance 1e-5", "tolerance 1e-2",
+            stats.substeps, {"largest_um": _largest(difference), "force_percent": _percent(*forces)},
+        )
+    ]  # fmt: skip
+    for mach in OTHERS:
+        scene = press_scene(ball, element, mach=mach)
+        timing, (other, stats) = timed(partial(press, scene, DEPTH), 1, warm=lambda: None)
+        difference = profile(other) - profile(usual)
+        rows.append(
+            Measurement(
+                timing, _largest(difference), "µm at most", f"the same press at Mach {USUAL:g}, tolerance 1e-2",
+                f"two speeds, Mach {USUAL:g} and {mach:g}", stats.substeps, {"rms_um": rms(difference) * 1e6},
+                "seconds: at the second speed",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def sphere_force(element: float, repeat: int) -> list[Measurement]:
+    """Force of a shallow frictionless ball against the FFT layer."""
+    rows: list[Measurement] = []
+    for nu in FORCE_RATIOS:
+        scene = press_scene(Sphere(radius=RADIUS), element, nu=nu, friction=0.0, tolerance=1e-3)
+        for depth in FORCE_DEPTHS:
+            # kernels are warm after the first press
+            warm = None if not rows else (lambda: None)
+            timing, (world, stats) = timed(partial(press, scene, depth), 1, warm)  # sphere_press compares seconds
+            truth = layer(_ball_gap, depth, nu).force
+            rows.append(_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}"))
+    return rows
+
+
+def flat_punch(element: float, repeat: int) -> list[Measurement]:
+    """Force of a frictionless flat cylinder, radius 3 mm, depth 0.1 mm, against the FFT layer."""
+    cylinder, depth, nu = Cylinder(radius=3e-3, height=4e-3), 0.1e-3, 0.45
+    scene = press_scene(cylinder, element, nu=nu, friction=0.0, tolerance=1e-3)
+    timing, (world, stats) = timed(partial(press, scene, depth), repeat)
+    truth = layer(_punch_gap, depth, nu, pixels=768).force
+    return [_force_row(timing, world, stats, truth, f"depth {depth * 1e3:g} mm, nu {nu:g}")]
+
+
+def sliding_force(element: float, repeat: int) -> list[Measurement]:
+    """A plate wider than the gel slides over it until the ratio of forces stays: then it is the coefficient.
+
+    No edge ploughs, but the gel shears first, and its parts slip one after the other.
+    """
+    friction, depth = 0.3, 0.3e-3
+    scene = press_scene(Box(size=(50e-3, 30e-3, 4e-3)), element, friction=friction, tolerance=1e-3)
+
+    def slide() -> tuple[PressWorld, list[float], int]:
+        world, _ = press(scene, depth)
+        ratios, substeps = [0.0], 0
+        while len(ratios) <= SLIDES:
+            pose = world.pose("indenter")
+            substeps += world.move({"indenter": Pose(pose.position + [SLIDE, 0, 0], pose.quaternion)}).substeps
+            force = world.wrench("lower")
+            ratios.append(abs(float(force[0] / force[2])))
+            if abs(ratios[-1] - ratios[-2]) < STAYS * ratios[-1]:
+                break
+        return world, ratios, substeps
+
+    timing, (world, ratios, substeps) = timed(slide, repeat)
+    way = (len(ratios) - 1) * SLIDE
+    figures = {"ratio": ratios[-1], "normal_n": abs(float(world.wrench("lower")[2])), "way_mm": way * 1e3}
+    note = "" if len(ratios) <= SLIDES else f"the ratio still changes after {way * 1e3:g} mm"
+    return [
+        Measurement(timing, _percent(ratios[-1], friction), "%", "Coulomb's law", "coefficient 0.3", substeps, figures,
+                    note)
+    ]  # fmt: skip
+
+
+def layer_press(repeat: int) -> list[Measurement]:
+    """The independent solver at the deep press: small strain and no friction, hence its error."""
+    timing, contact = timed(partial(layer, _ball_gap, DEPTH, 0.45), repeat)
+    n = contact.displacement.shape[0]
+    limit = load_limit()
+    step = GRID_PITCH / contact.pixel  # both grids have a point in the middle of the contact
+    index = n // 2 + np.rint((np.arange(limit.profile.shape[0]) - limit.profile.shape[0] // 2) * step).astype(int)
+    difference = -contact.displacement[np.ix_(index, index)] - limit.profile
+    return [
+        Measurement(timing, rms(difference) * 1e6, "µm rms", LIMIT, figures={"largest_um": _largest(difference)},
+                    note="small strain, frictionless, gel without rim")
+    ]  # fmt: skip
+
+
+def tacchi_press(repeat: int) -> list[Measurement]:
+    """The same press at the numbers that Tacchi publishes: particles, sticky contact through the grid, 200 mm/s.
+    Its kernels are its own, since those of `seed` know only two neo-Hookean gels that close round a body, driven by
+    their backings; transfers (APIC), update of F and contact through the grid are the same.
+    """
+    from benchmarks.truth import tacchi  # compiles nothing before it is asked for
+
+    return tacchi.sphere_press(repeat)
+
+
+def layer(
+    gap_of_radius: Callable[[Float64], Float64], depth: float, nu: float, pixels: int = 512, thickness: float = 4e-3
+) -> LayerContact:
+    """The FFT solver on a periodic square of 32 mm, E = 0.145 MPa; lengths in m."""
+    side = 32e-3
+    x = (np.arange(pixels) - pixels // 2) * side / pixels
+    gap = gap_of_radius(np.hypot(x[:, None], x[None, :]))
+    return layer_contact(gap, depth, side / pixels, thickness, 0.145e6, nu)
+
+
+def _ball_gap(r: Float64) -> Float64:
+    return np.where(r < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - r**2, 0.0)), 1.0)
+
+
+def _punch_gap(r: Float64) -> Float64:
+    return np.where(r < 3e-3, 0.0, 1.0)
+
+
+def _force_row(timing: Timing, world: PressWorld, stats: MoveStats, truth: float, variant: str) -> Measurement:
+    force = abs(float(world.wrench("lower")[2]))
+    figures = {"force_n": force, "truth_n": truth}
+    return Measurement(timing, _percent(force, truth), "%", LAYER, variant, stats.substeps, figures)
+
+
+def _percent(value: float, truth: float) -> float:
+    return abs(value / truth - 1.0) * 100.0
+
+
+def _largest(difference: Float64) -> float:
+    """[µm]"""
+    return float(np.abs(difference).max()) * 1e6
+
+
+CASES = (
+    *(Case("press", "sphere_press", "tacsim", f"h {h:g} mm", partial(sphere_press, h * 1e-3)) for h in (1.0, 0.5)),
+    Case("press", "sphere_press", "tacsim", "h 0.25 mm", partial(sphere_press, 0.25e-3), long=True),
+    Case("press", "sphere_press", "layer", "pixel 0.0625 mm", layer_press),
+    Case(
+        "press", "sphere_press", "tacchi-settings", "dx 0.129 mm, 214221 particles", tacchi_press, baseline=True
+    ),
+    Case("press", "quasi_static", "tacsim", "h 0.5 mm", quasi_static),
+    Case("press", "sphere_force", "tacsim", "h 0.5 mm", partial(sphere_force, 0.5e-3)),
+    Case("press", "sphere_force", "tacsim", "h 0.25 mm", partial(sphere_force, 0.25e-3), long=True),
+    Case("press", "flat_punch", "tacsim", "h 0.5 mm", partial(flat_punch, 0.5e-3)),
+    Case("press", "sliding_force", "tacsim", "h 1 mm", partial(sliding_force, 1e-3)),
+)  # fmt: skip

@@ -1,0 +1,238 @@
+"""Real group: presses of a ball on a real sensor, predicted by a calibration that has not seen them; and the labels of
+such sets.
+
+A folder of frames may carry its own labels, `balls.yaml`; without, those of public sets are taken
+(`references/balls.yaml`). Nothing but ball radius and pixel pitch is told: circles, skirt and light are found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import TYPE_CHECKING, Annotated, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from benchmarks.cases.real.labels import BadData, Image, Positive
+from benchmarks.harness.measure import Measurement, Timing
+from benchmarks.harness.runner import Case
+from tacsim.models.quantity import Config
+from tacsim.record.episode import EpisodeError
+
+if TYPE_CHECKING:
+    from calibration.bundle import Calibration
+    from calibration.light.ball_press import Fit, Score
+
+CASE = "ball_presses"
+OWN = "balls.yaml"
+SHIPPED = Path(__file__).parents[2] / "references" / OWN
+FEWEST = 3  # presses
+LARGEST = 1 << 30  # [bytes] of an archive
+
+Frames = tuple[tuple[str, Image], ...]
+
+
+class BallSet(Config):
+    """Presses of one ball on one sensor, and a picture without contact."""
+
+    name: str
+    source: str = ""
+    frames: tuple[str, ...] = ()  # patterns below the user's folder; the first that finds any counts
+    backgrounds: tuple[str, ...] = ()  # seen from the folder of the frames; the first that exists counts
+    archive: tuple[str, ...] = ()  # or an .npz with `images` (n, H, W, 3) and `background` (H, W, 3), uint8
+    blue_first: bool = False  # of an archive: its colours stand as B, G, R
+    ball_radius: Positive  # [m]
+    pixel_pitch: Positive  # [m]
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if bool(self.frames) == bool(self.archive):
+            raise ValueError("give either frames (patterns of pictures) or archive (an .npz)")
+        if self.frames and not self.backgrounds:
+            raise ValueError("give backgrounds: the picture without contact")
+        return self
+
+    @property
+    def wanted(self) -> str:
+        """What is looked for, in words."""
+        return " or ".join(self.frames or self.archive)
+
+
+class BallSets(Config):
+    """What a labels file holds."""
+
+    sets: Annotated[tuple[BallSet, ...], Field(min_length=1)]
+
+
+def read_sets(folder: Path) -> tuple[BallSet, ...]:
+    """The sets that hold for `folder`. Raises ConfigError for labels with mistakes."""
+    from tacsim.config import load
+
+    own = folder / OWN
+    return load(BallSets, own if own.is_file() else SHIPPED).sets
+
+
+def is_there(folder: Path, of: BallSet) -> bool:
+    """True where `folder` holds frames of the set."""
+    return any(next(folder.rglob(pattern), None) is not None for pattern in of.frames or of.archive)
+
+
+def read_balls(folder: Path, of: BallSet) -> tuple[Image, Frames]:
+    """The picture without contact, and names and pictures of the presses, (H, W, 3) RGB. Raises BadData."""
+    reference, frames = _of_archive(folder, of) if of.archive else _of_pictures(folder, of)
+    if len(frames) < FEWEST:
+        raise BadData(f"{of.name}: {len(frames)} presses; to leave one out, {FEWEST} are the least")
+    return reference, frames
+
+
+@lru_cache(maxsize=4)
+def calibrated(folder: Path, of: BallSet) -> tuple[Fit, float, float]:
+    """The calibration by all presses of a set, and the wall and processor time it took [s], leaving out included.
+    Raises BadData."""
+    from calibration.light.ball_press import BadPresses, calibrate_light
+
+    reference, frames = read_balls(folder, of)
+    wall, cpu = perf_counter(), process_time()
+    try:
+        fit = calibrate_light(reference, frames, of.ball_radius / of.pixel_pitch)
+    except BadPresses as error:
+        raise BadData(f"{of.name}: {error}") from None
+    return fit, perf_counter() - wall, process_time() - cpu
+
+
+def bundle(of: BallSet, fit: Fit) -> Calibration:
+    """What the calibrator would write of a fit."""
+    from calibration.bundle import FORMAT, Calibration, Provenance
+    from tacsim.models.sensor import SensorGeometry
+
+    rows, columns, _ = fit.reference.shape
+    return Calibration(
+        format=FORMAT,
+        serial="bench",
+        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=of.pixel_pitch),
+        gel_size=(columns * of.pixel_pitch, rows * of.pixel_pitch),
+        forward=fit.forward,
+        inverse=fit.inverse,
+        skirt_length=fit.skirt.length * of.pixel_pitch,
+        skirt_fraction=fit.skirt.fraction,
+        provenance=Provenance(
+            made="", software="tacsim", ball_radius=of.ball_radius, frames=tuple(press.name for press in fit.presses)
+        ),
+        reference="0" * 64,
+    )
+
+
+def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
+    """Each press of a ball predicted from all others: picture and normals. Seconds: to calibrate, leaving out too."""
+    fit, wall, cpu = calibrated(folder, of)
+    if not fit.scores:
+        raise BadData(f"{of.name}: one press alone can be used; the others: {fit.left_out}")
+    scores, left = fit.scores, f"{len(fit.left_out)} frames left out" if fit.left_out else ""
+    timing = Timing((wall,), cpu)
+    figures = {
+        "ncc": _mean(scores, "correlation"),
+        "null_grey": _mean(scores, "nothing"),
+        **_interval("grey", [score.error for score in scores]),
+        "presses": float(len(scores)),
+        "left_out": float(len(fit.left_out)),
+        "weights": 3.0 * fit.order.terms,
+        "steepest": fit.steepest,
+    }
+    picture = Measurement(
+        timing, _mean(scores, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; light "
+        "by all other presses, circles and skirt by all", f"{of.name}: picture", None, figures, left,
+    )  # fmt: skip
+    flat = [float(np.degrees(np.arctan(_usual_slope(score, of)))) for score in scores]
+    figures = {
+        "null_deg": float(np.mean(flat)),
+        **_interval("deg", [score.angle for score in scores]),
+        "untouched_deg": _mean(scores, "untouched_angle"),
+    }
+    normals = Measurement(
+        timing, _mean(scores, "angle"), "deg", "normals of ball and skirt inside the contact circle",
+        f"{of.name}: normals", None, figures, left,
+    )  # fmt: skip
+    return [picture, normals]
+
+
+def cases(folder: Path) -> tuple[Case, ...]:
+    """A case a set, all but the first long; one whose frames are not there says so. Raises ConfigError."""
+    sets = read_sets(folder)
+    there = [of for of in sets if is_there(folder, of)]
+    return tuple(
+        Case(
+            "real", CASE, "tacsim", f"{of.pixel_pitch * 1e3:.3g} mm a pixel", partial(ball_presses, folder, of),
+            cpu=True,
+            long=of in there[1:],
+            missing="" if of in there else f"{of.name}: no {of.wanted} below {folder}",
+        )
+        for of in sets
+    )  # fmt: skip
+
+
+def _mean(scores: Sequence[Score], what: str) -> float:
+    return float(np.mean([getattr(score, what) for score in scores]))
+
+
+def _interval(unit: str, values: Sequence[float]) -> dict[str, float]:
+    """Median, and 95 % interval of the mean by bootstrap over presses."""
+    from calibration.compare.compare import bootstrap
+
+    low, high = bootstrap(np.array(values))
+    return {f"median_{unit}": float(np.median(values)), f"low_{unit}": low, f"high_{unit}": high}
+
+
+def _usual_slope(score: Score, of: BallSet) -> float:
+    """Slope of the ball half-way between the middle and the rim, by area: what a flat guess misses."""
+    ball, r = of.ball_radius / of.pixel_pitch, score.circle.radius / np.sqrt(2)
+    return float(r / np.sqrt(ball**2 - r**2))
+
+
+def _of_pictures(folder: Path, of: BallSet) -> tuple[Image, Frames]:
+    paths = next((found for pattern in of.frames if (found := sorted(folder.rglob(pattern)))), [])
+    homes = {path.parent for path in paths}
+    if not paths:
+        raise BadData(f"{folder} and the folders below it hold no {of.wanted}")
+    if len(homes) > 1:
+        raise BadData(f"{of.name} is there twice: {' and '.join(map(str, sorted(homes)))}. Name the one that is meant")
+    home = homes.pop()
+    background = next((path for name in of.backgrounds if (path := home / name).is_file()), None)
+    if background is None:
+        raise BadData(f"{home} has no frame without contact; looked for {', '.join(of.backgrounds)}")
+    return _read(background), tuple((path.name, _read(path)) for path in paths if path != background)
+
+
+def _of_archive(folder: Path, of: BallSet) -> tuple[Image, Frames]:
+    path = next((found for pattern in of.archive for found in sorted(folder.rglob(pattern))), None)
+    if path is None:
+        raise BadData(f"{folder} and the folders below it hold no {of.wanted}")
+    try:
+        if path.stat().st_size > LARGEST:
+            raise BadData(f"{path} is larger than {LARGEST >> 30} GiB")
+        with np.load(path, allow_pickle=False) as archive:
+            images, reference = archive["images"], archive["background"]
+    except (OSError, ValueError, KeyError) as error:
+        raise BadData(f"{path}: needs arrays `images` and `background` without pickles: {error}") from None
+    if images.ndim != 4 or images.shape[1:] != reference.shape or reference.shape[-1] != 3:
+        raise BadData(
+            f"{path}: `images` are {images.shape}, `background` {reference.shape}; (n, H, W, 3) and (H, W, 3)"
+        )
+    if images.dtype != np.uint8 or reference.dtype != np.uint8:
+        raise BadData(f"{path}: `images` and `background` must be uint8")
+    step = -1 if of.blue_first else 1
+    return (
+        np.ascontiguousarray(reference[..., ::step]),
+        tuple((f"press {k}", np.ascontiguousarray(image[..., ::step])) for k, image in enumerate(images)),
+    )
+
+
+def _read(path: Path) -> Image:
+    from tacsim.record.images import read_image
+
+    try:
+        return read_image(path)
+    except EpisodeError as error:
+        raise BadData(str(error)) from None

@@ -1,0 +1,193 @@
+"""Real group: balls pressed to a known depth, simulated from that depth alone, and seen through the light of a
+calibration by other presses; pictures and heights against the real ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cases.real import balls
+from benchmarks.cases.real.balls import BallSet
+from benchmarks.cases.real.labels import BadData, Image, Press, Presses, read_frames, read_labels
+from benchmarks.cases.real.real import ELEMENT, ball_scene
+from benchmarks.harness.measure import Measurement, Timing
+from benchmarks.harness.runner import Case
+from tacsim.interface import Pose
+from tacsim.models.scene import GelSurface
+from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.physics.worlds.world import World, make_world
+
+if TYPE_CHECKING:
+    from calibration.light.ball_press import Fit
+
+Mask = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+
+CASE = "known_depth"
+GRID = CanonicalGrid()
+REACH = 1.3  # the mask of a picture reaches this far, in radii of the cap that the rest plane cuts off the ball
+HEIGHT_REACH = 1.5  # heights are compared this far from the middle, in radii of Hertz' contact
+
+
+def light_of(folder: Path, labels: Presses) -> BallSet:
+    """The ball presses that calibrate the sensor of the known depths. Raises BadData, ConfigError."""
+    found = next((of for of in balls.read_sets(folder) if of.name == labels.light), None)
+    if found is None:
+        raise BadData(f"the labels of '{labels.name}' name no ball presses that calibrate its light (light:)")
+    if not balls.is_there(folder, found):
+        raise BadData(f"no ball presses to calibrate the light by: no {found.wanted} below {folder}")
+    return found
+
+
+def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
+    """A ball pressed to a real press's depth, in calibrated light: picture and height. Seconds: to press and draw."""
+    from calibration.light.circle import NoCircle, contact_circle
+
+    labels = read_labels(folder)
+    of = light_of(folder, labels)
+    reference, frames = read_frames(folder, labels)
+    fit, _, _ = balls.calibrated(folder, of)
+    world = make_world(ball_scene(labels, ball, labels.gel_thickness[0], ELEMENT))
+    camera = Camera(of, fit, labels.gel_size, reference)
+    rows = []
+    for press in sorted((p for p in frames if p.ball_radius == ball), key=lambda p: p.depth):
+        try:
+            at = contact_circle(frames[press], reference, ball / labels.pixel_pitch)
+        except NoCircle as error:
+            raise BadData(f"the real frame of {press.name}: {error}") from None
+        wall, cpu = perf_counter(), process_time()
+        stats = _deeper(world, ball, press.depth)
+        surface = moved(world.surface("lower"), (at.x, at.y), camera.model)
+        image = camera.see(surface)
+        timing = Timing((perf_counter() - wall,), process_time() - cpu)
+        cap = float(np.sqrt(2 * ball * press.depth - press.depth**2)) / labels.pixel_pitch
+        mask = circle_mask(reference.shape[:2], at.x, at.y, REACH * cap)
+        figures = pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
+        note = "" if stats else "not settled"
+        rows.append(
+            Measurement(
+                timing, figures.pop("grey"), "grey", "the real frame within 1.3 radii of the cap",
+                f"{press.name}: picture", None, figures, note,
+            )
+        )  # fmt: skip
+        rows.append(_height(camera, surface, frames[press], press, (at.x, at.y), timing))
+    return rows
+
+
+class Camera:
+    """The twin of a calibrated sensor: draws surfaces, and finds them in real frames."""
+
+    def __init__(self, of: BallSet, fit: Fit, gel_size: tuple[float, float], reference: Image) -> None:
+        from calibration.bundle import sensor_model, write_bundle
+        from calibration.normaliser import for_calibrated
+        from tacsim.interface import TactileFrame
+        from tacsim.optics.render import Renderer
+
+        calibration = balls.bundle(of, fit)
+        with TemporaryDirectory() as place:
+            write_bundle(Path(place), calibration, reference)
+            self.model = sensor_model(Path(place))
+            self._render = Renderer(self.model, gel_size)
+        self._normalise = for_calibrated(calibration, GRID)
+        self._normalise.take_reference(TactileFrame(reference, 0.0, 0))
+
+    def see(self, surface: GelSurface) -> Image:
+        return self._render(surface)
+
+    def height(self, image: Image) -> Float64:
+        """(h, w) [m] on the canonical grid, as the inverse model finds it."""
+        from tacsim.interface import TactileFrame
+
+        found = self._normalise(TactileFrame(image, 0.0, 0), 0.0).height
+        assert found is not None
+        return found.astype(np.float64)
+
+
+def moved(surface: GelSurface, to: tuple[float, float], model: SensorModel) -> GelSurface:
+    """The surface with the middle of its gel at this pixel."""
+    (u0, v0), pitch = model.geometry.principal, model.geometry.pixel_pitch
+    x, y = (to[0] - u0) * pitch, (to[1] - v0) * pitch
+    return replace(surface, origin=(surface.origin[0] + x, surface.origin[1] + y))
+
+
+def circle_mask(shape: Iterable[int], x: float, y: float, radius: float) -> Mask:
+    """(H, W) within `radius` of x, y [px]."""
+    rows, columns = shape
+    v, u = np.mgrid[:rows, :columns]
+    return np.asarray(np.hypot(u - x, v - y) < radius)
+
+
+def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[str, float]:
+    """How alike two pictures are where `mask`, and what the picture without contact would score."""
+    from calibration.compare import metrics
+
+    still = reference.astype(np.float64)
+    return {
+        "grey": metrics.mean_absolute_error(image, real, mask),
+        "null_grey": metrics.mean_absolute_error(reference, real, mask),
+        "ssim": metrics.structural_similarity(image, real, mask),
+        "null_ssim": metrics.structural_similarity(reference, real, mask),
+        "ncc": metrics.correlation(image - still, real - still, mask),
+    }
+
+
+def _height(
+    camera: Camera, surface: GelSurface, real: Image, press: Press, at: tuple[float, float], timing: Timing
+) -> Measurement:
+    """Of the surface that the inverse finds in the real frame against the simulated one."""
+    from tacsim.optics.surface import surface_map
+
+    (u0, v0), pitch = camera.model.geometry.principal, camera.model.geometry.pixel_pitch
+    scale = pitch / GRID.pitch
+    x, y = (at[0] - u0) * scale + (GRID.columns - 1) / 2, (at[1] - v0) * scale + (GRID.rows - 1) / 2
+    near = circle_mask(
+        (GRID.rows, GRID.columns), x, y, HEIGHT_REACH * np.sqrt(press.ball_radius * press.depth) / GRID.pitch
+    )
+    ours = surface_map(surface, GRID, None).height.astype(np.float64)
+    found = camera.height(real)
+    off = (found - ours)[near]
+    percent = 100.0 / press.depth
+    shape = float(np.sqrt(((off - np.median(off)) ** 2).mean())) * percent
+    figures = {
+        "whole_percent": float(np.sqrt((off**2).mean())) * percent,
+        "null_percent": float(np.sqrt(((ours[near] - np.median(ours[near])) ** 2).mean())) * percent,
+        "peak_ratio": float(found[near].max() / ours[near].max()),
+        "depth_mm": press.depth * 1e3,
+    }
+    return Measurement(
+        timing, shape, "% of depth", "the simulated surface at this depth, rms within 1.5 radii, median removed",
+        f"{press.name}: height", None, figures,
+    )  # fmt: skip
+
+
+def _deeper(world: World, ball: float, depth: float) -> bool:
+    pose = world.pose("indenter")
+    return world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)}).settled
+
+
+def cases(folder: Path) -> tuple[Case, ...]:
+    """A case a ball; one that lacks frames or light says so. Raises ConfigError."""
+    labels = read_labels(folder)
+    try:
+        light_of(folder, labels)
+        frames = read_frames(folder, labels)[1]
+        lacking = ""
+    except BadData as error:
+        frames, lacking = {}, str(error)
+    return tuple(
+        Case(
+            "real", CASE, "tacsim", f"ball R {ball * 1e3:g} mm, h {ELEMENT * 1e3:g} mm",
+            partial(known_depth, folder, ball),
+            missing=lacking or ("" if any(p.ball_radius == ball for p in frames) else "no frame of this ball"),
+        )
+        for ball in labels.balls
+    )  # fmt: skip

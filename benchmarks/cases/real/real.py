@@ -1,0 +1,163 @@
+"""Real group: contact radius of balls on a real sensor against the simulated gel; the user brings the frames.
+
+Two comparisons a press. `image`: the real frame against our rendered one, the circle found in both by the same fit
+(`calibration/light/circle.py`). `pressure`: the radius of the simulated contact itself, against the radius that the
+labels give.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cases.press import layer, press
+from benchmarks.cases.real.labels import BadData, Image, Presses, read_frames, read_labels
+from benchmarks.harness.measure import Measurement, timed
+from benchmarks.harness.runner import Case
+from calibration.light.circle import NoCircle, contact_circle
+from tacsim.interface import Pose
+from tacsim.models.scene import Gel, GelMaterial, Indenter, Scene, Settling, Sphere
+from tacsim.physics.worlds.world import MoveStats, World, make_world
+
+Float64 = NDArray[np.float64]
+
+ELEMENT = 0.5e-3  # [m]
+LAYER_PIXELS = 512
+CASE = "contact_radius"
+
+
+def contact_radius(folder: Path, ball: float, thickness: float, element: float, repeat: int) -> list[Measurement]:
+    """Balls pressed to the depths of real presses: radius of the contact, ours against the real one."""
+    labels = read_labels(folder)
+    background, frames = read_frames(folder, labels)
+    scene = ball_scene(labels, ball, thickness, element)
+    press(ball_scene(labels, ball, 2e-3, 1e-3), 0.05e-3)  # compiles
+    world = make_world(scene)
+    camera = Camera(labels, background)
+    before = camera.see(world)
+    rows = []
+    for at in sorted((p for p in labels.presses if p.ball_radius == ball), key=lambda p: p.depth):
+        timing, stats = timed(partial(_deeper, world, ball, at.depth), 1, warm=lambda: None)
+        pressed = pressed_radius(world) / labels.pixel_pitch
+        figures = {
+            "ball_radius_mm": ball * 1e3,
+            "depth_mm": at.depth * 1e3,
+            "thickness_mm": thickness * 1e3,
+            "depth_uncertainty_mm": labels.depth_uncertainty * 1e3,
+            "pressure_px": pressed,
+            **{f"{name}_px": value / labels.pixel_pitch for name, value in theories(ball, at.depth, thickness).items()},
+        }
+        note = "" if stats.settled else "not settled"
+        if at in frames:
+            real = camera.radius(frames[at], background, ball, f"the real frame of {at.name}")
+            ours = camera.radius(camera.see(world), before, ball, f"our image of {at.name}")
+            figures |= {"real_px": real, "image_px": ours}
+            rows.append(
+                Measurement(
+                    timing, abs(ours - real), "px", "the real frame, circle by the same fit", f"{at.name}: image",
+                    stats.substeps, figures, note,
+                )
+            )  # fmt: skip
+        if at.radius_px is not None:
+            rows.append(
+                Measurement(
+                    timing, abs(pressed - at.radius_px), "px", "contact radius in the labels", f"{at.name}: pressure",
+                    stats.substeps, {**figures, "label_px": at.radius_px}, note,
+                )
+            )  # fmt: skip
+    return rows
+
+
+def ball_scene(labels: Presses, ball: float, thickness: float, element: float) -> Scene:
+    """The default gel in the size of the labels, under a ball."""
+    return Scene(
+        body=None,
+        indenter=Indenter(geometry=Sphere(radius=ball)),
+        gel=Gel(size=(*labels.gel_size, thickness)),
+        element_size=element,
+        settling=Settling(mach=0.05),
+    )
+
+
+def _deeper(world: World, ball: float, depth: float) -> MoveStats:
+    pose = world.pose("indenter")
+    return world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)})
+
+
+def pressed_radius(world: World) -> float:
+    """Radius of a ball's contact [m]: that of the Hertz pressure with the same second moment, a^2 = 5/2 <r^2>.
+
+    r is taken where the surface has moved to. Single points of the quadrature may lift off within the contact, so
+    their area is no measure. Against the FFT layer's area the moment is 0.3 px of 0.06 mm off at most, 1 mm deep.
+    """
+    from tacsim.optics.spline import displacement_and_jacobian
+
+    surface = world.surface("lower")
+    pressure = world.snapshot()["pressure"].astype(np.float64)
+    nodes = surface.displacement.shape[:2]
+    lines = [
+        start + (np.arange(count) + 0.5) * (n - 1) * surface.spacing / count
+        for start, n, count in zip(surface.origin, nodes, pressure.shape, strict=True)
+    ]
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
+    displacement, _ = displacement_and_jacobian(surface, points)
+    away = points + displacement[:, :2] - world.pose("indenter").position[:2]
+    weight = pressure.ravel()
+    if not weight.sum() > 0:
+        raise RuntimeError("the ball does not touch the gel")
+    return float(np.sqrt(2.5 * (weight * (away**2).sum(axis=1)).sum() / weight.sum()))
+
+
+def theories(ball: float, depth: float, thickness: float) -> dict[str, float]:
+    """Contact radius [m] by others: the cap cut off a ball by the rest plane (images made from a depth map), Hertz on a
+    half-space, and the FFT layer."""
+
+    def gap(r: Float64) -> Float64:
+        return np.where(r < ball, ball - np.sqrt(np.maximum(ball**2 - r**2, 0.0)), 1.0)
+
+    contact = layer(gap, depth, GelMaterial().poisson_ratio, LAYER_PIXELS, thickness)
+    return {
+        "cap": float(np.sqrt(2 * ball * depth - depth**2)),
+        "hertz": float(np.sqrt(ball * depth)),
+        "layer": float(np.sqrt((contact.pressure > 0).sum() / np.pi)) * contact.pixel,
+    }
+
+
+class Camera:
+    """Our image of the gel, with as many pixels and the same pitch as the real one, and circles in such images."""
+
+    def __init__(self, labels: Presses, like: Image) -> None:
+        from tacsim.models.sensor import SensorGeometry, SensorModel
+        from tacsim.optics.render import Renderer
+
+        rows, columns, _ = like.shape
+        geometry = SensorGeometry(width=columns, height=rows, pixel_pitch=labels.pixel_pitch)
+        self._pitch = labels.pixel_pitch
+        self._render = Renderer(SensorModel(geometry=geometry), labels.gel_size)
+
+    def see(self, world: World) -> Image:
+        return self._render(world.surface("lower"))
+
+    def radius(self, image: Image, background: Image, ball: float, what: str) -> float:
+        """[px]. Raises BadData that says which image shows no contact."""
+        try:
+            return contact_circle(image, background, ball / self._pitch).radius
+        except NoCircle as error:
+            raise BadData(f"{what}: {error}") from None
+
+
+def cases(folder: Path) -> tuple[Case, ...]:
+    """A case for each ball and gel. Raises BadData, ConfigError."""
+    labels = read_labels(folder)
+    read_frames(folder, labels)  # all mistakes before the first press
+    return tuple(
+        Case(
+            "real", CASE, "tacsim", f"ball R {ball * 1e3:g} mm, gel {thickness * 1e3:g} mm, h {ELEMENT * 1e3:g} mm",
+            partial(contact_radius, folder, ball, thickness, ELEMENT), long=thickness != labels.gel_thickness[0],
+        )
+        for thickness in labels.gel_thickness
+        for ball in labels.balls
+    )  # fmt: skip

@@ -1,0 +1,145 @@
+"""Real group: would a policy notice that its frames are simulated? Presses of our gel beside the same presses of a real
+one, each seen through a calibration by other presses.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.cases.real import balls
+from benchmarks.cases.real.balls import BallSet, Frames
+from benchmarks.cases.real.depths import GRID, light_of
+from benchmarks.cases.real.labels import BadData, Image, read_labels
+from benchmarks.harness.measure import Measurement, Timing
+from benchmarks.harness.runner import Case, lacking
+from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
+
+if TYPE_CHECKING:
+    from calibration.bundle import Calibration
+    from calibration.compare.compare import Comparison
+
+CASE = "invariance"
+FOLDS = 5
+LEAST_PRESSES = 10
+ELEMENT = 0.5e-3  # [m]
+
+
+def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], repeat: int) -> list[Measurement]:
+    """Real presses beside the same by our gel, in five folds: distances, a classifier, drift. Seconds: of a press.
+
+    *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: our simulation says it.
+    """
+    reference, frames = balls.read_balls(folder, of)
+    if len(frames) < LEAST_PRESSES:
+        raise BadData(f"{of.name}: {len(frames)} presses; {LEAST_PRESSES} are the least that say something")
+    wall, cpu, pressed, notes = 0.0, 0.0, 0, []
+    ways: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
+    for fold in range(FOLDS):
+        train = tuple(frame for k, frame in enumerate(frames) if k % FOLDS != fold)
+        both, calibration, taken, said = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
+        wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(both["pictures"].pairs)
+        notes += said
+        for way, comparison in both.items():
+            ways[way].append((comparison, calibration))
+    timing, note = Timing((wall / pressed,), cpu / pressed), "; ".join(notes)
+    rows = []
+    for way, folds in ways.items():
+        rows += _rows(way, folds, timing, note)
+    return rows
+
+
+def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: Timing, note: str) -> list[Measurement]:
+    from calibration.compare.invariance import pooled_invariance
+
+    report = pooled_invariance(folds, GRID)
+    rows = [
+        Measurement(
+            timing, view.rho, "x", "the distance of two real presses that are neighbours in size; 1 is as far",
+            f"{way}: rho, {view.view}", None,
+            {
+                "rho_low": view.rho_low, "rho_high": view.rho_high, "auc": view.auc, "auc_low": view.auc_low,
+                "auc_high": view.auc_high, "distance": view.distance, "neighbour": view.neighbour,
+                "presses": float(report.presses),
+            },
+            note,
+        )
+        for view in report.views
+        if way == "pictures" or view.view in ("gradient", "height")
+    ]  # fmt: skip
+    rows += [
+        Measurement(
+            timing, max(0.0, drift.fresh), "deg more", "the same frames before the change, against our gel's gradient",
+            f"{way}: drift, {drift.change.name}", None,
+            {"extra_deg": drift.fresh, "stale_deg": drift.stale, "usual_deg": report.angle}, note,
+        )
+        for drift in report.drifts
+    ]  # fmt: skip
+    overall = [pair for comparison, _ in folds for pair in comparison.pairs]
+    kinds = [("gradient_angle", "gradient", "deg", 1.0), ("height_share", "height", "% of depth", 100.0)]
+    if way == "pictures":
+        kinds.insert(0, ("contact_mae", "picture", "grey", 1.0))
+    for key, name, unit, scale in kinds:
+        values, nulls = [pair.numbers[key] for pair in overall], [pair.null[key] for pair in overall]
+        figures = {"null": float(np.nanmean(nulls)) * scale, "median": float(np.nanmedian(values)) * scale}
+        if key == "contact_mae":
+            figures["ncc"] = float(np.nanmean([pair.numbers["contact_ncc"] for pair in overall]))
+        rows.append(
+            Measurement(
+                timing, float(np.nanmean(values)) * scale, unit, "the real frame, by `tacsim compare`",
+                f"{way}: {name}", None, figures, note,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _fold(
+    of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
+) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
+    """Left-out presses by our gel, compared with the real ones in both ways; the calibration that has not seen them;
+    wall and processor time of pressing; what to look at."""
+    from calibration.bundle import sensor_model, write_bundle
+    from calibration.compare.compare import compare
+    from calibration.compare.frame_set import Shot, Side
+    from calibration.light.ball_press import BadPresses, calibrate_light
+    from robot.studies.matched_press import press_like
+
+    try:
+        fit = calibrate_light(reference, train, of.ball_radius / of.pixel_pitch)
+    except BadPresses as error:
+        raise BadData(f"{of.name}: {error}") from None
+    calibration = balls.bundle(of, fit)
+    real = Side("real", reference, "as labelled", tuple(Shot(name, image) for name, image in test))
+    scene = Scene(
+        body=None,
+        indenter=Indenter(geometry=Sphere(radius=of.ball_radius)),
+        gel=Gel(size=gel_size),
+        element_size=ELEMENT,
+        settling=Settling(mach=0.05),
+    )
+    wall, cpu = perf_counter(), process_time()
+    with TemporaryDirectory() as place:
+        write_bundle(Path(place), calibration, reference)
+        ours, said = press_like(real, scene, sensor_model(Path(place)), GRID)
+    taken = perf_counter() - wall, process_time() - cpu
+    both = {
+        "pictures": compare(ours, real, calibration, calibration),
+        "surfaces": compare(ours, real, None, calibration),
+    }
+    return both, calibration, taken, said
+
+
+def cases(folder: Path) -> tuple[Case, ...]:
+    """The presses of the sensor whose gel is known; says what is missing. Raises ConfigError."""
+    labels, resolution = read_labels(folder), f"{FOLDS} folds, h {ELEMENT * 1e3:g} mm"
+    try:
+        of = light_of(folder, labels)
+    except BadData as error:
+        return (lacking("real", CASE, str(error), resolution),)
+    size = (*labels.gel_size, labels.gel_thickness[0])
+    return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size), long=True),)

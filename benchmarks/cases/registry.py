@@ -1,0 +1,87 @@
+"""All cases, by group."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from benchmarks.cases import deep, incline, materials, press, scenes, squeeze
+from benchmarks.cases.real import balls, depths, films, labels, observe, punches, real, touching, twins
+from benchmarks.cases.real.labels import BadData
+from benchmarks.harness.runner import Case, backend, lacking
+from benchmarks.harness.schema import Group
+from benchmarks.reliability import reliability
+
+CASES: tuple[Case, ...] = (
+    *press.CASES,
+    *squeeze.CASES,
+    *deep.CASES,
+    *incline.CASES,
+    *materials.CASES,
+    *scenes.CASES,
+    *reliability.CASES,
+)
+
+CPU_ONLY = "it runs on the CPU only"
+
+BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
+    ("real", real.CASE): real.contact_radius,
+    ("real", films.CASE): films.marker_film,
+    ("real", balls.CASE): balls.ball_presses,
+    ("real", depths.CASE): depths.known_depth,
+    ("real", punches.CASE): punches.punch,
+    ("real", twins.CASE): twins.invariance,
+    ("real", observe.RENDER): observe.calibrated_render,
+    ("real", observe.NORMALISE): observe.normaliser,
+    ("real", touching.CASE): touching.touch_ball,
+}
+
+
+def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None) -> list[Case]:
+    """The cases of `groups` in their order; other methods only with `baselines`, long ones only with `long`.
+
+    On a device (TACSIM_DEVICE) other methods, and cases that need the CPU, are named as not measured.
+
+    `data`: folder of the real group's frames; without it that group has no cases. Raises BadData, ConfigError for one
+    that cannot be used.
+    """
+    wanted = set(groups)
+    every = CASES if data is None or "real" not in wanted else (*CASES, *_real_cases(data))
+    cases = [
+        case for case in every if case.group in wanted and (baselines or not case.baseline) and (long or not case.long)
+    ]
+    if backend() == "cpu":
+        return cases
+    return [replace(case, missing=case.missing or CPU_ONLY) if case.needs_cpu else case for case in cases]
+
+
+def _real_cases(data: Path) -> tuple[Case, ...]:
+    """Those of the frames below `data`, and those that need none; what is not there says so. Raises BadData where there
+    is nothing at all, or where labels of the folder's own name what is not there; ConfigError."""
+    found = (*films.cases(data), *balls.cases(data)) if data.is_dir() else ()
+    try:
+        presses = real.cases(data)
+    except BadData as error:
+        if all(case.missing for case in found) or (data / labels.OWN).is_file():
+            raise
+        presses = (lacking("real", real.CASE, str(error)),)
+    if not any(case.name == films.CASE for case in found):
+        found = (*found, lacking("real", films.CASE, f"no film of a dotted gel below {data}"))
+    of_light = (*depths.cases(data), *punches.cases(data), *twins.cases(data))
+    return (*presses, *found, *of_light, *observe.CASES, *touching.CASES)
+
+
+def description(group: Group, name: str, method: str) -> str:
+    """What a case does, from the first paragraph of its docstring; empty for a case that is no more."""
+    if (group, name) in BY_DATA:
+        return _first_paragraph(BY_DATA[group, name])
+    for case in CASES:
+        if (case.group, case.name, case.method) == (group, name, method):
+            return _first_paragraph(case.measure.func if isinstance(case.measure, partial) else case.measure)
+    return ""
+
+
+def _first_paragraph(function: object) -> str:
+    return " ".join((function.__doc__ or "").partition("\n\n")[0].split())

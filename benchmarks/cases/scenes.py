@@ -1,0 +1,166 @@
+"""Scenes group: what a scene costs by what is in it, and how soon a second world is ready."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.cases.press import press, press_scene
+from benchmarks.cases.squeeze import PRESETS, STEP, close, closer, normal_forces, squeeze_scene, touching
+from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.runner import Case
+from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.physics.worlds.world import MoveStats, World, make_world
+
+DEPTH = 0.3e-3  # of an indenter [m]
+CLOSE = 0.3e-3  # both sensors together [m]
+RADIUS = 4e-3
+ENVIRONMENTS = (1, 8, 64)
+AT_REST = "contact force against force at the backing, and their change"
+
+
+def rigid(shape: Callable[[Path], Shape], repeat: int) -> list[Measurement]:
+    """A rigid indenter pressed 0.3 mm into the draft gel, from the scene on: no particles, no grid."""
+    with tempfile.TemporaryDirectory() as folder:
+        scene = press_scene(shape(Path(folder)), 1e-3)
+        timing, (world, stats) = timed(partial(press, scene, DEPTH), repeat)
+        started, _ = timed(partial(make_world, scene), repeat, warm=lambda: None)
+    moving = max(timing.median - started.median, 0.0)
+    figures = {"ready_ms": started.median * 1e3, "force_n": abs(float(world.wrench("lower")[2]))}
+    return [_row(timing, stats, "", moving, figures)]
+
+
+def _ball(folder: Path) -> Shape:
+    return Sphere(radius=RADIUS)
+
+
+def _cylinder(folder: Path) -> Shape:
+    return Cylinder(radius=RADIUS, height=2 * RADIUS)
+
+
+def _box(folder: Path) -> Shape:
+    return Box(size=(2 * RADIUS,) * 3)
+
+
+def _mesh(folder: Path) -> Shape:
+    import trimesh
+
+    path = folder / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=4, radius=RADIUS * 1e3).export(path)  # an STL is in millimetres
+    return Mesh(path=str(path))
+
+
+def body(material: str, repeat: int) -> list[Measurement]:
+    """A cube of 10 mm between two draft gels, closed by 0.3 mm in the middle of a squeeze; then also its images."""
+    from tacsim.config import load_sensor
+    from tacsim.optics.render import Renderer
+
+    scene = squeeze_scene("draft")
+    if material == "elastic":
+        assert scene.body is not None
+        config = scene.body.material
+        soft = BodyMaterial(youngs_modulus=config.youngs_modulus, poisson_ratio=config.poisson_ratio)
+        scene = scene.model_copy(update={"body": Body(geometry=scene.body.geometry, material=soft)})
+    world = touching(scene)
+    close(world, 0.5e-3)
+    begin = world.snapshot()
+
+    def run() -> MoveStats:
+        world.restore(begin)
+        return close(world, CLOSE)
+
+    timing, stats = timed(run, repeat, warm=lambda: None)
+    rows = [_row(timing, stats, "", timing.median, {"force_n": float(normal_forces(world).mean())})]
+    sensor = load_sensor("ideal", ["geometry.width=320", "geometry.height=240"])
+    camera = Renderer(sensor, scene.gel.size[:2])
+
+    def look() -> list[object]:
+        return [camera(world.surface(name)) for name in world.sensors]
+
+    seen, _ = timed(look, repeat)
+    both = Timing(tuple(timing.median + each for each in seen.samples), timing.processor + seen.processor)
+    rows.append(_row(both, stats, "and two images of 320 x 240", both.median, {"images_ms": seen.median * 1e3}))
+    return rows
+
+
+def _row(timing: Timing, stats: MoveStats, variant: str, moving: float, figures: dict[str, float]) -> Measurement:
+    """`moving`: the seconds that are the substeps'."""
+    each = {"wall_per_substep_us": moving * 1e6 / stats.substeps}
+    note = "" if stats.settled else "not settled"
+    return Measurement(
+        timing, stats.residual * 100, "% residual", AT_REST, variant, stats.substeps, {**each, **figures}, note
+    )
+
+
+def second_world(preset: str, repeat: int) -> list[Measurement]:
+    """A world from its scene, once more in a process that has made and moved one already: nothing compiles anew."""
+    scene = squeeze_scene(preset, mach=0.1, max_substeps=0)
+    first, first_ms, first_move_ms = _made_and_moved(scene)
+    timing, _ = timed(partial(make_world, scene), repeat, warm=lambda: None)
+    second, _, second_move_ms = _made_and_moved(scene)
+    state = second.snapshot()
+    different = max(
+        float(np.abs(a.astype(np.float64) - state[name].astype(np.float64)).max(initial=0.0))
+        for name, a in first.snapshot().items()
+    )
+    figures = {"first_ms": first_ms, "second_ms": timing.median * 1e3}
+    figures |= {"first_move_ms": first_move_ms, "second_move_ms": second_move_ms}
+    return [
+        Measurement(timing, different, "difference of state", "the first world after the same motion", figures=figures,
+                    note="the first world starts Taichi, its first move compiles kernels or loads them; moves are 1 µm")
+    ]  # fmt: skip
+
+
+def _made_and_moved(scene: Scene) -> tuple[World, float, float]:
+    """A world, the time to make it and that of its first motion [ms]."""
+    began = time.perf_counter()
+    world = make_world(scene)
+    made = time.perf_counter()
+    close(world, 1e-6)
+    return world, (made - began) * 1e3, (time.perf_counter() - made) * 1e3
+
+
+def batch(count: int, repeat: int) -> list[Measurement]:
+    """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: what a substep costs each of them."""
+    from tacsim.physics.worlds.batch import Batch
+
+    begin = touching(squeeze_scene("draft"))
+    close(begin, 0.5e-3)
+    scene = squeeze_scene("draft", max_substeps=0)
+    alone, many = make_world(scene), Batch([scene] * count)
+    for world in (alone, *many.worlds):
+        world.restore(begin.snapshot())
+
+    def run() -> MoveStats:
+        ends = many.move([closer(world, STEP) for world in many.worlds])
+        for end in ends:
+            if isinstance(end, Exception):
+                raise end
+        assert isinstance(ends[0], MoveStats)
+        return ends[0]
+
+    timing, stats = timed(run, repeat if count < max(ENVIRONMENTS) else 1)  # the largest takes seconds
+    for _ in range(len(timing.samples) + 1):  # as often as the batch, which was moved once untimed
+        close(alone, STEP)
+    force = float(normal_forces(alone).mean())
+    error = max(abs(float(normal_forces(world).mean()) / force - 1) for world in many.worlds) * 100
+    each = timing.median * 1e6 / (stats.substeps * count)
+    figures = {"wall_per_environment_substep_us": each, "force_n": force}
+    return [Measurement(timing, error, "% of force", "the same motions of a world alone", "", stats.substeps, figures)]
+
+
+def _indenter(name: str, shape: Callable[[Path], Shape]) -> Case:
+    return Case("scenes", f"indenter_{name}", "tacsim", "gel 1 mm", partial(rigid, shape))
+
+
+CASES = (
+    *(_indenter(n, f) for n, f in (("sphere", _ball), ("cylinder", _cylinder), ("box", _box), ("mesh", _mesh))),
+    *(Case("scenes", f"body_{m}", "tacsim", PRESETS["draft"], partial(body, m)) for m in ("elastic", "plastic")),
+    *(Case("scenes", "second_world", "tacsim", words, partial(second_world, p)) for p, words in PRESETS.items()),
+    *(Case("scenes", "batch", "tacsim", f"{n} x {PRESETS['draft']}", partial(batch, n)) for n in ENVIRONMENTS),
+)  # fmt: skip

@@ -1,0 +1,305 @@
+"""Runs cases one after the other, in processes apart from this one, and collects the report.
+
+Cases that share a process count memory from their own start, with what the kernels before them left behind. A process
+that dies costs one case: those after it go on in a new one.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from benchmarks.harness.cache import fingerprint
+from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
+from benchmarks.harness.schema import Device, Failure, Group, Machine, Metadata, Missing, Report, Row
+from robot.arm.realtime import allowed
+
+EXIT = 10.0  # [s] a process may take to end after its last word
+PACKAGES = ("tacsim", "taichi", "numpy", "scipy")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One case, by one method at one resolution. `measure` must be importable by name (or a partial of such)."""
+
+    group: Group
+    name: str
+    method: str
+    resolution: str
+    measure: Callable[[int], list[Measurement]]  # repetitions -> rows
+    baseline: bool = False  # only with --baselines: a method that is not ours
+    long: bool = False  # only with --long: ours, but more than some seconds
+    cpu: bool = False  # ours, but in NumPy or by kernels of the CPU alone
+    missing: str = ""  # why it cannot be measured here: what the user's folder lacks
+
+    @property
+    def short(self) -> bool:
+        """Whether it needs neither --baselines nor --long."""
+        return not (self.baseline or self.long)
+
+    @property
+    def needs_cpu(self) -> bool:
+        """Whether it says nothing of a device. Other methods are written for the CPU, or in NumPy."""
+        return self.cpu or self.method != "tacsim" or self.group == "robot"
+
+
+def lacking(group: Group, name: str, why: str, resolution: str = "") -> Case:
+    """A case of ours that cannot be measured here, and why."""
+    return Case(group, name, "tacsim", resolution, _never, missing=why)
+
+
+def _never(repeat: int) -> list[Measurement]:
+    raise AssertionError("a case that lacks its frames was measured")
+
+
+class Stopped(RuntimeError):
+    """The run was stopped from outside."""
+
+
+def run_cases(
+    cases: Sequence[Case], repeat: int, *, baselines: bool, long: bool = False,
+    on_start: Callable[[Case], None] = lambda case: None, stop: Callable[[], bool] = lambda: False,
+) -> Report:  # fmt: skip
+    """Runs `cases` in turn. A case that raises or dies becomes a failure of the report. Raises Stopped."""
+    began, load = time.perf_counter(), _load()
+    (commit, modified), code = _commit(), fingerprint("tacsim", "robot", "calibration")
+    rows: list[Row] = []
+    failures: list[Failure] = []
+    missing = [Missing(**_names(case), cause=case.missing) for case in cases if case.missing]
+    group_seconds: dict[Group, float] = {}
+    for together in _apart([case for case in cases if not case.missing]):
+        started = time.perf_counter()
+        for case, found in _run(together, repeat, on_start, stop):
+            if isinstance(found, str):
+                failures.append(Failure(**_names(case), cause=found))
+            else:
+                rows += found
+        if together[0].short:
+            group = together[0].group
+            group_seconds[group] = group_seconds.get(group, 0.0) + time.perf_counter() - started
+    groups = list(dict.fromkeys(case.group for case in cases))
+    order = {tuple(_names(case).values()): number for number, case in enumerate(cases)}
+    rows.sort(key=lambda row: order[row.group, row.case, row.method, row.resolution])
+    return Report(
+        metadata=Metadata(
+            date=datetime.now(UTC).replace(microsecond=0),
+            commit=commit,
+            modified=modified,
+            changed=fingerprint("tacsim", "robot", "calibration") != code,
+            versions=_versions(),
+            machine=_machine(load),
+            groups=groups,
+            baselines=baselines,
+            long=long,
+            repeat=repeat,
+            seconds=time.perf_counter() - began,
+            group_seconds=group_seconds,
+        ),
+        results=rows,
+        failures=failures,
+        missing=missing,
+    )
+
+
+def _names(case: Case) -> dict[str, Any]:
+    return {"group": case.group, "case": case.name, "method": case.method, "resolution": case.resolution}
+
+
+def _apart(cases: Sequence[Case]) -> list[list[Case]]:
+    """Our own short cases of a group share a process, since loading the kernels takes longer than most of them run;
+    another method gets one of its own, and so does every long case."""
+    parts: dict[object, list[Case]] = {}
+    for case in cases:
+        parts.setdefault(case.group if case.short else case, []).append(case)
+    return list(parts.values())
+
+
+class _Worker:
+    """A process that runs cases in turn. When it dies, the next is started for those that are left."""
+
+    def __init__(self, cases: Sequence[Case], repeat: int) -> None:
+        context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
+        self._here, there = context.Pipe(duplex=False)
+        self._process = context.Process(target=_work, args=(list(cases), repeat, there), daemon=True)
+        self._process.start()
+        there.close()
+
+    def next(self, stop: Callable[[], bool]) -> list[Row] | str | None:
+        """Rows of the next case, or what went wrong in words; None when the process has died. Raises Stopped."""
+        try:
+            while not self._here.poll(0.1):
+                if stop():
+                    raise Stopped("stopped before all cases were over")
+            found: list[Row] | str = self._here.recv()
+            return found
+        except EOFError:
+            self._process.join(EXIT)
+            return None
+
+    @property
+    def exit_code(self) -> int | None:
+        return self._process.exitcode
+
+    def close(self) -> None:
+        self._process.kill()  # nothing happens to one that is over
+        self._process.join()
+        self._here.close()
+
+
+def _run(
+    cases: Sequence[Case], repeat: int, on_start: Callable[[Case], None], stop: Callable[[], bool]
+) -> Iterator[tuple[Case, list[Row] | str]]:
+    """What each case came to, all in one process as long as it lives."""
+    worker: _Worker | None = None
+    try:
+        for index, case in enumerate(cases):
+            on_start(case)
+            worker = worker or _Worker(cases[index:], repeat)
+            found = worker.next(stop)
+            if found is not None:
+                yield case, found
+            else:
+                yield case, f"its process died with exit code {worker.exit_code}"
+                worker.close()
+                worker = None
+    finally:
+        if worker is not None:
+            worker.close()
+
+
+def _work(cases: Sequence[Case], repeat: int, report: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    for case in cases:
+        gc.collect()
+        forget_peak_memory()
+        try:
+            report.send(measure(case, repeat))
+        except Exception as error:  # whatever it is, the other cases go on, and the report names it
+            report.send(f"{type(error).__name__}: {error}")
+    report.close()
+
+
+def measure(case: Case, repeat: int) -> list[Row]:
+    """Runs one case in this process."""
+    found = case.measure(repeat)
+    memory = peak_memory()
+    return [
+        Row(
+            group=case.group,
+            case=case.name,
+            variant=one.variant,
+            method=case.method,
+            resolution=case.resolution,
+            seconds=one.timing.median,
+            spread=one.timing.spread,
+            cpu_seconds=one.timing.processor,
+            repeats=len(one.timing.samples),
+            error=one.error,
+            error_unit=one.error_unit,
+            against=one.against,
+            peak_mb=memory,
+            substeps=one.substeps,
+            figures=one.figures,
+            note=one.note,
+        )
+        for one in found
+    ]
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def _load() -> list[float] | None:
+    return [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None
+
+
+def _machine(load_before: list[float] | None) -> Machine:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    memory = None
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
+    system = f"{platform.system()} {platform.machine()}"
+    return Machine(
+        cpu=_cpu(),
+        cores=cores,
+        memory_gb=memory,
+        system=system,
+        load_before=load_before,
+        load_after=_load(),
+        realtime=allowed(),
+        device=_device(),
+    )
+
+
+def backend() -> str:
+    """Where the processes of cases compute. As tacsim.compute.runtime reads it, which would import Taichi."""
+    return os.environ.get("TACSIM_DEVICE") or "cpu"
+
+
+def _device() -> Device | None:
+    """The GPU that cases compute on, None for the CPU; its name as far as a tool tells it."""
+    if backend() == "cpu":
+        return None
+    if backend() == "cuda":
+        try:
+            name, memory, driver = _nvidia()
+        except (OSError, subprocess.SubprocessError, ValueError, IndexError):
+            return Device(backend="cuda")
+        size = round(int(memory) * 2**20 / 1e9, 1) if memory.isdecimal() else None  # None: it shares the host's
+        return Device(backend="cuda", name=name, memory_gb=size, driver=driver)
+    return Device(backend=backend())
+
+
+def _nvidia() -> list[str]:
+    """Name, memory [MiB] and driver of the first GPU that may be seen, which Taichi takes."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").partition(",")[0]
+    words = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"]
+    words += [f"--id={visible}"] if visible else []
+    done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
+    return [word.strip() for word in done.stdout.splitlines()[0].split(",")]
+
+
+def _cpu() -> str:
+    listed = Path("/proc/cpuinfo")
+    if listed.exists():
+        for line in listed.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine() or sys.platform
+
+
+def _commit() -> tuple[str | None, bool | None]:
+    """Commit of the checkout this file lies in, and whether it has changes; None for an installed package."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None, None
+    try:
+        commit = _git(root, "rev-parse", "--short=12", "HEAD")
+        return commit, bool(_git(root, "status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.SubprocessError):
+        return None, None
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10, check=True)
+    return done.stdout.strip()

@@ -1,0 +1,227 @@
+"""docs/benchmarks.md and its pictures, from a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from benchmarks.cases.registry import description
+from benchmarks.harness.schema import Machine, Report, Row
+from benchmarks.pages import targets
+from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
+
+GROUP_WORDS = {
+    "press": "Press: a rigid indenter on one gel",
+    "squeeze": "Squeeze: plasticine between two gels",
+    "materials": "Materials: laws, elements, transfers, and what a substep costs",
+    "scenes": "Scenes: cost by what is in them",
+    "real": "Real: frames of real sensors, and what they cost",
+}
+COLUMNS = ("case", "method", "resolution", "seconds", "CPU s", "error", "MB", "substeps")
+
+FIGURES = (
+    "What the project must reach and aims for, from the rows below: worst row of its kind, ratios within this run. "
+    "*missed* is beyond *must*; *not measured* means that this run has no such row."
+)
+READING = (
+    "- **A row** is one thing by one method at one resolution. `tacsim` is ours; `seed`, `textbook`, `tacchi-settings` "
+    "and `layer` are what it is compared with. The error belongs to the same run as the seconds: a fast row with a "
+    "large error is not fast.\n"
+    "- **Time.** Compare seconds within this page only. On a busy machine compare CPU s, or ratios; rows of one case "
+    "ran one after the other.\n"
+    "- **Error** is against what stands under each table: a closed form, a limit of fine meshes, a symmetry, or the "
+    "same mesh driven so slowly that speed plays no part.\n"
+    "- **Rerun** one group with `tacsim bench squeeze --json squeeze.json`; the last of the figures says how long "
+    "that takes (slow limits are kept for the next time). Other methods need `--baselines`, our own long rows (fine "
+    "meshes, `standard` squeezes, the incline, 100,000 substeps of rest; of real presses punches, twins and all but "
+    "the first set of balls) `--long`; both take "
+    "many minutes. This page: `tacsim bench all --baselines --long --json benchmarks/reference.json`, then "
+    "`tacsim bench --from benchmarks/reference.json --docs docs`, with `--from "
+    "benchmarks/gpu/report.json` too where there is one. That is of a GPU: `make test-gpu` measures it and "
+    "writes the page.\n"
+    "- **Real frames** are not shipped. `tacsim bench real --data DIR` finds those of the public set named in "
+    "`benchmarks/references/presses.yaml` by their names anywhere below DIR; a `presses.yaml` in DIR itself describes "
+    "other presses, on any sensor. With `all`, `--data DIR` adds the group to the rest. Rows ending in `image` compare "
+    "the circle in the real frame with that in our picture, found by the same fit; rows ending in `pressure` compare "
+    "our contact itself with the radius in the labels. Films of dotted gels under a press are found alike, by "
+    "`films.yaml`: the share of their dots that is followed to the end, how still the dots lie at rest, and the time "
+    "of a frame. Presses of a ball are described by `balls.yaml`; `light` in `presses.yaml` names those by which the "
+    "sensor of the known depths is calibrated. *null* beside an error is what no contact at all would score. What "
+    "the folder lacks stands under *Not measured*."
+)
+
+
+ON_DEVICE = (
+    "Kernels ran on the device; images are drawn by the processor there too, and MB is the process's own memory. "
+    "*CPU / GPU* is seconds of the same row in the tables above over seconds here: two runs, perhaps on two machines."
+)
+NO_DEVICE = "No GPU has been measured yet: where there is CUDA, `make test-gpu` measures it and adds it to this page."
+
+
+def cells(row: Row) -> list[str]:
+    """A row of the table, as text."""
+    name = row.case if not row.variant else f"{row.case}: {row.variant}"
+    spread = "" if row.spread is None else f" ± {row.spread:.2g}"
+    substeps = "" if row.substeps is None else str(row.substeps)
+    error = f"{row.error:.3g} {row.error_unit}"
+    null = next((value for name, value in row.figures.items() if name.startswith("null")), None)
+    error += "" if null is None else f" (null {null:.3g})"
+    return [
+        name, row.method, row.resolution, f"{row.seconds:.3g}{spread}", f"{row.cpu_seconds:.3g}", error,
+        f"{row.peak_mb:.0f}", substeps,
+    ]  # fmt: skip
+
+
+def costs(row: Row) -> list[str]:
+    """The costs of a substep for each particle or element, as text."""
+    found = []
+    for name, value in row.figures.items():
+        kind, per, rest = name.partition("_per_")
+        what, substep, unit = rest.rpartition("_substep_")
+        if per and substep:
+            found.append(f"{value:.0f} {unit.replace('us', 'µs')} {kind} a substep and {what}")
+    return found
+
+
+def write_page(report: Report, folder: Path, devices: Sequence[Report] = ()) -> list[Path]:
+    """Writes benchmarks.md, and its pictures into images/, below `folder`; returns their paths. Raises OSError."""
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    draw(report.results, images / PICTURE)
+    pictures = [images / PICTURE]
+    if draw_radii(report.results, images / RADII):
+        pictures.append(images / RADII)
+    page = folder / "benchmarks.md"
+    page.write_text(markdown(report, devices), encoding="utf-8")
+    return [page, *pictures]
+
+
+def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
+    """The page of a report of the CPU, and of some of devices. The same reports give the same text."""
+    parts = [
+        "# Benchmarks",
+        "Written by `tacsim bench --from FILE --docs docs`; do not edit. Every row is time, error and memory of one "
+        "run, kernels compiled before the clock starts; another method and every long case has a process of its own, "
+        "our other cases of a group share one. Seconds are the median of wall time ± interquartile range (none with "
+        "fewer than three repetitions), CPU s the processor time of all threads.",
+        setting(report),
+        f"![Time against error, by method](images/{PICTURE})",
+        "## Figures",
+        FIGURES,
+        table(targets.HEADER, [*targets.lines(report.results), slowest_group(report)]),
+        "## How to read and rerun",
+        READING,
+    ]
+    for group, words in GROUP_WORDS.items():
+        rows = [row for row in report.results if row.group == group]
+        if rows:
+            parts += [f"## {words}", table(COLUMNS, map(cells, rows)), *_remarks(rows)]
+        if group == "real" and rows:
+            parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
+    if report.failures:
+        parts += ["## Failed", _failures(report)]
+    for title in dict.fromkeys(_title(each) for each in devices):
+        parts += _on_device(title, [each for each in devices if _title(each) == title], report)
+    parts += [
+        "## Not measured",
+        *(["\n".join(f"- {m.case}: {m.cause}" for m in report.missing)] if report.missing else []),
+        "Whether hard cases end their process is counted by a test, `test_no_case_ended_the_process` in "
+        "`tests/stability`.",
+        *([] if devices else [NO_DEVICE]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def slowest_group(report: Report) -> list[str]:
+    """The figure that no row has: what `tacsim bench GROUP` takes, as a line of the table."""
+    seconds = report.metadata.group_seconds
+    name = "a group without `--baselines` and `--long`"
+    if seconds:
+        name += f" ({', '.join(f'{group} {value:.0f} s' for group, value in seconds.items())})"
+    slowest = max(seconds.values(), default=None)
+    return targets.lines([], [targets.Target(name, "s", 40, None, lambda rows: slowest)])[0]
+
+
+def _on_device(title: str, reports: Sequence[Report], cpu: Report) -> list[str]:
+    """The section of one device."""
+    usual = {_identity(row): row.seconds for row in cpu.results}
+
+    def ratio(row: Row) -> str:
+        seconds = usual.get(_identity(row))
+        return "" if seconds is None or row.seconds == 0 else f"{seconds / row.seconds:.3g} x"
+
+    parts = [f"## On a GPU: {title}", *dict.fromkeys(map(setting, reports)), ON_DEVICE]
+    for group, words in GROUP_WORDS.items():
+        rows = [row for report in reports for row in report.results if row.group == group]
+        if rows:
+            lines = ([*cells(row), ratio(row)] for row in rows)
+            parts += [f"### {words}", table((*COLUMNS, "CPU / GPU"), lines), *_remarks(rows)]
+    lost = [_failures(report) for report in reports if report.failures]
+    parts += ["### Failed there", *lost] if lost else []
+    missing = [lack for report in reports for lack in report.missing]
+    for cause in dict.fromkeys(lack.cause for lack in missing):
+        cases = dict.fromkeys(f"{lack.case}, {lack.method}" for lack in missing if lack.cause == cause)
+        parts.append(f"Not measured there ({cause}): {'; '.join(cases)}.")
+    return parts
+
+
+def _title(report: Report) -> str:
+    device = report.metadata.machine.device
+    return "" if device is None else device.title
+
+
+def _identity(row: Row) -> tuple[str, ...]:
+    """What the rows of two runs have in common when they measure the same."""
+    return row.group, row.case, row.variant, row.method, row.resolution
+
+
+def _failures(report: Report) -> str:
+    return "\n".join(f"- {f.case}, {f.method}, {f.resolution}: {f.cause}" for f in report.failures)
+
+
+def setting(report: Report) -> str:
+    """Machine, load, date, commit and versions of a run, in a sentence or two."""
+    config = report.metadata
+    machine = config.machine
+    loads = [load for load in (machine.load_before, machine.load_after) if load is not None]
+    load = "load average unknown" if not loads else f"load average {' to '.join(f'{each[0]:.1f}' for each in loads)}"
+    commit = (
+        "no commit" if config.commit is None else f"commit {config.commit}{' with changes' if config.modified else ''}"
+    )
+    versions = ", ".join(f"{name} {version}" for name, version in config.versions.items())
+    if config.changed:
+        commit += ", **and the code changed while this ran**: not all rows are of one version"
+    return (
+        f"{_hardware(machine)}; {load} (others worked on the machine if it is above the number of cores; compare CPU s "
+        f"then). {config.date:%Y-%m-%d}, {commit}; {versions}."
+    )
+
+
+def _hardware(machine: Machine) -> str:
+    """Processor and, if kernels ran on one, device."""
+    host, device = f"{machine.cpu}, {machine.cores} cores, {machine.system}", machine.device
+    if device is None:
+        return host
+    memory = f", {device.memory_gb:g} GB" if device.memory_gb is not None else ""
+    driver = f", driver {device.driver}" if device.driver is not None else ""
+    return f"{device.title} ({device.backend}{memory}{driver}) beside {host}"
+
+
+def _remarks(rows: Sequence[Row]) -> list[str]:
+    """What each case is, what its error is measured against, notes, costs of substeps."""
+    lines = []
+    for case, method in dict.fromkeys((row.case, row.method) for row in rows):
+        same = [row for row in rows if (row.case, row.method) == (case, method)]
+        against = "; ".join(dict.fromkeys(row.against for row in same))
+        words = f"- **{case}, {method}**: {description(same[0].group, case, method)} Error against: {against}."
+        notes = dict.fromkeys(row.note for row in same if row.note)
+        words += "".join(f" Note: {note}." for note in notes)
+        words += "".join(f" {row.resolution}: {', '.join(cost)}." for row in same if (cost := costs(row)))
+        lines.append(words)
+    return ["\n".join(lines)]
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])

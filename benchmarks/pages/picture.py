@@ -1,0 +1,112 @@
+"""Pictures of a report: time against error by method; contact radius against depth, real and simulated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from benchmarks.harness.schema import Row
+
+PICTURE = "speed_vs_error.png"
+RADII = "contact_radius.png"
+# what is drawn: case, variant ("" for any), title, unit of the error
+PANELS = (
+    ("sphere_press", "", "Ball R 4 mm, 1 mm deep", "error of the surface [µm rms]"),
+    ("settled_squeeze", "", "3 mm squeeze, settled", "force against one slow limit, of standard [%]"),
+    ("plasticine_step", "", "Yield of a 10 mm cube", "error of the stress [%]"),
+)
+# contact radii: figure of the row, words, colour, style
+CURVES = (
+    ("cap_px", "cap cut by the rest plane (depth map)", "C7", ":"),
+    ("hertz_px", "Hertz, half-space", "C2", "--"),
+    ("layer_px", "FFT elastic layer", "C1", "-."),
+    ("pressure_px", "ours, contact pressure", "C0", "-"),
+)
+DOTS = (
+    ("image_px", "ours, circle in our image", "C0", "s"),
+    ("real_px", "real, circle in the frame, same fit", "k", "o"),
+    ("label_px", "real, as labelled", "k", "+"),
+)
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Time against error on logarithmic axes, a panel a case, a colour a method; lower left is better.
+
+    Raises OSError.
+    """
+    from tacsim.report.figure import canvas, plain, save
+
+    panels = [(panel, _points(rows, *panel[:2])) for panel in PANELS]
+    shown = [(panel, points) for panel, points in panels if points] or [(PANELS[0], [])]
+    methods = list(dict.fromkeys(row.method for _, points in shown for row in points))
+    figure = canvas(4.6 * len(shown), 3.8)
+    figure.set_layout_engine("constrained")
+    for index, ((_, _, title, unit), points) in enumerate(shown):
+        axes = plain(figure.add_subplot(1, len(shown), index + 1), title, "seconds (wall)", unit)
+        axes.set(xscale="log", yscale="log")
+        for row in points:
+            colour = f"C{methods.index(row.method)}"
+            axes.plot(row.seconds, row.error, "o", color=colour)
+            words = f"{row.method}\n{row.resolution.partition(',')[0]}"
+            axes.annotate(words, (row.seconds, row.error), (5, 4), textcoords="offset points", fontsize=7, color=colour)
+        if points:
+            axes.set_xlim(*_decades([row.seconds for row in points]))
+            axes.set_ylim(*_decades([row.error for row in points]))
+    save(figure, path)
+
+
+def _decades(values: Sequence[float]) -> tuple[float, float]:
+    """Whole powers of ten round `values`, so that each axis has at least two numbers on it."""
+    return 10.0 ** math.floor(math.log10(min(values) / 1.2)), 10.0 ** math.ceil(math.log10(max(values) * 1.2))
+
+
+def _points(rows: Iterable[Row], case: str, variant: str) -> list[Row]:
+    """A logarithmic axis shows no zero: such a row is left to the table."""
+    return [
+        row for row in rows
+        if row.case == case and (not variant or row.variant == variant) and row.error > 0 and row.seconds > 0
+    ]  # fmt: skip
+
+
+def draw_radii(rows: Sequence[Row], path: Path) -> bool:
+    """Contact radius against depth, a panel a ball, of the first gel in `rows`. False, and no file, without such rows.
+
+    Raises OSError.
+    """
+    from tacsim.report.figure import canvas, plain, save
+
+    found = [row for row in rows if row.group == "real" and "thickness_mm" in row.figures]
+    if not found:
+        return False
+    thickness = found[0].figures["thickness_mm"]
+    found = [row for row in found if row.figures["thickness_mm"] == thickness]
+    balls = sorted({row.figures["ball_radius_mm"] for row in found})
+    figure = canvas(4.8 * len(balls), 4.2)
+    figure.set_layout_engine("constrained")
+    for index, ball in enumerate(balls):
+        words = f"Ball R {ball:g} mm, gel {thickness:g} mm thick"
+        axes = plain(figure.add_subplot(1, len(balls), index + 1), words, "depth [mm]", "contact radius [px]")
+        here = [row for row in found if row.figures["ball_radius_mm"] == ball]
+        for name, label, colour, style in CURVES:
+            axes.plot(*_against_depth(here, name), style, color=colour, label=label, linewidth=1.2)
+        for name, label, colour, marker in DOTS:
+            depth, radius = _against_depth(here, name)
+            if depth:
+                axes.plot(depth, radius, marker, color=colour, label=label, markerfacecolor="none", markersize=8)
+        doubt = max(row.figures.get("depth_uncertainty_mm", 0.0) for row in here)
+        if doubt > 0:
+            depth, radius = _against_depth(here, "real_px")
+            axes.errorbar(depth, radius, xerr=doubt, fmt="none", ecolor="k", elinewidth=0.8, capsize=2)
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
+        if index == 0:
+            axes.legend(fontsize=7, frameon=False, loc="lower right")
+    save(figure, path)
+    return True
+
+
+def _against_depth(rows: Iterable[Row], name: str) -> tuple[list[float], list[float]]:
+    """Depths [mm] and values of one figure, each depth once."""
+    at = {row.figures["depth_mm"]: row.figures[name] for row in rows if name in row.figures}
+    return sorted(at), [at[depth] for depth in sorted(at)]

@@ -1,0 +1,184 @@
+"""Small kernels that drive the product's own laws, transfers and elements directly, where no World has the boundary
+conditions of a closed form. Units as in the physics: mm, N, MPa, wave speed 1."""
+
+import numpy as np
+
+from tacsim.compute.runtime import start, ti
+from tacsim.physics.body.material import convect, hencky_return, mat3, vec6
+from tacsim.physics.body.plasticine import BodyParams, BodyState
+from tacsim.physics.body.transfers import (
+    Particles,
+    Strips,
+    clear_masses,
+    grid_to_particles,
+    node_sum,
+    particles_to_grid,
+)
+from tacsim.physics.exec.lanes import LANES, NODES, PARTS, Counts, Params, Partial, strip, vec3
+from tacsim.physics.exec.layout import (
+    BACKING,
+    COUNTS,
+    ELEMENTS,
+    GEL_DAMPING,
+    GRID,
+    NUMBERS,
+    OFF_GRID,
+    PARAMS,
+    SMALLEST_STEP_VOLUME,
+    SMALLEST_VOLUME,
+    STEP,
+    STEPS,
+)  # fmt: skip
+from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.gel.element import SMALLEST_STRETCH
+from tacsim.physics.gel.gel import (
+    Corners,
+    GelParams,
+    GelState,
+    Lattice,
+    Nodes,
+    Skin,
+    Touch,
+    gel_advance,
+    gel_forces,
+    margin,
+)
+
+Steps = ti.types.ndarray(dtype=ti.i32, ndim=2)
+Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
+
+
+@ti.kernel
+def body_substeps(
+    team: ti.i32, steps: Steps,
+    particles: Particles, masses: Strips, velocities: Strips,
+    params: Params, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
+):  # fmt: skip
+    """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
+    own substeps are (tacsim.physics.worlds.hybrid_kernels)."""
+    for task in range(team * CHUNK):
+        for _ in range(first_in_chunk(task)):
+            member = task // CHUNK
+            for it in range(steps.shape[1]):
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    clear_masses(0, part, masses, counts)
+                    particles_to_grid(0, part, particles, masses, params, counts, partial)
+                meet(sync, 0, team, 2 * it + 1)
+                plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
+                for share in range((rows - member + team - 1) // team):
+                    i = member + share * team
+                    for at in range(i * plane, (i + 1) * plane):
+                        q = node_sum(0, i, at, masses, velocities, counts)
+                        moved = strip(0.0)
+                        for n in ti.static(range(NODES)):
+                            if q[4 * n + 3] > 0.0:
+                                moved[4 * n] = keep_x * q[4 * n] / q[4 * n + 3]
+                                moved[4 * n + 1] = keep_y * q[4 * n + 1] / q[4 * n + 3]
+                                moved[4 * n + 2] = keep_z * q[4 * n + 2] / q[4 * n + 3]
+                        velocities[at] = moved
+                meet(sync, 0, team, 2 * it + 2)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    grid_to_particles(0, part, particles, velocities, params, counts, partial)
+
+
+@ti.kernel
+def gel_substeps(
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    params: Params, counts: Counts, partial: Partial,
+    keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32,
+):  # fmt: skip
+    """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
+    ti.loop_config(serialize=True)
+    for _ in range(counts[0, STEPS]):
+        nx, ny, layers = counts[0, ELEMENTS], counts[0, ELEMENTS + 1], counts[0, ELEMENTS + 2]
+        for part in range(PARTS):
+            gel_forces(0, part, 1, nodes, corners, lattice, params, counts, partial, layers, nx, ny)
+        for part in range(PARTS):
+            gel_advance(0, part, 1, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
+        layer = ((nx + 1) * (ny + 1) + LANES - 1) // LANES * LANES
+        dt, keep = params[0, STEP], vec3(keep_x, keep_y, keep_z)
+        for d in ti.static(range(3)):
+            for k in range(1, layers + 1):
+                for n in range((nx + 1) * (ny + 1)):
+                    v = margin(ny) + ((3 + d) * (layers + 1) + k) * layer + n
+                    before = nodes[v]
+                    after = keep[d] * before
+                    if driven == 1 and k == layers and d == 2:
+                        after = speed
+                    nodes[v] = after
+                    nodes[v - 3 * (layers + 1) * layer] += dt * (after - before)
+
+
+@ti.kernel
+def shear_points(
+    n: ti.i32, step: ti.f32, e: Symmetric, flow: Scalars, tau: Symmetric, mu: ti.f32, bulk: ti.f32, limit: ti.f32,
+    hardening: ti.f32,
+):  # fmt: skip
+    """Material points in simple shear: n increments of d(v_x)/dy, each followed by the return mapping."""
+    for p in range(e.shape[0]):
+        for _ in range(n):
+            moved = convect(e[p], mat3([[0.0, step, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+            elastic, new_flow, stress = hencky_return(moved, flow[p], mu, bulk, limit, hardening)
+            e[p] = elastic
+            flow[p] = new_flow
+            tau[p] = stress
+
+
+class Block:
+    """What a body or a gel on its own shares with its kernel. Use one of the two below."""
+
+    def __init__(self, params: dict[int, float], dt: float) -> None:
+        start(cpu_only="a single block of a material (tacsim bench materials)")
+        self.params = np.zeros((1, PARAMS), np.float32)
+        self.params[0, list(params)] = list(params.values())
+        self.params[0, STEP] = dt
+        self.counts = np.zeros((1, COUNTS), np.int32)
+        self.partial = np.zeros((1, PARTS, NUMBERS), np.float32)
+        self.partial[:, :, [SMALLEST_VOLUME, SMALLEST_STEP_VOLUME]] = 1.0
+
+
+class BodyBlock(Block):
+    """A free body of particles (n, 3) [mm], no damping, time step dt [mm]."""
+
+    def __init__(self, params: BodyParams, points: np.ndarray, dt: float) -> None:
+        super().__init__(params.params(), dt)
+        self.cell = params.cell
+        self.state = BodyState([points])
+
+    def fit(self, margin: float) -> None:
+        """Lays the grid round the particles, which may then move by margin [mm]."""
+        self.state.fit(0, self.cell, margin, self.params, self.counts)
+
+    def advance(self, substeps: int, keep: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
+        """keep: 0 forbids motion along an axis, 1 allows it. Raises RuntimeError if a particle left the grid."""
+        steps = np.zeros((1, substeps), np.int32)
+        arguments = self.state.arguments()
+        run_team(body_substeps, steps, arguments, self.params, self.counts, self.partial, *keep)
+        if self.partial[0, :, OFF_GRID].any():
+            raise RuntimeError("particles left the grid of a body block: fit it anew, or with a wider margin")
+
+
+class GelBlock(Block):
+    """A gel on its backing that nothing touches; damping rate [1/mm], time step dt [mm]."""
+
+    def __init__(self, params: GelParams, dt: float, damping: float) -> None:
+        super().__init__({**params.params(), GEL_DAMPING: damping}, dt)
+        self.state = GelState(params, 1, 1)
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = params.elements
+        self._arguments = (*self.state.arguments(), self.params, self.counts, self.partial)
+
+    def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:
+        """keep: as for a body; speed: of the top along z, if driven. Raises RuntimeError if an element inverts."""
+        self.counts[0, STEPS] = substeps
+        gel_substeps(*self._arguments, *keep, int(speed is not None), speed or 0.0)
+        smallest = float(self.partial[0, :, SMALLEST_VOLUME].min())
+        if not smallest > SMALLEST_STRETCH:
+            raise RuntimeError(f"an element of a gel block shrank to {smallest:.3g} of its volume: drive it less far")
+
+    @property
+    def backing(self) -> np.ndarray:
+        """Force of the gel on its backing in the last substep [N], (3,)."""
+        return self.partial[0, :, BACKING : BACKING + 3].sum(axis=0, dtype=np.float64)

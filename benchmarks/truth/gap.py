@@ -1,0 +1,79 @@
+"""How far body and gel lie from each other where they press on one another: geometry alone, nothing that contact keeps.
+
+The body's surface is that of its outer particles (`tacsim.physics.body.surface`): for each the foot of its tangent
+plane. The gel's is the B-spline that the renderer draws. Their distance is taken along the gel's normal. The patch is
+made of cells of two particle spacings with a particle that bears load; judged are all outer particles that face the gel
+in a cell whose eight neighbours belong to the patch, whether they bear load or not: a hole in the patch counts. In the
+outermost ring planes lie aslant over an edge, and their feet say little of the surface; it is told apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacsim.optics.spline import displacement_and_jacobian
+from tacsim.optics.surface import material_points
+from tacsim.physics.body.surface import surface_points
+from tacsim.pose import inverse, rotate, transform
+
+if TYPE_CHECKING:
+    from tacsim.interface import FloatArray
+    from tacsim.models.scene import GelSurface
+    from tacsim.physics.worlds.world import World
+
+MM = 1e3  # m -> mm, of a snapshot's lengths
+CELL = 2.0  # of the patch, in particle spacings
+FACING = 0.7  # least cosine between a particle's plane and the gel's surface
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """Largest distances of body and gel [m]."""
+
+    gap: float  # inside the patch
+    overlap: float  # there, positive
+    rim: float  # of loaded particles in the patch's outermost ring, either way
+
+
+def gaps(world: World, spacing: float) -> Gaps:
+    """The worst of both sensors; spacing: of the body's particles [m]. Raises ValueError: a patch has no inside."""
+    found = [_of_sensor(world, name, index, spacing) for index, name in enumerate(world.sensors)]
+    return Gaps(max(f.gap for f in found), max(f.overlap for f in found), max(f.rim for f in found))
+
+
+def _of_sensor(world: World, name: str, index: int, spacing: float) -> Gaps:
+    from scipy.ndimage import binary_erosion, binary_fill_holes
+
+    state = world.snapshot()
+    x, planes = (state[key].astype(np.float64) for key in ("position", "planes"))
+    outer = (planes != 0).any(axis=1)
+    loaded = state["contact"][index, outer, 3] > 0  # the multiplier, which alone bears load at rest
+    to_sensor = inverse(world.pose(name))
+    feet = transform(to_sensor, surface_points(x[outer], planes[outer]) / MM)
+    normal = rotate(to_sensor, planes[outer])
+    at, distance, upwards = _from_gel(world.surface(name), feet)
+    facing = -(normal * upwards).sum(axis=1) > FACING * np.linalg.norm(normal, axis=1)
+    cell = np.floor(at / (CELL * spacing)).astype(int)
+    cell -= cell.min(axis=0) - 1
+    patch = np.zeros(cell.max(axis=0) + 2, dtype=bool)
+    patch[tuple(cell[loaded].T)] = True
+    within = binary_erosion(binary_fill_holes(patch), np.ones((3, 3), dtype=bool))[tuple(cell.T)]
+    inside, ring = distance[facing & within], distance[loaded & ~within]
+    if not len(inside):
+        raise ValueError(f"'{name}' has no contact patch of at least three cells of {CELL * spacing * MM:g} mm across")
+    return Gaps(
+        max(float(inside.max()), 0.0), max(-float(inside.min()), 0.0), float(np.abs(ring).max(initial=0.0))
+    )  # fmt: skip
+
+
+def _from_gel(surface: GelSurface, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Material points (n, 2) [m] under `points` (n, 3) [m, sensor frame], distances (n,) [m] above, normals (n, 3)."""
+    at = material_points(surface, points[:, :2])
+    displacement, jacobian = displacement_and_jacobian(surface, at)
+    along = jacobian + np.eye(3)[:, :2]
+    normal = np.cross(along[:, :, 0], along[:, :, 1])
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    return at, (points[:, 2] - displacement[:, 2]) * normal[:, 2], normal

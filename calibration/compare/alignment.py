@@ -1,0 +1,150 @@
+"""A brought into the pixels of B without a person's help: one scale and one shift for the whole comparison.
+
+One for all pairs, as a sensor does not move in its housing: a shift chosen anew for each pair would hide that contacts
+are in the wrong place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.compare.frame_set import BadSide
+from calibration.compare.metrics import contact_region, patch_of, untouched_change
+from tacsim.models.sensor import SensorGeometry
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+ASPECT = 0.02  # relative difference of two pictures' shapes that a scale may hide
+FARTHEST = 0.25  # of the picture: a shift beyond is a mistake in the pairing, not in the mounting
+SCATTER = 0.05  # of the picture: pairs that disagree by more have no shift in common
+SMOOTH = 5  # side of the Gaussian window of the fit [px]
+STEPS, SMALL = 200, 1e-4  # of the fit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """Where the pixels of B lie in the picture of A. Pixel centres are whole numbers, x right, y down."""
+
+    a_from_b: Float64  # (2, 3) affine: x, y in A of x, y in B
+    shape: tuple[int, int]  # rows, columns of B
+    source: tuple[int, int]  # ... of A
+    shift: tuple[float, float] = (0.0, 0.0)  # the part of it that was found: how far A's contacts lie off B's [px of B]
+    said: str = "pixel for pixel"
+
+    @property
+    def covered(self) -> NDArray[np.bool_]:
+        """(rows, columns) pixels of B that A shows."""
+        rows, columns = self.shape
+        u, v = np.meshgrid(np.arange(columns), np.arange(rows))
+        x, y = np.einsum("ij,jkl->ikl", self.a_from_b, np.stack([u, v, np.ones_like(u)]))
+        near = 0.5 + 1e-6
+        return np.asarray((x >= -near) & (x <= self.source[1] - 1 + near) & (y >= -near)
+                          & (y <= self.source[0] - 1 + near))  # fmt: skip
+
+    def __call__(self, picture: NDArray[Any]) -> Float32:
+        """(rows, columns, 3) what a picture of A, 0..255, shows at the pixels of B; its border where it ends."""
+        import cv2
+
+        picture = np.asarray(picture, dtype=np.float32)
+        if self.shape == self.source and np.array_equal(self.a_from_b, np.eye(2, 3)):
+            return picture
+        scale = float(np.sqrt(abs(np.linalg.det(self.a_from_b[:, :2]))))
+        if scale > 1.0:  # else fine detail of A would alias
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * np.sqrt(scale**2 - 1) + 1e-3))
+        # cubic: between two pixels a linear one would average the camera's noise away, and look better than it is
+        seen = cv2.warpAffine(
+            picture,
+            self.a_from_b,
+            (self.shape[1], self.shape[0]),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        clipped: Float32 = np.clip(np.asarray(seen, dtype=np.float32), 0.0, 255.0)  # it overshoots at edges
+        return clipped
+
+    def shifted(self, shift: tuple[float, float], said: str) -> Alignment:
+        """The same, with A's pictures taken `shift` [px of B] farther on."""
+        moved = np.eye(3)
+        moved[:2, 2] = shift
+        whole = np.vstack([self.a_from_b, [0.0, 0.0, 1.0]]) @ moved
+        return Alignment(whole[:2], self.shape, self.source, shift, f"{self.said}; {said}")
+
+
+def by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
+    """A of `source` rows, columns scaled to B's `shape`: both show the same part of the gel. Raises BadSide when their
+    proportions differ."""
+    if source == shape:
+        return Alignment(np.eye(2, 3), shape, source)
+    across, down = source[1] / shape[1], source[0] / shape[0]
+    if abs(across / down - 1) > ASPECT:
+        raise BadSide(
+            f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. "
+            "Give the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
+            "--corners-b)"
+        )
+    # pixel centres are whole numbers, so a picture begins at -1/2
+    matrix = np.array([[across, 0.0, (across - 1) / 2], [0.0, down, (down - 1) / 2]])
+    return Alignment(matrix, shape, source, said=f"A scaled by {1 / across:.3g} to the size of B")
+
+
+def by_geometry(source: SensorGeometry, target: SensorGeometry) -> Alignment:
+    """Both pictures on the gel, in metres, by their calibrated geometries."""
+    scale = target.pixel_pitch / source.pixel_pitch
+    offset = np.array(source.principal) - scale * np.array(target.principal)
+    matrix = np.array([[scale, 0.0, offset[0]], [0.0, scale, offset[1]]])
+    said = "by the calibrated geometries" if source != target else "pixel for pixel, of one geometry"
+    return Alignment(matrix, (target.height, target.width), (source.height, source.width), said=said)
+
+
+def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment) -> Alignment:
+    """`alignment` with the shift that brings the contacts of A onto those of B.
+
+    `changes`: of each pair the changes of colour (rows, columns, 3) of A (in the pixels of B) and of B. For each pair
+    with contact in both, the shift is found to a fraction of a pixel from the strength of the change, whatever its
+    colours (enhanced correlation coefficient, Evangelidis and Psarakis 2008); the median of all holds.
+    """
+    found = [shift for pair in changes if (shift := _shift(*pair)) is not None]
+    if not found:
+        return alignment.shifted((0.0, 0.0), "no pair shows contact on both sides, so no shift was looked for")
+    shifts = np.array(found)
+    middle = np.median(shifts, axis=0)
+    scatter = float(np.median(np.linalg.norm(shifts - middle, axis=1)))
+    size = max(alignment.shape)
+    words = f"({middle[0]:+.2f}, {middle[1]:+.2f}) px"
+    if scatter > SCATTER * size:
+        return alignment.shifted((0.0, 0.0), f"not shifted: the pairs disagree by {scatter:.0f} px; are they pairs?")
+    if float(np.linalg.norm(middle)) > FARTHEST * size:
+        return alignment.shifted((0.0, 0.0), f"not shifted: {words} is too far; are these pairs?")
+    x, y = (float(value) for value in middle)
+    return alignment.shifted((x, y), f"shifted by {words}, the pairs agree within {scatter:.2f} px")
+
+
+def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
+    """x, y from a point of `b` to the same in `a` [px]; None where there is no contact, or no shift to be found."""
+    import cv2
+
+    patches = [patch_of(contact_region(change)) for change in (a, b)]
+    if patches[0] is None or patches[1] is None:
+        return None
+    template, moved = _strength(b), _strength(a)
+    start = np.eye(2, 3, dtype=np.float32)
+    start[:, 2] = patches[0].x - patches[1].x, patches[0].y - patches[1].y
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, STEPS, SMALL)
+    mask = np.ones(moved.shape, dtype=np.uint8)
+    try:
+        _, warp = cv2.findTransformECC(template, moved, start, cv2.MOTION_TRANSLATION, criteria, mask, SMOOTH)
+    except cv2.error:  # it does not converge: these pictures do not show the same
+        return None
+    return float(warp[0, 2]), float(warp[1, 2])
+
+
+def _strength(change: Float32) -> Float32:
+    away = change - untouched_change(change)
+    strength: Float32 = np.sqrt(np.einsum("ijk,ijk->ij", away, away)).astype(np.float32)
+    return strength

@@ -1,0 +1,323 @@
+"""Would a policy notice that its frames come from another source? Three answers, for any pair of sources.
+
+**rho**: the distance of a press to its partner, over the distance of two neighbouring presses of B. Below 1 the change
+of source matters less than the next press. **AUC**: how well a linear classifier tells the sources apart on presses
+that it has not seen; 1/2 is chance. **Drift**: how much worse the gradient becomes when B's light changes, with a fresh
+and with a stale reference.
+
+Distances are those of a patch of fixed size round the contact, in four views: the raw picture, its difference to the
+reference, gradient, height.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.bundle import Calibration
+from calibration.compare import metrics
+from calibration.compare.compare import DRAWS, GRID, Comparison
+from calibration.compare.frame_set import BadSide, Image
+from calibration.compare.surfaces import touches
+from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.models.sensor import CanonicalGrid
+
+Float64 = NDArray[np.float64]
+
+PATCH = 5.2e-3  # side of the patch, where pixels have a known pitch [m]
+OF_RADIUS = 3.0  # ... and else in radii of the usual contact region
+POINTS = 36  # of the patch, each way
+FEWEST = 4  # presses
+COMPONENTS = 6  # principal ones that the classifier sees
+RIDGE = 1.0
+FOLDS = 20  # of the presses: up to so many, each press is left out alone
+
+VIEWS = ("raw", "difference", "gradient", "height")
+
+
+@dataclass(frozen=True, slots=True)
+class Invariance:
+    """What one view says."""
+
+    view: str
+    signal: float  # mean norm of a patch's change by contact, in the view's own unit
+    distance: float  # median distance of A and B, over the signal
+    neighbour: float  # median distance of presses of B that are neighbours in size, over the signal
+    rho: float  # distance / neighbour
+    rho_low: float  # 95 % interval, by bootstrap over presses
+    rho_high: float
+    auc: float  # of a linear classifier on left-out presses
+    auc_low: float
+    auc_high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A change of a camera's light and gain, as grey = gain * grey + offset for R, G, B, clipped to 0..255."""
+
+    name: str
+    key: str
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    offset: float = 0.0  # [grey levels]
+
+    def __call__(self, image: Image) -> Image:
+        changed = image * np.array(self.gain, dtype=np.float32) + np.float32(self.offset)
+        grey: Image = np.rint(np.clip(changed, 0, 255)).astype(np.uint8)
+        return grey
+
+
+CHANGES = (
+    Change("gain −30 %", "gain_down", (0.7, 0.7, 0.7)),
+    Change("gain +20 %", "gain_up", (1.2, 1.2, 1.2)),
+    Change("white balance R +20 %, B −15 %", "white_balance", (1.2, 1.0, 0.85)),
+    Change("offset +15", "offset", offset=15.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Gradient angle error against A where pressed, beyond that without change [degrees]; mean over presses."""
+
+    change: Change
+    fresh: float  # with a reference taken after the change
+    stale: float  # with the one from before
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything that is said of invariance."""
+
+    presses: int
+    views: tuple[Invariance, ...]
+    patch: str  # its size, in words
+    angle: float  # gradient angle error against A without any change [degrees]; NaN without surfaces
+    drifts: tuple[Drift, ...]
+    notes: tuple[str, ...]
+
+
+def invariance(
+    comparison: Comparison,
+    calibration_b: Calibration | None = None,
+    grid: CanonicalGrid = GRID,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Of a finished comparison. Gradient and height need surfaces on both sides, the drift table B's calibration.
+
+    Raises BadSide for fewer than FEWEST presses with contact in B.
+    """
+    folds = [(comparison, calibration_b)]
+    return pooled_invariance(folds, grid, on_step)
+
+
+def pooled_invariance(
+    folds: Sequence[tuple[Comparison, Calibration | None]],
+    grid: CanonicalGrid = GRID,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """The same of several comparisons, each with B's calibration: parts of one set of presses, of which each was left
+    out of the calibration that it is seen through. Raises BadSide for fewer than FEWEST presses with contact in B."""
+    touched = [
+        {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
+        for comparison, _ in folds
+    ]
+    count = sum(map(len, touched))
+    if count < FEWEST:
+        raise BadSide(f"{count} pairs show contact in B; {FEWEST} are needed to tell how far two presses are apart")
+    radii = [patch.radius for one in touched for patch in one.values()]
+    half, words = _size(folds[0][1], radii)
+    parts = [
+        _patches(comparison, one, calibration, grid, half)
+        for (comparison, calibration), one in zip(folds, touched, strict=True)
+        if one
+    ]
+    common = [name for name in VIEWS if all(name in part for part in parts)]
+    steps = len(common) + len(CHANGES)
+    views: list[Invariance] = []
+    for name in common:
+        on_step(len(views), steps)
+        of_a, of_b = (np.concatenate([part[name][side] for part in parts]) for side in (0, 1))
+        signal = float(np.mean(np.concatenate([part[name][2] for part in parts])))
+        views.append(_view(name, of_a, of_b, signal, np.argsort(radii)))
+    notes = [] if "height" in common else ["gradient and height are left out: no surfaces on both sides"]
+    angle = math.nan
+    drifts: list[Drift] = []
+    if any(comparison.touched_a is None or calibration is None for comparison, calibration in folds):
+        notes.append("no drift table: it needs surfaces of A and the calibration of B")
+    else:
+        angle = _angle(folds, touched, grid, None, None)
+        for k, change in enumerate(CHANGES):
+            on_step(len(views) + k, steps)
+            fresh = _angle(folds, touched, grid, change, change)
+            stale = _angle(folds, touched, grid, change, None)
+            drifts.append(Drift(change, fresh - angle, stale - angle))
+    return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
+
+
+def ratio(of_a: Float64, of_b: Float64, order: NDArray[np.intp]) -> tuple[float, float]:
+    """Median distance of rows (n, d) of A and B that are partners, and of rows of B that are neighbours in `order`."""
+    apart = np.linalg.norm(of_a - of_b, axis=1)
+    steps = np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
+    return float(np.median(apart)), float(np.median(steps))
+
+
+def classifier_scores(of_a: Float64, of_b: Float64) -> tuple[Float64, Float64]:
+    """(n,) scores of the presses of A and of B, each by a linear classifier that has not seen that press, of neither
+    source: ridge regression on -1 and 1 in the first principal components, standardised."""
+    count = len(of_a)
+    rows = np.concatenate([of_a, of_b])
+    wanted = np.repeat([-1.0, 1.0], count)
+    fold = np.tile(np.arange(count) % min(count, FOLDS), 2)
+    scores = np.zeros(2 * count)
+    for number in range(min(count, FOLDS)):
+        held = fold == number
+        middle = rows[~held].mean(axis=0)
+        away = rows - middle
+        # principal components through the products of the few presses, not of their many pixels
+        _, vectors = np.linalg.eigh(away[~held] @ away[~held].T)
+        seen = away @ (away[~held].T @ vectors[:, : -COMPONENTS - 1 : -1])
+        spread = seen[~held].std(axis=0)
+        seen = np.column_stack([seen / np.where(spread > 0, spread, 1.0), np.ones(len(seen))])
+        square = seen[~held].T @ seen[~held] + RIDGE * np.eye(seen.shape[1])
+        scores[held] = seen[held] @ np.linalg.solve(square, seen[~held].T @ wanted[~held])
+    return scores[:count], scores[count:]
+
+
+def area_under_curve(low: Float64, high: Float64, weight: Float64 | None = None) -> Float64:
+    """Probability that a score of `high` (n,) is above one of `low` (n,); ties count half (Mann and Whitney). `weight`
+    (..., n): how often each press counts; without, once."""
+    above = (high[:, None] > low[None, :]) + 0.5 * (high[:, None] == low[None, :])
+    times = np.ones(len(low)) if weight is None else weight
+    return np.asarray(((times @ above) * times).sum(axis=-1) / times.sum(axis=-1) ** 2)
+
+
+def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray[np.intp]) -> Invariance:
+    rng = np.random.default_rng(0)
+    count = len(of_a)
+    apart, step = ratio(of_a, of_b, order)
+    score_a, score_b = classifier_scores(of_a, of_b)
+    distances = np.linalg.norm(of_a - of_b, axis=1)
+    steps = np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
+    drawn = rng.integers(0, count, (DRAWS, count))
+    below = np.median(steps[rng.integers(0, count - 1, (DRAWS, count - 1))], axis=1)
+    rho_low, rho_high = np.percentile(np.median(distances[drawn], axis=1) / np.maximum(below, 1e-30), (2.5, 97.5))
+    times = np.stack([(drawn == press).sum(axis=1) for press in range(count)], axis=1).astype(np.float64)
+    auc_low, auc_high = np.percentile(area_under_curve(score_a, score_b, times), (2.5, 97.5))
+    return Invariance(
+        view=name,
+        signal=signal,
+        distance=apart / signal if signal > 0 else math.nan,
+        neighbour=step / signal if signal > 0 else math.nan,
+        rho=apart / step if step > 0 else math.nan,
+        rho_low=float(rho_low),
+        rho_high=float(rho_high),
+        auc=float(area_under_curve(score_a, score_b)),
+        auc_low=float(auc_low),
+        auc_high=float(auc_high),
+    )
+
+
+def _size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
+    """Half the side of the patch [px], and how large that is in words."""
+    if calibration is not None:
+        return PATCH / 2 / calibration.geometry.pixel_pitch, f"{PATCH * 1e3:g} mm"
+    half = OF_RADIUS / 2 * float(np.median(radii))
+    return half, f"{2 * half:.0f} px: {OF_RADIUS:g} radii of the usual contact region"
+
+
+def _patches(
+    comparison: Comparison,
+    touched: dict[int, metrics.Patch],
+    calibration: Calibration | None,
+    grid: CanonicalGrid,
+    half: float,
+) -> dict[str, tuple[Float64, Float64, Float64]]:
+    """Of each view the patches (n, d) of A and of B, and the norms (n,) of B's change."""
+    found: dict[str, tuple[list[Float64], list[Float64], list[float]]] = {view: ([], [], []) for view in VIEWS}
+    a0, b0 = comparison.alignment(comparison.a.reference), comparison.b.reference.astype(np.float32)
+    for k, patch in touched.items():
+        pair, x, y = comparison.pairs[k], patch.x, patch.y
+        seen_a, seen_b = comparison.alignment(pair.a.image), pair.b.image.astype(np.float32)
+        still = _cut(b0, x, y, half)
+        for view, one, other in (("raw", seen_a, seen_b), ("difference", seen_a - a0, seen_b - b0)):
+            cut = _cut(other, x, y, half)
+            zero = still if view == "raw" else 0.0
+            _add(found[view], _cut(one, x, y, half), cut, cut - zero)
+        if comparison.touched_a is None or comparison.touched_b is None:
+            continue
+        at_x, at_y, reach = _in_cells(comparison, k, calibration, grid, x, y)
+        touch_a, touch_b = comparison.touched_a[k], comparison.touched_b[k]
+        for view, one, other in (
+            ("gradient", touch_a.gradient, touch_b.gradient),
+            ("height", touch_a.height, touch_b.height),
+        ):
+            cut = _cut(other, at_x, at_y, reach)
+            _add(found[view], _cut(one, at_x, at_y, reach), cut, cut)
+    return {
+        view: (np.array(of_a), np.array(of_b), np.array(signals))
+        for view, (of_a, of_b, signals) in found.items()
+        if of_a
+    }
+
+
+def _add(to: tuple[list[Float64], list[Float64], list[float]], a: Float64, b: Float64, change: Float64) -> None:
+    to[0].append(a)
+    to[1].append(b)
+    to[2].append(float(np.linalg.norm(change)))
+
+
+def _in_cells(
+    comparison: Comparison, k: int, calibration: Calibration | None, grid: CanonicalGrid, x: float, y: float
+) -> tuple[float, float, float]:
+    """Centre of the patch of pair k on the canonical grid, and half its side [cells]."""
+    reach = PATCH / 2 / grid.pitch
+    if calibration is None:  # both surfaces were recorded
+        assert comparison.touched_b is not None
+        patch = metrics.patch_of(metrics.pressed_region(comparison.touched_b[k].height, CONTACT_HEIGHT))
+        return (patch.x, patch.y, reach) if patch is not None else (grid.columns / 2, grid.rows / 2, reach)
+    u0, v0 = calibration.geometry.principal
+    scale = calibration.geometry.pixel_pitch / grid.pitch
+    return (x - u0) * scale + (grid.columns - 1) / 2, (y - v0) * scale + (grid.rows - 1) / 2, reach
+
+
+def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> Float64:
+    """(d,) values of a square patch of a field (H, W[, n]) round x, y, as far as `half` each way."""
+    import cv2
+
+    line = np.linspace(-half, half, POINTS)
+    u, v = (points.astype(np.float32) for points in np.meshgrid(x + line, y + line))
+    picture = np.ascontiguousarray(field, dtype=np.float32)
+    spacing = 2 * half / (POINTS - 1)
+    if spacing > 1.0:  # a patch of many pixels: else every few of them would decide
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * spacing), dtype=np.float32)
+    cut = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cut, dtype=np.float64).ravel()
+
+
+def _angle(
+    folds: Sequence[tuple[Comparison, Calibration | None]],
+    touched: Sequence[dict[int, metrics.Patch]],
+    grid: CanonicalGrid,
+    change: Change | None,
+    of_reference: Change | None,
+) -> float:
+    """Mean gradient angle error of B's changed frames against A's surfaces, where those are pressed [degrees]."""
+    angles: list[float] = []
+    for (comparison, calibration), one in zip(folds, touched, strict=True):
+        assert comparison.touched_a is not None
+        truth = [comparison.touched_a[k] for k in one]
+        reference = comparison.b.reference if of_reference is None else of_reference(comparison.b.reference)
+        real = [comparison.pairs[k].b for k in one]
+        shots = [replace(shot, image=shot.image if change is None else change(shot.image)) for shot in real]
+        found, _ = touches(replace(comparison.b, reference=reference), shots, calibration, grid)
+        assert found is not None  # there is a calibration
+        angles += [
+            metrics.gradient_angle(
+                seen.gradient, other.gradient, metrics.pressed_region(seen.height, CONTACT_HEIGHT) & other.valid
+            )
+            for seen, other in zip(truth, found, strict=True)
+        ]
+    return float(np.nanmean(angles))

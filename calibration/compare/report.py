@@ -1,0 +1,212 @@
+"""A comparison as files: compare.json, compare.csv, and compare.html (one file, nothing from outside)."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.compare.compare import METRICS, Comparison, Metric, Overall
+from calibration.compare.invariance import CHANGES, VIEWS, Report
+
+Image = NDArray[np.uint8]
+
+SHOWN = 24  # pairs with pictures, the worst first
+THUMBNAIL = 240  # [px]
+QUALITY = 85  # of the page's JPEG
+WORST_BY = "contact_mae"
+FORMAT = 1
+
+FILES = ("compare.json", "compare.csv", "compare.html")
+
+
+def figures(comparison: Comparison, report: Report | None = None) -> dict[str, float]:
+    """All that a threshold may speak of, by name; NaN where it is not known. Units as in the JSON file."""
+    found = {key: overall.mean for key, overall in comparison.overall.items()}
+    for view in report.views if report else ():
+        found |= {f"rho_{view.view}": view.rho, f"auc_{view.view}": view.auc, f"auc_low_{view.view}": view.auc_low}
+    for drift in report.drifts if report else ():
+        found |= {f"drift_{drift.change.key}": drift.fresh, f"stale_{drift.change.key}": drift.stale}
+    return {name: found.get(name, math.nan) for name in names()}
+
+
+def names() -> list[str]:
+    """The names of all figures."""
+    views = [f"{what}_{view}" for view in VIEWS for what in ("rho", "auc", "auc_low")]
+    drifts = [f"{what}_{change.key}" for change in CHANGES for what in ("drift", "stale")]
+    return [*(metric.key for metric in METRICS), *views, *drifts]
+
+
+def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, Any]:
+    """Everything as JSON: lengths in m, angles in degrees, contact radius and centroid in pixels of B; what is not
+    known is null."""
+    return {
+        "format": FORMAT,
+        "a": {"name": comparison.a.name, "reference": comparison.a.reference_from},
+        "b": {"name": comparison.b.name, "reference": comparison.b.reference_from},
+        "alignment": {"said": comparison.alignment.said, "shift": list(comparison.alignment.shift)},
+        "notes": list(comparison.notes),
+        "overall": {key: _known(overall) for key, overall in comparison.overall.items()},
+        "pairs": [
+            {
+                "a": pair.a.name,
+                "b": pair.b.name,
+                "flags": list(pair.flags),
+                "numbers": {key: _number(value) for key, value in pair.numbers.items()},
+                "null": {key: _number(value) for key, value in pair.null.items()},
+            }
+            for pair in comparison.pairs
+        ],
+        "invariance": None
+        if report is None
+        else {
+            "presses": report.presses,
+            "patch": report.patch,
+            "views": {view.view: _known(view, leave="view") for view in report.views},
+            "gradient_angle": _number(report.angle),
+            "drift": {
+                drift.change.key: {"fresh": _number(drift.fresh), "stale": _number(drift.stale)}
+                for drift in report.drifts
+            },
+            "notes": list(report.notes),
+        },
+    }
+
+
+def write(folder: Path, comparison: Comparison, report: Report | None = None) -> list[Path]:
+    """Writes the three files into `folder`, which exists, and returns their paths. Raises OSError."""
+    paths = [folder / name for name in FILES]
+    text = json.dumps(as_json(comparison, report), indent=1, allow_nan=False)
+    paths[0].write_text(text + "\n", encoding="utf-8")
+    _write_csv(paths[1], comparison)
+    paths[2].write_text(_html(comparison, report), encoding="utf-8")
+    return paths
+
+
+def rows(comparison: Comparison) -> list[tuple[Metric, Overall]]:
+    """The metrics that are known of at least one pair."""
+    found = ((metric, comparison.overall[metric.key]) for metric in METRICS)
+    return [(metric, overall) for metric, overall in found if not math.isnan(overall.mean)]
+
+
+def shown(value: float, metric: Metric) -> str:
+    """A number in the metric's unit for people; a dash where it is not known."""
+    return "–" if math.isnan(value) else "∞" if math.isinf(value) else f"{value * metric.scale:.{metric.digits}f}"
+
+
+def verdict(overall: Overall) -> str:
+    """Against the null, in a word."""
+    if overall.beats_null is None:
+        return "–"
+    return "better" if overall.beats_null else "not better"
+
+
+def _write_csv(path: Path, comparison: Comparison) -> None:
+    keys = [metric.key for metric in METRICS]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["a", "b", *keys, *(f"null_{key}" for key in keys), "flags"])
+        for pair in comparison.pairs:
+            numbers = [*(pair.numbers.get(key) for key in keys), *(pair.null.get(key) for key in keys)]
+            cells = ["" if (value := _number(number)) is None else repr(value) for number in numbers]
+            writer.writerow([_harmless(pair.a.name), _harmless(pair.b.name), *cells, "; ".join(pair.flags)])
+
+
+def _harmless(name: str) -> str:
+    """A file's name that no spreadsheet takes for a formula."""
+    return f"'{name}" if name[:1] in "=+-@\t\r" else name
+
+
+def _html(comparison: Comparison, report: Report | None) -> str:
+    from jinja2 import Environment, StrictUndefined
+
+    def worst(k: int) -> float:
+        value = comparison.pairs[k].numbers[WORST_BY]
+        return -math.inf if math.isnan(value) else value
+
+    order = sorted(range(len(comparison.pairs)), key=worst, reverse=True)
+    known = rows(comparison)
+    columns = [metric for metric, _ in known if metric.key not in ("psnr", "contact_psnr", "mae", "ssim")]
+    template = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string(Path(__file__).with_name("comparison.html.jinja").read_text(encoding="utf-8"))
+    return template.render(
+        comparison=comparison,
+        report=report,
+        rows=known,
+        columns=columns,
+        shown=shown,
+        verdict=verdict,
+        number=lambda value, digits=2: "–" if math.isnan(value) else f"{value:.{digits}f}",
+        pairs=[(comparison.pairs[k], _pictures(comparison, k)) for k in order[:SHOWN]],
+        rest=[comparison.pairs[k] for k in order[SHOWN:]],
+        nan=math.nan,
+    )
+
+
+def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
+    """Captions and pictures (data URLs) of a pair."""
+    pair = comparison.pairs[k]
+    a, b = comparison.aligned(pair.a.image), pair.b.image
+    base_a, base_b = comparison.aligned(comparison.a.reference), comparison.b.reference
+    change_a, change_b = (_grey(one, base) for one, base in ((a, base_a), (b, base_b)))
+    error = np.abs(a.astype(np.float32) - b).mean(axis=2)
+    found = [("A", a), ("B", b), ("A − its reference", change_a), ("B − its reference", change_b)]
+    found.append(("|A − B|, 0 to 64 grey; contact outlined", _outlined(_coloured(error, 64.0), pair.region)))
+    if comparison.touched_a is not None and comparison.touched_b is not None:
+        height_a, height_b = comparison.touched_a[k].height, comparison.touched_b[k].height
+        deepest = max(float(height_a.max()), float(height_b.max()), 1e-6)
+        found += [(f"height of {side}, 0 to {deepest * 1e3:.2f} mm", _coloured(height, deepest))
+                  for side, height in (("A", height_a), ("B", height_b))]  # fmt: skip
+    return [(caption, _inline(picture)) for caption, picture in found]
+
+
+def _grey(image: Image, base: Image) -> Image:
+    grey: Image = np.clip(128.0 + (image.astype(np.float32) - base), 0, 255).astype(np.uint8)
+    return grey
+
+
+def _coloured(field: NDArray[np.floating], full: float) -> Image:
+    """(H, W, 3) false colours of a field from 0 to `full`."""
+    import cv2
+
+    level = np.clip(np.asarray(field, dtype=np.float32) * (255.0 / full), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1], dtype=np.uint8)
+
+
+def _outlined(picture: Image, region: NDArray[np.bool_]) -> Image:
+    from scipy.ndimage import binary_dilation
+
+    marked = picture.copy()
+    marked[binary_dilation(region) & ~region] = 255
+    return marked
+
+
+def _inline(picture: Image) -> str:
+    import cv2
+
+    rows_, columns = picture.shape[:2]
+    scale = THUMBNAIL / max(rows_, columns)
+    size = (max(1, round(columns * scale)), max(1, round(rows_ * scale)))
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
+    small = cv2.resize(picture, size, interpolation=how)
+    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def _known(record: Any, leave: str = "") -> dict[str, Any]:
+    """The fields of a flat record, NaN and infinity as None."""
+    fields: Iterable[str] = record.__slots__
+    values = ((name, getattr(record, name)) for name in fields if name != leave)
+    return {name: _number(value) if isinstance(value, float) else value for name, value in values}
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)

@@ -1,0 +1,93 @@
+"""Height, gradient and flow of a side's frames on the canonical grid, wherever they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.bundle import Calibration
+from calibration.compare.frame_set import BadSide, Image, Shot, Side
+from calibration.normaliser import for_calibrated
+from calibration.reference import UnusableReference
+from tacsim.interface import TactileFrame
+from tacsim.models.sensor import CanonicalGrid
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touch:
+    """The surface of one frame."""
+
+    height: Float32  # (h, w) into the gel [m]
+    gradient: Float32  # (h, w, 2) [-]
+    flow: Float32 | None  # (m, n, 2) at the markers [m]
+    valid: NDArray[np.bool_]  # (h, w)
+
+    def moved(self, shift: NDArray[np.float64]) -> Touch:
+        """The surface seen from `shift` (x, y) [cells] farther on. Its flow stays that of the same markers."""
+        import cv2
+
+        if not shift.any():
+            return self
+        matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
+
+        def at(field: Float32) -> Any:
+            size = (field.shape[1], field.shape[0])
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            return cv2.warpAffine(field, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+        return replace(self, height=np.asarray(at(self.height)), gradient=np.asarray(at(self.gradient)))
+
+
+def touches(
+    side: Side,
+    shots: Sequence[Shot],
+    calibration: Calibration | None,
+    grid: CanonicalGrid,
+    reference: Image | None = None,
+) -> tuple[tuple[Touch, ...] | None, str]:
+    """The surfaces of some frames of a side; or None, and why not.
+
+    With a calibration they are found in the pictures, also where a simulation knows them by itself: then both sides go
+    the same way. `reference`: instead of the side's own. Raises BadSide for a reference that cannot be used.
+    """
+    if calibration is None:
+        return _recorded(shots, grid)
+    normaliser = for_calibrated(calibration, grid)
+    try:
+        normaliser.take_reference(TactileFrame(side.reference if reference is None else reference, 0.0, 0))
+        found = []
+        for shot in shots:
+            seen = normaliser(TactileFrame(shot.image, 0.0, 0), 0.0)
+            assert seen.height is not None and seen.gradient is not None
+            found.append(Touch(seen.height, seen.gradient, seen.flow, seen.valid))
+    except UnusableReference as error:
+        raise BadSide(f"{side.name}: {side.reference_from}: {error}") from None
+    except ValueError as error:
+        raise BadSide(f"{side.name}: {error}") from None
+    return tuple(found), ""
+
+
+def untouched(like: Touch) -> Touch:
+    """The surface of a gel that nothing touches."""
+    flow = None if like.flow is None else np.zeros_like(like.flow)
+    return Touch(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
+
+
+def _recorded(shots: Sequence[Shot], grid: CanonicalGrid) -> tuple[tuple[Touch, ...] | None, str]:
+    shape = (grid.rows, grid.columns)
+    found = []
+    for shot in shots:
+        if shot.surface is None:
+            return None, "pictures alone have no height; give the sensor's calibration"
+        if shot.surface.height.shape != shape:
+            lies = " x ".join(map(str, shot.surface.height.shape))
+            return None, f"the recorded surface has {lies} cells, not {shape[0]} x {shape[1]}; give a calibration"
+        everywhere = np.ones(shape, dtype=np.bool_)
+        found.append(Touch(shot.surface.height, shot.surface.gradient, shot.surface.flow, everywhere))
+    return tuple(found), ""

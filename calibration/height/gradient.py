@@ -1,0 +1,138 @@
+"""Colour -> slope: the inverse of a sensor's light.
+
+A model maps the relative change of colour (I - I0) / mean(I0) of each pixel to the slopes of the surface there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.models.sensor import Lighting, SensorModel
+from tacsim.optics.render import shade, untouched_image
+
+Float32 = NDArray[np.float32]
+
+STEEPEST = 1.5  # slopes that a table knows: up to here along each axis [-]
+STEP = 0.02  # of the slopes at which a table's light is evaluated [-]
+CELLS = 48  # of a table along each colour
+NOISE = 0.02  # relative change of colour that means nothing: a camera's noise [-]
+PRIOR = 0.5  # usual slope: where colour tells nothing, a small slope is likelier than a steep one [-]
+FOREIGN = 0.2  # a colour farther than this from all that the light can make belongs to no known slope [-]
+MARGIN = 0.08  # of a table beyond the colours of its light [-]
+
+
+class GradientModel(Protocol):
+    """Inverse of the light of one sensor, on the pixels of one grid."""
+
+    def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+        """(H, W, 2) slopes [-] of the relative change of colour (H, W, 3), and (H, W) where that colour lies beyond
+        what the model was made for: there the slope is that of the nearest colour it knows."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColourTable:
+    """Inverse of a light that is the same everywhere on the gel. Make it by :func:`from_lighting`.
+
+    Each cell of colour space holds an affine map colour -> slope: the regularised Gauss-Newton step from the slope
+    whose colour is nearest to the middle of the cell. So a coarse table is exact to second order.
+    """
+
+    low: Float32  # (3,) colour change at the lower corner of the first cell
+    scale: Float32  # (3,) cells per unit of colour change
+    maps: Float32  # (CELLS^3, 8) offset (2), then the columns (2,) of the matrix for each colour
+    foreign: NDArray[np.bool_]  # (CELLS^3,)
+
+    def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+        shape = change.shape[:2]
+        colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
+        index = np.zeros(shape, dtype=np.float32)  # whole numbers up to CELLS^3 are exact
+        beyond = np.zeros(shape, dtype=np.bool_)
+        for colour, low, scale in zip(colours, self.low, self.scale, strict=True):
+            at = (colour - low) * scale
+            beyond |= at < 0
+            beyond |= at >= CELLS
+            np.clip(at, 0, CELLS - 1, out=at)
+            index *= CELLS
+            index += np.floor(at, out=at)
+        flat = index.ravel().astype(np.intp)
+        maps = np.ascontiguousarray(self.maps.take(flat, axis=0).T).reshape(8, *shape)
+        slope = maps[:2]
+        for channel, colour in enumerate(colours):
+            part = maps[2 + 2 * channel : 4 + 2 * channel]
+            part *= colour
+            slope += part
+        steep = np.abs(slope)
+        beyond |= np.maximum(steep[0], steep[1]) > STEEPEST
+        np.clip(slope, -STEEPEST, STEEPEST, out=slope)
+        beyond |= self.foreign.take(flat).reshape(shape)
+        return np.moveaxis(slope, 0, -1), beyond
+
+
+def from_model(model: SensorModel) -> ColourTable:
+    """The inverse of a simulated sensor's light, for its mean untouched colour. Raises what :func:`from_lighting`
+    raises, and ValueError for a background picture that cannot be read."""
+    untouched = untouched_image(model.lighting, (model.geometry.height, model.geometry.width))
+    red, green, blue = untouched.mean(axis=(0, 1), dtype=np.float64)
+    return from_lighting(model.lighting, (float(red), float(green), float(blue)))
+
+
+@lru_cache(maxsize=8)
+def from_lighting(lighting: Lighting, background: tuple[float, float, float]) -> ColourTable:
+    """Tabulates the inverse of a Phong light whose untouched gel shows the mean colour `background` (1 is white).
+
+    Where the light does not tell slopes apart (a flank turned away from all lights but one), the smallest one wins.
+    Raises ValueError for a light that cannot be inverted: its colour does not change with the slope along both axes.
+    """
+    base = np.array(background, dtype=np.float32)
+    if not (base > 0).all():
+        raise ValueError(f"lighting: the untouched gel is black in a channel {background}; no change is relative to it")
+    steps = round(STEEPEST / STEP)
+    line = (np.arange(-steps, steps + 1) * STEP).astype(np.float32)
+    slopes = np.stack(np.meshgrid(line, line), axis=-1)
+    flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
+
+    def seen(at: Float32) -> Float32:
+        relative: Float32 = (np.clip(base + shade(at, lighting) - flat, 0.0, 1.0) - base) / base
+        return relative
+
+    colours = seen(slopes)
+    shifts = np.eye(2, dtype=np.float32) * np.float32(STEP / 2)
+    by_slope = np.stack([seen(slopes + shift) - seen(slopes - shift) for shift in shifts], axis=-1) / STEP
+    if float(np.linalg.svd(by_slope[steps, steps], compute_uv=False)[1]) < NOISE / PRIOR:
+        raise ValueError(
+            "lighting: the colour of the gel does not tell its slope along both axes, so no height can be found; "
+            "it needs lights from at least two sides, in different colours"
+        )
+    low = colours.min(axis=(0, 1)) - MARGIN
+    scale = CELLS / (colours.max(axis=(0, 1)) + MARGIN - low)
+    lines = ((np.arange(CELLS) + 0.5)[:, None] / scale + low).T
+    middles = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+    nearest, foreign = _likeliest(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
+    jacobian = by_slope.reshape(-1, 3, 2)[nearest].astype(np.float64)
+    transposed = jacobian.transpose(0, 2, 1)
+    matrix = np.linalg.solve(transposed @ jacobian + (NOISE / PRIOR) ** 2 * np.eye(2), transposed)  # (n, 2, 3)
+    offset = slopes.reshape(-1, 2)[nearest] - np.einsum("nij,nj->ni", matrix, colours.reshape(-1, 3)[nearest])
+    maps = np.concatenate([offset, matrix.transpose(0, 2, 1).reshape(-1, 6)], axis=1).astype(np.float32)
+    return ColourTable(low.astype(np.float32), scale.astype(np.float32), maps, foreign)
+
+
+def _likeliest(colours: Float32, slopes: Float32, middles: Float32) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """For each cell (n, 3) the index of the likeliest of the slopes (m, 2) with colours (m, 3): near in colour (in
+    units of noise) and small (in units of the prior). Cells far from every colour are foreign: they take their nearest
+    neighbour's, as a search for them would last many times longer."""
+    from scipy.ndimage import distance_transform_edt
+    from scipy.spatial import KDTree
+
+    tree = KDTree(np.concatenate([colours / NOISE, slopes / PRIOR], axis=1))
+    asked = np.concatenate([middles / NOISE, np.zeros((len(middles), 2))], axis=1)
+    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=FOREIGN / NOISE)
+    foreign = ~np.isfinite(distance)
+    where = distance_transform_edt(foreign.reshape(CELLS, CELLS, CELLS), return_distances=False, return_indices=True)
+    native = np.ravel_multi_index(tuple(where.reshape(3, -1)), (CELLS, CELLS, CELLS))
+    return np.asarray(index, dtype=np.intp)[native], np.asarray(foreign)

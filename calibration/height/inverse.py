@@ -1,0 +1,117 @@
+"""Colour -> slope by a polynomial in colour and place that was fitted to labelled presses.
+
+The polynomial, of degree 3 in (R, G, B, x, y) together, predicts the parts (nx, ny) = (gx, gy) / sqrt(1 + |g|^2) of the
+normal, which stay bounded where slopes do not (56 weights each; the order of Wang et al. 2021 with position).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from tacsim.models.quantity import Config
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+DEGREE = 3
+TERMS = 56
+GAIN = 2.4  # brings changes of colour to about -2..2, the size of x and y
+ROOM = 1.1  # slopes up to this times the steepest calibrated one are believed
+RIDGE = 1e-6  # times the number of pixels
+
+Weight = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class InverseModel(Config):
+    """The inverse model of one sensor's light."""
+
+    weights: Annotated[tuple[tuple[Weight, Weight], ...], Field(min_length=TERMS, max_length=TERMS)]  # of nx, ny
+    steepest: Annotated[float, Field(gt=0, le=10)]  # slope up to which it was calibrated [-]
+
+
+class PolynomialSlopes:
+    """An inverse model made ready for pixels at places x, y (H, W) in -1..1 across the sensor's own image."""
+
+    def __init__(self, model: InverseModel, x: Float64, y: Float64) -> None:
+        self._steepest = ROOM * model.steepest
+        colours = [powers for powers in _colour_powers() if powers]
+        self._powers: list[tuple[int, ...]] = [(), *colours]
+        maps = {powers: np.zeros((2, *x.shape)) for powers in self._powers}
+        for (colour, place), weight in zip(_terms(), model.weights, strict=True):
+            at = np.prod([(x, y)[axis] for axis in place], axis=0) if place else np.ones_like(x)
+            maps[colour] += np.array(weight)[:, None, None] * at * GAIN ** len(colour)
+        self._maps = {powers: grid.astype(np.float32) for powers, grid in maps.items()}
+
+    def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+        """Slopes (H, W, 2) of relative changes (H, W, 3); where they are steeper than calibrated they are clipped."""
+        colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
+        products: dict[tuple[int, ...], Float32] = {}
+        normal = self._maps[()].copy()  # zeros, unless somebody's weights say otherwise
+        product = np.empty_like(normal)
+        for powers in self._powers[1:]:
+            last = colours[powers[-1]]
+            products[powers] = last if len(powers) == 1 else products[powers[:-1]] * last
+            np.multiply(self._maps[powers], products[powers], out=product)
+            normal += product
+        square = normal[0] * normal[0] + normal[1] * normal[1]
+        largest = np.float32(self._steepest / np.sqrt(1.0 + self._steepest**2))
+        beyond = square > largest * largest
+        if beyond.any():
+            normal[:, beyond] *= largest / np.sqrt(square[beyond])
+            square[beyond] = largest * largest
+        slope = normal / np.sqrt(1.0 - square)
+        return np.moveaxis(slope, 0, -1), np.asarray(beyond)
+
+
+def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:
+    """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1; each term lies together in memory."""
+    inputs = np.stack([*(GAIN * change).T, x, y])
+    found: dict[tuple[int, ...], int] = {}
+    terms = np.empty((TERMS, len(x)))
+    for row, (colour, place) in enumerate(_terms()):
+        factors = (*colour, *(3 + axis for axis in place))
+        found[factors] = row
+        if not factors:
+            terms[row] = 1.0
+        else:  # a term of one factor less, which comes before it, times its last
+            np.multiply(terms[found[factors[:-1]]], inputs[factors[-1]], out=terms[row])
+    return terms.T
+
+
+def to_normal(gradient: Float64) -> Float64:
+    """(..., 2) parts of the unit normal in the plane, of slopes (..., 2)."""
+    normal: Float64 = gradient / np.sqrt(1.0 + (gradient**2).sum(axis=-1, keepdims=True))
+    return normal
+
+
+def fit_inverse(sets: Sequence[tuple[Float64, Float64]], *, place: bool) -> Float64:
+    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `place` those of
+    all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The ridge grows
+    with the number of pixels, which the first diagonal element counts."""
+    use = np.array([i for i, (colour, axes) in enumerate(_terms()) if colour and (place or not axes)])
+    square = sum((s[np.ix_(use, use)] for s, _ in sets), np.zeros((len(use), len(use))))
+    right = sum((r[use] for _, r in sets), np.zeros((len(use), 2)))
+    weights = np.zeros((TERMS, 2))
+    weights[use] = np.linalg.solve(square + RIDGE * square[0, 0] * np.eye(len(use)), right)
+    return weights
+
+
+def _colour_powers() -> list[tuple[int, ...]]:
+    """Products of colours as sorted channels: (), (0,), ..., (0, 0), (0, 1), ..., (2, 2, 2)."""
+    return [c for order in range(DEGREE + 1) for c in itertools.combinations_with_replacement(range(3), order)]
+
+
+def _terms() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """(channels, axes) of every term: products of at most DEGREE colours and places together."""
+    return [
+        (colour, place)
+        for colour in _colour_powers()
+        for order in range(DEGREE + 1 - len(colour))
+        for place in itertools.combinations_with_replacement(range(2), order)
+    ]

@@ -1,0 +1,190 @@
+"""Change of colour over a sensor's view -> height and gradient on the canonical grid.
+
+The view is wider than the canonical image: all of the gel that the camera sees. Slopes are integrated over all of it,
+because its border, farther from the contact, is the best zero there is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.drift import THIN, DriftFinder, size_of
+from calibration.height.depth import Integrator
+from calibration.height.gradient import GradientModel
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.optics.grid import PixelGrid, canonical_image
+
+Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+INK = 0.6  # a pixel darker than this in all channels, relative to the mean of the gel, shows a printed dot
+DOT_RIM = 1  # pixels round a dot that its blurred edge reaches
+BRIDGE = 1.5  # slopes under a dot are those around it, weighted by a Gaussian so wide [px]
+PROBE = 0.02  # change of colour by which the slopes that it stands for are told [-]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundSurface:
+    """What a picture tells of the gel surface, on the canonical grid."""
+
+    height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
+    gradient: Float32  # (h, w, 2) [-]
+    beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
+    drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it to tell
+    background: float | None  # mean angle of the slopes that this change would be taken for [degrees]
+    removed: Float32 | None  # (H, W, 3) part of the canonical image's change that is drift; None: none told or removed
+
+
+class SurfaceFinder:
+    """Finds the surface of one sensor.
+
+    Args:
+        slopes: the inverse of its light, on the pixels of :func:`seen_box`.
+        valid: (H, W) of :func:`view`, as the rectification gives it.
+        dots: dots are printed on the gel.
+        drifts: the light changes in time, as that of any real sensor; what changes where nothing touches is removed.
+            It is measured in any case: see `FoundSurface.background`.
+    """
+
+    def __init__(
+        self, slopes: GradientModel, valid: Mask, grid: CanonicalGrid, *, dots: bool, drifts: bool = False
+    ) -> None:
+        self._slopes, self._grid, self._dots = slopes, grid, dots
+        self._box = seen_box(valid)
+        self._unseen = ~valid[self._box]
+        pitch = grid.pitch / grid.image_scale
+        self._drift, self._drifts = DriftFinder(self._unseen.shape), drifts
+        # the canonical image in the seen box: its first row and column, and its size
+        self._image = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
+        corner = [(there - own) // 2 for there, own in zip(valid.shape, self._image, strict=True)]
+        self._corner = (corner[0] - self._box[0].start, corner[1] - self._box[1].start)
+        self._response = _response(slopes, self._unseen.shape)
+        self._integrate = Integrator(self._unseen.shape, pitch)
+        self._shape = valid.shape
+        self._any_unseen = bool(self._unseen.any())
+        self._known: _Known | None = None
+
+    def __call__(self, change: Float32, reference: Float32) -> FoundSurface:
+        """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3), known again by
+        its identity."""
+        if self._known is None or self._known.picture is not reference:
+            self._known = self._prepared(reference)
+        known, hidden = self._known, self._known.hidden
+        planes = np.empty((3, *self._unseen.shape), dtype=np.float32)  # work on planes is several times as fast
+        for channel in range(3):
+            np.multiply(change[(*self._box, channel)], known.gain[channel], out=planes[channel])
+        if self._dots:
+            hidden = hidden | _ink(known.planes + planes)
+        drift = self._drift(planes, hidden)
+        changed = self._drift.at(drift) if drift.told else None
+        if self._drifts:
+            self._drift.remove(planes, drift)
+        gradient, beyond = self._slopes(np.moveaxis(planes, 0, -1))
+        by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
+        if self._dots:
+            _bridge((by_x, by_y), hidden)
+        if self._any_unseen:
+            by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
+        height = self._integrate(np.stack([by_x, by_y], axis=-1))
+        return FoundSurface(
+            height=self._cells(height),
+            gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
+            beyond=float(np.count_nonzero(beyond & ~hidden) / beyond.size),
+            drift=None if changed is None else size_of(changed),
+            background=None if changed is None else self._angle(changed),
+            removed=self._drift.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
+            if self._drifts and drift.told
+            else None,
+        )
+
+    def _angle(self, change: Float32) -> float:
+        """Mean angle [degrees] over the gel of the slopes that changes of colour (n, 3) at every THIN-th pixel are."""
+        slope = np.einsum("nsc,nc->ns", self._response, change)
+        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::THIN, ::THIN].ravel()]
+        return float(np.degrees(np.arctan(steepness)).mean())
+
+    def _prepared(self, picture: Float32) -> _Known:
+        reference = picture[self._box]
+        hidden = self._unseen | _ink(np.moveaxis(reference, -1, 0)) if self._dots else self._unseen
+        # the light that is known is that of all the gel, without its dots
+        gain = (1.0 / reference[~hidden].mean(axis=0)).astype(np.float32)
+        return _Known(picture, np.ascontiguousarray(np.moveaxis(reference * gain, -1, 0)), gain, hidden)
+
+    def _cells(self, plane: Float32) -> Float32:
+        """(h, w) means over the cells of the canonical grid, of a plane of the seen box; 0 beyond it."""
+        import cv2
+
+        view = np.zeros(self._shape, dtype=np.float32)
+        view[self._box] = plane
+        size = (self._grid.columns, self._grid.rows)
+        return np.asarray(cv2.resize(window(view, self._grid), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What follows from the reference alone."""
+
+    picture: Float32  # itself
+    planes: Float32  # (3, H, W) of the seen box, relative to the mean of the gel without its dots
+    gain: Float32  # (3,) from relative to the mean with dots, to that without
+    hidden: Mask  # (H, W) not seen, or under a dot at rest
+
+
+def view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
+    """The canonical image, extended by whole cells on each side until it covers a gel of `gel_size` (x, y) [m]."""
+    extra_y, extra_x = (
+        max(0, math.ceil((length / grid.pitch - cells) / 2 - 1e-6))
+        for length, cells in ((gel_size[1], grid.rows), (gel_size[0], grid.columns))
+    )
+    return canonical_image(grid).extended(extra_y * grid.image_scale, extra_x * grid.image_scale)
+
+
+def seen_box(valid: Mask) -> tuple[slice, slice]:
+    """Rows and columns of a view in which gel is seen. Raises ValueError when there are none."""
+    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
+    if len(rows) < 2 or len(columns) < 2:
+        raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def window(view: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
+    """The canonical image in the middle of a view (H, W, ...); it shares the view's memory."""
+    rows, columns = grid.rows * grid.image_scale, grid.columns * grid.image_scale
+    top, left = (view.shape[0] - rows) // 2, (view.shape[1] - columns) // 2
+    return view[top : top + rows, left : left + columns]
+
+
+def _ink(relative: Float32) -> Mask:
+    """(H, W) where an image (3, H, W) relative to the mean of the gel shows a printed dot."""
+    import cv2
+
+    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < INK).view(np.uint8)
+    side = 2 * DOT_RIM + 1
+    return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
+
+
+def _response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
+    """(n, 2, 3) how the slope answers to a small change of colour, at every THIN-th row and column."""
+    answers = []
+    for channel in range(3):
+        change = np.zeros((*shape, 3), dtype=np.float32)
+        change[..., channel] = PROBE
+        up, down = slopes(change)[0], slopes(-change)[0]
+        answers.append(((up - down) / (2 * PROBE))[::THIN, ::THIN].reshape(-1, 2))
+    return np.stack(answers, axis=-1)
+
+
+def _bridge(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
+    """Gives planes of slopes (H, W) in the hidden pixels a weighted mean of what surrounds these."""
+    import cv2
+
+    told = (~hidden).astype(np.float32)
+    total = np.maximum(cv2.GaussianBlur(told, (0, 0), BRIDGE), np.float32(1e-6))
+    for slope in slopes:
+        around = cv2.GaussianBlur(slope * told, (0, 0), BRIDGE)
+        np.copyto(slope, around / total, where=hidden)

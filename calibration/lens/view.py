@@ -1,0 +1,330 @@
+"""Where points of space and of the gel's plane appear in a camera's picture: lens, and view of the plane.
+
+A lens is calibrated from several pictures of one board, tilted in many ways. The view of a gel's plane needs one
+picture of a board that lies on it: a perspective, through the lens if it is known; if not, radial distortion is fitted
+along, as far as dots that are left out are predicted better by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from calibration.errors import Unusable
+from calibration.lens.board import Points
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.quantity import Config, Length
+from tacsim.models.sensor import SensorGeometry
+
+FEWEST_PICTURES = 6  # for a lens
+LARGEST_RESIDUAL = 1.5  # of a lens, root mean square [px]
+LARGEST_DOUBT = 0.03  # standard deviation of the focal length over itself
+LEAST_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]
+LARGEST_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
+FEWEST_POINTS = 6  # of a plane
+
+Side = Annotated[int, Field(ge=16, le=8192)]
+Positive = Annotated[Length, Field(gt=0)]
+Pair = tuple[float, float]
+
+
+class BadView(Unusable):
+    """Pictures of a board that tell no lens, or no plane."""
+
+
+class Lens(Config):
+    """A pinhole with distortion (Brown's model, as OpenCV has it)."""
+
+    width: Side  # of the picture [px]
+    height: Side
+    focal: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]  # fx, fy [px]
+    centre: Pair  # cx, cy [px]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    residual: Annotated[float, Field(ge=0)] = 0.0  # root mean square of the calibration [px]
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(3, 3) [px]"""
+        return np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1.0]])
+
+    def project(self, directions: FloatArray) -> FloatArray:
+        """(n, 2) pixels of lines of sight (n, 2), each as x/z, y/z."""
+        import cv2
+
+        ahead = np.concatenate([directions, np.ones((len(directions), 1))], axis=1)
+        pixels, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+    def directions(self, pixels: FloatArray) -> FloatArray:
+        """(n, 2) lines of sight x/z, y/z of pixels (n, 2)."""
+        import cv2
+
+        there = cv2.undistortPointsIter(
+            np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2), self.matrix, np.array(self.distortion),
+            np.eye(3), np.eye(3), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+        )  # fmt: skip
+        return np.asarray(there, dtype=np.float64).reshape(-1, 2)
+
+
+class GelView(Config):
+    """Where the gel lies in the native picture. The sensor's x runs along image columns, where its axis is.
+
+    A point (x, y) of the gel [m] is seen along (a, b, c) = perspective (x, y, 1), at the pixel that `lens` gives a / c,
+    b / c.
+    """
+
+    lens: Lens
+    perspective: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    size: tuple[Positive, Positive]  # x, y of the gel that counts, round the sensor's axis [m]
+    pixel_pitch: Positive  # of the rectified picture [m]
+    residual: Annotated[float, Field(ge=0)] = 0.0  # root mean square of the points [px]
+    residual_length: Annotated[Length, Field(ge=0)] = 0.0  # the same on the gel [m]
+    board: str = ""  # by what it was found
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows, columns of the native picture."""
+        return (self.lens.height, self.lens.width)
+
+    @property
+    def geometry(self) -> SensorGeometry:
+        """Of the rectified picture."""
+        width, height = (round(length / self.pixel_pitch) for length in self.size)
+        return SensorGeometry(width=width, height=height, pixel_pitch=self.pixel_pitch)
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """(..., 2) pixels of points (..., 2) of the gel [m]."""
+        seen = _seen(np.array(self.perspective), points.reshape(-1, 2))
+        return self.lens.project(seen).reshape(points.shape)
+
+
+def _seen(perspective: FloatArray, points: FloatArray) -> FloatArray:
+    lines = points @ perspective[:, :2].T + perspective[:, 2]
+    seen: FloatArray = lines[:, :2] / lines[:, 2:]
+    return seen
+
+
+def pinhole(image_shape: tuple[int, int], distortion: Sequence[float] = ()) -> Lens:
+    """A lens of which nothing is known: pixels over the picture's longer side, from its middle. `distortion`: k1, k2,
+    and how far from the picture's middle its centre is, over the longer side."""
+    rows, columns = image_shape
+    k1, k2, off_x, off_y = (*distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+    side = float(max(rows, columns))
+    return Lens(
+        width=columns,
+        height=rows,
+        focal=(side, side),
+        centre=((columns - 1) / 2 + off_x * side, (rows - 1) / 2 + off_y * side),
+        distortion=(k1, k2, 0.0, 0.0, 0.0),
+    )
+
+
+def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tuple[Lens, dict[str, float]]:
+    """The lens from several pictures of one board, and each picture's residual [px]. Raises BadView."""
+    import cv2
+
+    if len(pictures) < FEWEST_PICTURES:
+        raise BadView(
+            f"{len(pictures)} picture(s) of a board are too few for a lens; at least {FEWEST_PICTURES} are needed, 12 "
+            "are good, with the board tilted by 20 to 40 degrees to all sides, and in all corners of the picture"
+        )
+    rows, columns = image_shape
+    on_board = [np.pad(each.board, ((0, 0), (0, 1))).astype(np.float32) for each in pictures.values()]
+    seen = [each.image.astype(np.float32).reshape(-1, 1, 2) for each in pictures.values()]
+    # k3 needs more of a fish-eye than these cameras have
+    answer: Any = cv2.calibrateCameraExtended(
+        on_board, seen, (columns, rows), np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+    )
+    residual, matrix, distortion, turns, _, doubt, _, each = answer
+    found = dict(zip(pictures, np.ravel(each).tolist(), strict=True))
+    if not residual <= LARGEST_RESIDUAL:
+        worst = max(found, key=found.__getitem__)
+        raise BadView(
+            f"the pictures do not fit one lens and one flat board: {residual:.2f} px root mean square, "
+            f"{LARGEST_RESIDUAL:g} at most (worst: {worst}, {found[worst]:.2f} px). Is the board flat, its size right, "
+            "and the focus fixed?"
+        )
+    tilt = _tilt(Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2])
+    if not tilt >= LEAST_TILT:
+        raise BadView(
+            f"the board is tilted by only {np.degrees(tilt):.1f} degrees between pictures (root mean square), "
+            f"{np.degrees(LEAST_TILT):.0f} are needed to tell its distance from the focal length: tilt the board more, "
+            "by 20 to 40 degrees to all sides"
+        )
+    unsure = float(np.max(np.ravel(doubt)[:2] / np.diag(matrix)[:2]))
+    if not unsure <= LARGEST_DOUBT:
+        raise BadView(
+            f"the focal length is unsure by {unsure:.0%} ({LARGEST_DOUBT:.0%} at most): tilt the board more, by 20 to "
+            "40 degrees to all sides"
+        )
+    k = [float(value) for value in np.ravel(distortion)[:5]]
+    lens = Lens(
+        width=columns,
+        height=rows,
+        focal=(float(matrix[0, 0]), float(matrix[1, 1])),
+        centre=(float(matrix[0, 2]), float(matrix[1, 2])),
+        distortion=(k[0], k[1], k[2], k[3], k[4]),
+        residual=float(residual),
+    )
+    return lens, found
+
+
+def _tilt(normals: FloatArray) -> float:
+    """Root mean square of the angles between normals (n, 3) and their mean [rad]."""
+    mean = normals.mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    return float(np.sqrt((np.arccos(np.clip(normals @ mean, -1.0, 1.0)) ** 2).mean()))
+
+
+def board_pose(lens: Lens, points: Points) -> tuple[Pose, float]:
+    """camera_from_board, and the residual [px]. Raises BadView."""
+    import cv2
+
+    on_board = np.pad(points.board, ((0, 0), (0, 1)))
+    known = (lens.matrix, np.array(lens.distortion))
+    done, turn, shift = cv2.solvePnP(on_board, points.image, *known, flags=cv2.SOLVEPNP_IPPE)
+    if not done:
+        raise BadView("the board's points tell no pose")
+    turn, shift = cv2.solvePnPRefineLM(on_board, points.image, *known, turn, shift)
+    again, _ = cv2.projectPoints(on_board, turn, shift, *known)
+    missed = np.asarray(again).reshape(-1, 2) - points.image
+    return se3.from_rotation_vector(np.ravel(shift), np.ravel(turn)), float(np.sqrt((missed**2).sum(axis=1).mean()))
+
+
+def fit_view(
+    points: Points,
+    image_shape: tuple[int, int],
+    lens: Lens | None = None,
+    centre: Pair | None = None,
+    size: Pair | None = None,
+    board: str = "",
+) -> GelView:
+    """The view of the plane on which a board lies.
+
+    Args:
+        lens: of the camera; None: radial distortion is fitted along if that pays.
+        centre: pixel (u, v) of the sensor's axis; None: the picture's middle.
+        size: x, y of the gel [m]; None: as far to both sides as the board reaches, plus half a pitch.
+
+    Raises BadView.
+    """
+    if len(points.board) < FEWEST_POINTS:
+        raise BadView(f"{len(points.board)} points tell no plane; at least {FEWEST_POINTS} are needed")
+    rows, columns = image_shape
+    if lens is not None and (lens.height, lens.width) != image_shape:
+        raise BadView(
+            f"the picture is {columns} x {rows} px, the lens was calibrated at {lens.width} x {lens.height} px; use "
+            "one setting of the camera"
+        )
+    middle = points.board.mean(axis=0)
+    local: FloatArray = np.asarray(points.board - middle, dtype=np.float64)
+    if lens is not None:
+        perspective, missed = _plane(lens, local, points.image), np.zeros(0)
+    else:
+        lens, perspective = _distorted(local, points.image, image_shape)
+    missed = lens.project(_seen(perspective, local)) - points.image
+    residual = float(np.sqrt((missed**2).sum(axis=1).mean()))
+    if not residual <= LARGEST_MISFIT * points.spacing:
+        raise BadView(
+            f"the points lie on no plane that this camera could see: {residual:.2f} px root mean square, where "
+            f"neighbours are {points.spacing:.0f} px apart ({LARGEST_MISFIT:.0%} at most). Is the board flat on the "
+            "gel, and its number of rows and columns right?"
+        )
+    back: FloatArray = np.asarray(np.linalg.inv(perspective), dtype=np.float64)
+    axis = ((columns - 1) / 2, (rows - 1) / 2) if centre is None else centre
+    near = lens.directions(np.array([axis, (axis[0] + 1.0, axis[1]), (axis[0], axis[1] + 1.0)]))
+    origin, right, below = _seen(back, near)
+    along = right - origin
+    pitch = float(np.sqrt(np.hypot(*along) * np.hypot(*(below - origin))))
+    turn = np.arctan2(along[1], along[0])
+    board_from_gel = np.array(
+        [[np.cos(turn), -np.sin(turn), origin[0]], [np.sin(turn), np.cos(turn), origin[1]], [0, 0, 1.0]]
+    )
+    on_gel = _seen(np.linalg.inv(board_from_gel), local)
+    if size is None:
+        step = 0.5 * points.spacing * pitch
+        reach = np.minimum(on_gel.max(axis=0), -on_gel.min(axis=0)) + step
+        if not (reach > 2 * step).all():
+            raise BadView("the sensor's axis lies off the board; give --centre, or press the board round it")
+        size = (2 * float(reach[0]), 2 * float(reach[1]))
+    p = perspective @ board_from_gel
+    p /= p[2, 2]
+    return GelView(
+        lens=lens,
+        perspective=tuple(tuple(float(value) for value in row) for row in p),
+        size=size,
+        pixel_pitch=pitch,
+        residual=residual,
+        residual_length=residual * pitch,
+        board=board,
+    )
+
+
+def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int, int]) -> GelView:
+    """The view of a gel of `size` (x, y) [m] by its corners in the picture: top left, top right, bottom right, bottom
+    left [px]. No residual tells whether they are right. Raises calibration.lens.rectification.BadCorners."""
+    from calibration.lens.rectification import check_corners
+
+    check_corners(corners, image_shape)
+    lens = pinhole(image_shape)
+    x, y = size[0] / 2, size[1] / 2
+    perspective = _plane(lens, np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.array(corners, dtype=np.float64))
+    perspective /= perspective[2, 2]
+    middle = lens.project(_seen(perspective, 1e-6 * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
+    along = np.linalg.norm(middle[1:] - middle[0], axis=1)  # [px / um]
+    return GelView(
+        lens=lens,
+        perspective=tuple(tuple(float(value) for value in row) for row in perspective),
+        size=size,
+        pixel_pitch=1e-6 / float(np.sqrt(along[0] * along[1])),
+        board="four corners",
+    )
+
+
+def _plane(lens: Lens, on_board: FloatArray, pixels: FloatArray) -> FloatArray:
+    """(3, 3) perspective from points (n, 2) [m] to lines of sight."""
+    import cv2
+
+    # in units of the board's own size, for the solver's sake
+    unit = float(np.abs(on_board).max())
+    found, _ = cv2.findHomography(on_board / unit, lens.directions(pixels), 0)
+    if found is None:
+        raise BadView("the points tell no plane; they lie on a line")
+    perspective: FloatArray = np.asarray(found, dtype=np.float64) @ np.diag([1 / unit, 1 / unit, 1.0])
+    return perspective
+
+
+def _distorted(on_board: FloatArray, pixels: FloatArray, image_shape: tuple[int, int]) -> tuple[Lens, FloatArray]:
+    """Lens and perspective with as many terms of distortion (k1, k2, its centre) as predict left-out points best."""
+    unit = float(np.abs(on_board).max())
+    scale = np.diag([unit, unit, 1.0])
+    best: tuple[float, Lens, FloatArray] | None = None
+    first = _plane(pinhole(image_shape), on_board, pixels) @ scale
+    start = np.append((first / first[2, 2]).ravel()[:8], (0.0, 0.0, 0.0, 0.0))
+    for terms in (0, 1, 2, 4):
+        if 8 + terms > len(pixels):
+            break
+
+        def lens_and_plane(p: FloatArray) -> tuple[Lens, FloatArray]:
+            return pinhole(image_shape, p[8:].tolist()), np.append(p[:8], 1.0).reshape(3, 3) @ np.linalg.inv(scale)
+
+        def missed(p: FloatArray) -> FloatArray:
+            lens, plane = lens_and_plane(p)
+            off: FloatArray = (lens.project(_seen(plane, on_board)) - pixels).ravel()
+            return off
+
+        fit = least_squares(missed, start[: 8 + terms], x_scale="jac", method="lm")
+        # left-out residuals of a linear fit (Allen's PRESS): r / (1 - leverage)
+        leverage = (np.linalg.qr(np.asarray(fit.jac))[0] ** 2).sum(axis=1)
+        left_out = float(np.sqrt(((fit.fun / np.maximum(1e-6, 1 - leverage)) ** 2).mean()))
+        start[: 8 + terms] = fit.x
+        if best is None or left_out < 0.97 * best[0]:
+            best = (left_out, *lens_and_plane(fit.x))
+    assert best is not None
+    return best[1], best[2]

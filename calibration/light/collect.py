@@ -1,0 +1,70 @@
+"""Presses of a ball, judged one by one while a person is still there to press again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.light.ball_press import BadPresses, find_press, untouched_mean
+from calibration.light.circle import NoCircle
+from calibration.light.dent import ContactCircle
+
+Image = NDArray[np.uint8]
+
+APART = 0.5  # two presses are in one place if their centres are nearer than this share of the larger contact's radius
+THIRDS = ("left", "middle", "right"), ("top", "middle", "bottom")
+
+
+class PressCollection:
+    """Presses that were taken so far.
+
+    Args:
+        reference: (H, W, 3) uint8 RGB, the native picture without contact.
+        ball: radius of the ball [px of the metric picture].
+        rectify: native picture -> metric one; None: they are the same.
+
+    Raises BadPresses for a picture that nothing can be measured against.
+    """
+
+    def __init__(self, reference: Image, ball: float, rectify: Callable[[Image], Image] | None = None) -> None:
+        self._rectify = rectify if rectify is not None else lambda image: image
+        self._reference = self._rectify(reference)
+        self._mean = untouched_mean(self._reference)
+        self._ball = ball
+        self._circles: list[ContactCircle] = []
+
+    @property
+    def circles(self) -> tuple[ContactCircle, ...]:
+        """Of the presses that were taken, in the metric picture [px]."""
+        return tuple(self._circles)
+
+    def offer(self, image: Image) -> ContactCircle:
+        """Takes a native picture and returns its contact, or raises BadPresses with why it is not taken."""
+        try:
+            circle = find_press("press", self._rectify(image), self._reference, self._mean, self._ball).circle
+        except NoCircle as none:
+            raise BadPresses(str(none)) from none
+        height, width = self._reference.shape[:2]
+        if min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) < circle.radius:
+            raise BadPresses("the contact is cut off by the border of the picture; press nearer to the middle")
+        for number, other in enumerate(self._circles, start=1):
+            if math.hypot(circle.x - other.x, circle.y - other.y) < APART * max(circle.radius, other.radius):
+                raise BadPresses(f"it is in the same place as press {number}; press elsewhere")
+        self._circles.append(circle)
+        return circle
+
+    def next_place(self) -> str:
+        """Where in the picture a press tells most: of its nine parts the one farthest from all presses so far."""
+        height, width = self._reference.shape[:2]
+        best, place = -1.0, "middle"
+        for row in (1, 0, 2):  # the middle first
+            for column in (1, 0, 2):
+                x, y = (column + 0.5) * width / 3, (row + 0.5) * height / 3
+                away = min((math.hypot(c.x - x, c.y - y) for c in self._circles), default=0.0)
+                if away > best:
+                    across, down = THIRDS[0][column], THIRDS[1][row]
+                    best, place = away, across if across == down else f"{down} {across}"
+        return place

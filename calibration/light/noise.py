@@ -1,0 +1,105 @@
+"""Noise of a real camera, from pictures without contact: what differs between two of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.drift import DriftFinder
+from calibration.reference import SATURATED
+from tacsim.models.sensor import CameraNoise
+
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Entry = TypeVar("Entry", bound=np.generic)
+
+TILE = 32  # pixels, each way; what is wider is drift, not noise
+DARK = 2  # at or below, a channel has lost its noise [grey levels]
+FEWEST_TILES = 4
+
+
+class NoiseUnknown(ValueError):
+    """Noise cannot be told from these pictures: why, and what to do."""
+
+
+def measure_noise(frames: Sequence[Image]) -> CameraNoise:
+    """From two or more pictures (H, W, 3) uint8 RGB without contact, of one camera and setting, in the order taken.
+
+    Two pictures far apart in time are subtracted, so that nothing that stands still counts; then a quadratic in the
+    place, the drift of the light, and the mean of each tile are taken off. Spread and correlations are those of the
+    median tile: what happens on less than half of the picture (a touch, a reflection) does not count. Not the median
+    absolute deviation of pixels: in whole grey levels it has steps as large as the noise of a good camera.
+
+    Tiles take a little of the spread of noise that is wide: 1.6 % where neighbours are correlated by 0.7.
+    Raises NoiseUnknown.
+    """
+    if len(frames) < 2:
+        raise NoiseUnknown(f"noise is what differs between pictures without contact; there is {len(frames) or 'none'}")
+    if len({frame.shape for frame in frames}) > 1:
+        raise NoiseUnknown("the pictures without contact differ in size")
+    apart = len(frames) // 2
+    pairs = [pair for pair in zip(frames, frames[apart:], strict=False) if not np.array_equal(*pair)]
+    if not pairs:
+        raise NoiseUnknown("the pictures without contact are all the same one; take them from the running camera")
+    tiles = np.concatenate([_tiles(*pair) for pair in pairs])
+    if len(tiles) < FEWEST_TILES:
+        raise NoiseUnknown(
+            f"only {len(tiles)} parts of {TILE} x {TILE} px are neither black nor saturated in all pictures without "
+            f"contact; {FEWEST_TILES} are needed"
+        )
+    size = tiles.shape[1] * tiles.shape[2]
+    square = np.einsum("nyxc,nyxd->ncd", tiles, tiles) / (2 * (size - 1))  # 2: both pictures are noisy
+    along_x = np.einsum("nyxc,nyxc->n", tiles[:, :, 1:], tiles[:, :, :-1])
+    along_y = np.einsum("nyxc,nyxc->n", tiles[:, 1:], tiles[:, :-1])
+    pixels = np.einsum("nyxc,nyxc->n", tiles, tiles)
+    covariance = np.median(square, axis=0)
+    deviation = np.sqrt(np.diag(covariance))
+    if not (deviation > 0).any():
+        raise NoiseUnknown("the pictures without contact do not differ on most of the gel")
+    # a row of a tile has one pair less than pixels
+    ends = tiles.shape[2] / (tiles.shape[2] - 1), tiles.shape[1] / (tiles.shape[1] - 1)
+    usual = float(np.median(pixels))
+    beside = [end * float(np.median(products)) / usual for end, products in zip(ends, (along_x, along_y), strict=True)]
+    red_green, red_blue, green_blue = _possible(covariance, deviation)
+    return CameraNoise(
+        deviation=(float(deviation[0]), float(deviation[1]), float(deviation[2])),
+        colours=(red_green, red_blue, green_blue),
+        neighbours=(beside[0], beside[1]),
+    )
+
+
+def _tiles(one: Image, other: Image) -> Float64:
+    """(n, h, w, 3) the difference of two pictures tile by tile, drift and mean removed, where neither is black or
+    saturated."""
+    most, least = np.maximum(one, other).max(axis=2), np.minimum(one, other).min(axis=2)
+    lost = np.asarray((most >= SATURATED) | (least <= DARK))
+    level = np.maximum(one.mean(axis=(0, 1)), 1.0)
+    change = other.astype(np.float32) - one
+    planes = np.ascontiguousarray(np.moveaxis(change / level.astype(np.float32), -1, 0), dtype=np.float32)
+    find = DriftFinder((one.shape[0], one.shape[1]))
+    find.remove(planes, find(planes, lost))
+    still = np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64)
+    size = min(TILE, *one.shape[:2])
+    tiles = _cut(still, size)[~_cut(lost[..., None], size).any(axis=(1, 2, 3))]
+    return np.asarray(tiles - tiles.mean(axis=(1, 2), keepdims=True), dtype=np.float64)
+
+
+def _cut(picture: NDArray[Entry], size: int) -> NDArray[Entry]:
+    """(n, size, size, channels) of (H, W, channels); what is left over at the right and lower border is dropped."""
+    rows, columns, channels = picture.shape[0] // size, picture.shape[1] // size, picture.shape[2]
+    whole = picture[: rows * size, : columns * size].reshape(rows, size, columns, size, channels)
+    return whole.swapaxes(1, 2).reshape(-1, size, size, channels)
+
+
+def _possible(covariance: Float64, deviation: Float64) -> tuple[float, float, float]:
+    """Correlations R-G, R-B, G-B. Medians of tiles, taken one by one, need not fit together: the nearest that do."""
+    scale = np.where(deviation > 0, deviation, 1.0)
+    correlation = covariance / np.outer(scale, scale)
+    np.fill_diagonal(correlation, 1.0)
+    values, vectors = np.linalg.eigh(correlation)
+    whole = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    whole /= np.sqrt(np.outer(np.diag(whole), np.diag(whole)))
+    return float(whole[0, 1]), float(whole[0, 2]), float(whole[1, 2])

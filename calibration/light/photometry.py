@@ -1,0 +1,199 @@
+"""Weights of a photometric model from labelled presses, and how well they hold for presses that were left out.
+
+Every press keeps only its normal equations. So any number of presses, orders and left-out presses costs one look at
+the pixels.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.models.photometric import normal_terms, position_terms, term_count
+
+Float64 = NDArray[np.float64]
+
+LARGEST = (5, 2)  # degree in the normal, degree in the place: the most that is tried
+ORDERS = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))  # by number of weights, nearly
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3)  # times the mean of the diagonal of the normal equations
+FEW = 3  # presses up to this number cover too little of the image to know how its light varies
+FEW_RIDGE = 1e-3
+CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
+WORTH = 0.98  # a larger model must lower the left-out error to this
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Size of a photometric model."""
+
+    degree: int
+    position: int
+    ridge: float
+
+    @property
+    def terms(self) -> int:
+        return term_count(self.degree, self.position)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Equations:
+    """Normal equations of one press for the terms of LARGEST. Each channel has its own where pixels are saturated in
+    one and not in another."""
+
+    square: Float64  # (1, terms, terms) of all channels, or (3, terms, terms)
+    right: Float64  # (terms, 3)
+    power: float  # sum of the squares of the changes of colour
+    count: int  # numbers summed
+
+    def __add__(self, other: Equations) -> Equations:
+        """Of the pixels of both."""
+        return Equations(
+            self.square + other.square, self.right + other.right, self.power + other.power, self.count + other.count
+        )
+
+    def __sub__(self, part: Equations) -> Equations:
+        """Without the pixels of a part."""
+        return Equations(
+            self.square - part.square, self.right - part.right, self.power - part.power, self.count - part.count
+        )
+
+
+def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: int) -> Float64:
+    """(n, terms) for slopes (n, 2) at places u, v (n,) in -1/2..1/2."""
+    normal = np.ascontiguousarray(np.moveaxis(normal_terms(gradient, degree), 0, -1))
+    place = np.stack(position_terms(u, v, position), axis=-1)
+    return np.asarray((place[:, :, None] * normal[:, None, :]).reshape(len(gradient), -1), dtype=np.float64)
+
+
+def equations(
+    gradient: Float64, u: Float64, v: Float64, change: Float64, lit: NDArray[np.bool_] | None = None
+) -> Equations:
+    """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
+    and counts; None: all."""
+    if lit is None or lit.all():
+        square, right = _normal_equations(gradient, u, v, change)
+        return Equations(square[None], right, float((change**2).sum()), change.size)
+    counted = change * lit
+    square, right = _normal_equations(gradient, u, v, counted)
+    squares = []
+    for burnt in (~lit).T:
+        lost, _ = _normal_equations(gradient[burnt], u[burnt], v[burnt], counted[burnt])
+        squares.append(square - lost)
+    return Equations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
+
+
+def _normal_equations(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
+    """F^T F and F^T `change` for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is a term
+    of the normal times one of the place, and of the products of two columns most are the same powers. What is left are
+    87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
+    degree, position = LARGEST
+    normals, places = len(_powers(degree)), len(_places(position))
+    sums = np.zeros((len(_products()), len(_places(2 * position))))
+    right = np.zeros((normals, places * 3))
+    for start in range(0, len(gradient), CHUNK):
+        part = slice(start, start + CHUNK)
+        normal = normal_terms(gradient[part], 2 * degree)
+        normal = np.concatenate([normal, normal[2] * normal[:normals]])  # as _products has them
+        place = np.stack(position_terms(u[part], v[part], 2 * position))
+        sums += normal @ place.T
+        right += normal[:normals] @ (place[:places, None] * change[part].T).reshape(places * 3, -1).T
+    of_normals, of_places = _pairs()
+    square = sums[of_normals[None, :, None, :], of_places[:, None, :, None]]  # (places, normals, places, normals)
+    by_place = right.reshape(normals, places, 3).swapaxes(0, 1)
+    return square.reshape(places * normals, -1), by_place.reshape(-1, 3)
+
+
+def _powers(degree: int) -> list[tuple[int, ...]]:
+    """Powers of nx, ny and 1 - nz of the terms of the normal, in their order."""
+    higher = [(order - b, b, 0) for order in range(2, degree + 1) for b in range(order + 1)]
+    return [(1, 0, 0), (0, 1, 0), (0, 0, 1), *higher]
+
+
+def _products() -> list[tuple[int, ...]]:
+    """The same of all products of two terms of the normal (and a few more): terms of twice the degree, and the terms
+    times 1 - nz."""
+    return [*_powers(2 * LARGEST[0]), *((a, b, c + 1) for a, b, c in _powers(LARGEST[0]))]
+
+
+def _places(position: int) -> list[tuple[int, ...]]:
+    """Powers of u and v of the terms of the place."""
+    return [(order - b, b) for order in range(position + 1) for b in range(order + 1)]
+
+
+@functools.cache
+def _pairs() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where the products of each two terms stand: those of the normal (n, n), and those of the place (m, m)."""
+
+    def where(powers: list[tuple[int, ...]], products: list[tuple[int, ...]]) -> NDArray[np.intp]:
+        return np.array([[products.index(tuple(np.add(one, other))) for other in powers] for one in powers])
+
+    degree, position = LARGEST
+    return where(_powers(degree), _products()), where(_places(position), _places(2 * position))
+
+
+def solve(pixels: Equations, order: Order) -> Float64:
+    """(terms, 3) ridge weights; `pixels`: the sum of all presses that count."""
+    part = _part(pixels, _terms_of(order))
+    return ridge_solution(part.square, part.right, order.ridge)
+
+
+def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
+    """(terms, 3) solution of the normal equations (1 or 3, terms, terms), (terms, 3) with `ridge` times the mean
+    diagonal added to the diagonal."""
+    size = square.shape[-1]
+    shift = np.maximum(ridge * np.trace(square, axis1=1, axis2=2) / size, 1e-300)
+    regular = square + shift[:, None, None] * np.eye(size)
+    if len(square) == 1:
+        return np.asarray(np.linalg.solve(regular[0], right), dtype=np.float64)
+    return np.asarray(np.linalg.solve(regular, right.T[..., None])[..., 0].T, dtype=np.float64)
+
+
+def left_out_error(presses: Sequence[Equations], ridge: float) -> float:
+    """Root mean square error of each press predicted from all others [relative change of colour]."""
+    every = functools.reduce(operator.add, presses)
+    error = 0.0
+    for press in presses:
+        others = every - press
+        weights = ridge_solution(others.square, others.right, ridge)
+        own, wanted = press.square, press.right
+        seen = own @ weights if len(own) == 1 else own @ weights.T[..., None]  # (1, terms, 3) or (3, terms, 1)
+        seen = seen[0] if len(own) == 1 else seen[..., 0].T
+        error += press.power - 2 * float((weights * wanted).sum()) + float((weights * seen).sum())
+    return float(np.sqrt(max(error, 0.0) / every.count))
+
+
+def choose_order(presses: Sequence[Equations]) -> Order:
+    """The size of model that the number of presses carries and left-out presses speak for.
+
+    Up to FEW presses: a cubic that is the same everywhere. With more, the smallest model that no larger one betters by
+    more than a little, each with its best ridge.
+    """
+    if len(presses) <= FEW:
+        return Order(3, 0, FEW_RIDGE)
+    best: tuple[float, Order] | None = None
+    for degree, position in sorted(ORDERS, key=lambda order: term_count(*order)):
+        use = _terms_of(Order(degree, position, RIDGES[0]))
+        parts = [_part(press, use) for press in presses]
+        error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
+        order = Order(degree, position, ridge)
+        if best is None or error < WORTH * best[0]:
+            best = (error, order)
+    assert best is not None
+    return best[1]
+
+
+def _part(of: Equations, use: list[int]) -> Equations:
+    """The equations of some of the terms."""
+    return Equations(of.square[:, use][:, :, use], of.right[use], of.power, of.count)
+
+
+def _terms_of(order: Order) -> list[int]:
+    """Where the terms of `order` stand among those of LARGEST."""
+    normals, all_normals = term_count(order.degree, 0), term_count(LARGEST[0], 0)
+    places = term_count(1, order.position) // term_count(1, 0)
+    return [place * all_normals + term for place in range(places) for term in range(normals)]

@@ -1,0 +1,157 @@
+"""Contact circles and elastic skirt, refined together with the light that they imply.
+
+The weights of the light are linear given the geometry, so they are eliminated (variable projection, Golub and Pereyra
+1973; Kaufman's approximation): Levenberg-Marquardt steps on three numbers a press and two of the skirt lower the
+difference of colour that no light explains. No light is assumed, and nobody has to click circles exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.light.dent import STEEPEST_RIM, ContactCircle, Skirt, dent_gradient
+from calibration.light.photometry import features
+
+Float64 = NDArray[np.float64]
+
+DEGREE = 3  # of the light during refinement, the same everywhere on the gel
+RIDGE = 1e-4
+BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
+STEPS = 25
+ENOUGH = 1e-4  # relative gain of a step that ends the refinement
+DELTA = 0.05  # step of the finite differences [px]; of the skirt relative to it
+SKIRTS = [(length, fraction) for length in (0.1, 0.25, 0.5, 0.9) for fraction in (0.6, 1.0)]  # first looks, in balls
+LENGTHS = (0.02, 2.0)  # bounds of the skirt's length, in ball radii
+FRACTIONS = (0.1, 1.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """What the refinement looks at of one press: n pixels round its contact."""
+
+    u: Float64  # (n,) columns [px]
+    v: Float64  # (n,) rows [px]
+    change: Float64  # (n, 3) relative change of colour
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Geometry of all presses."""
+
+    circles: tuple[ContactCircle, ...]
+    skirt: Skirt
+    unexplained: tuple[float, ...]  # share of the power of each press's change of colour that the light leaves
+    total: float  # the same of all presses together
+
+
+def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: float) -> Refined:
+    """Refines the circles; `ball`: radius [px].
+
+    Fixed windows, so that two states compare: they are cut round `start` and stay.
+    """
+    first = [
+        _Problem(windows, tuple(start), Skirt(length * ball, fraction), ball).solved() for length, fraction in SKIRTS
+    ]
+    state = min(first, key=lambda problem: problem.cost)
+    damping = 1e-2
+    for _ in range(STEPS):
+        gradient, curvature = state.normal_equations()
+        for _ in range(8):
+            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-12), -gradient)
+            trial = state.moved(np.asarray(step, dtype=np.float64)).solved()
+            if trial.cost < state.cost:
+                break
+            damping *= 4
+        else:
+            break
+        gain = 1.0 - trial.cost / state.cost
+        state, damping = trial, damping / 3
+        if gain < ENOUGH:
+            break
+    parts = state.part_costs()
+    powers = [float((window.change**2).sum()) for window in windows]
+    shares = tuple(part / max(power, 1e-300) for part, power in zip(parts, powers, strict=True))
+    return Refined(state.circles, state.skirt, shares, sum(parts) / max(sum(powers), 1e-300))
+
+
+@dataclass(slots=True, eq=False)
+class _Problem:
+    """One state of the geometry, with the light that fits it."""
+
+    windows: Sequence[Window]
+    circles: tuple[ContactCircle, ...]
+    skirt: Skirt
+    ball: float
+    cost: float = np.inf
+    _terms: list[Float64] = field(default_factory=list)
+    _square: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
+    _weights: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
+    _residuals: list[Float64] = field(default_factory=list)
+
+    def solved(self) -> _Problem:
+        self._terms = [self._features(i, self.circles[i], self.skirt) for i in range(len(self.windows))]
+        square = sum((t.T @ t for t in self._terms), np.zeros((self._terms[0].shape[1],) * 2))
+        right = sum(
+            (t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3))
+        )
+        self._square = square + RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+        self._weights = np.asarray(np.linalg.solve(self._square, right), dtype=np.float64)
+        self._residuals = [w.change - t @ self._weights for t, w in zip(self._terms, self.windows, strict=True)]
+        self.cost = sum(self.part_costs())
+        return self
+
+    def part_costs(self) -> list[float]:
+        return [float((residual**2).sum()) for residual in self._residuals]
+
+    def normal_equations(self) -> tuple[Float64, Float64]:
+        """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then log length and
+        fraction of the skirt. The light's answer to a motion is projected out."""
+        count = 3 * len(self.circles) + 2
+        gradient, curvature = np.zeros(count), np.zeros((count, count))
+        onto = np.zeros((3, count, len(self._square)))  # by channel: what the light could take over
+        longer = replace(self.skirt, length=self.skirt.length * np.exp(DELTA))
+        stronger = replace(self.skirt, fraction=self.skirt.fraction + DELTA)
+        for i, circle in enumerate(self.circles):
+            moved = [
+                self._features(i, replace(circle, x=circle.x + DELTA), self.skirt),
+                self._features(i, replace(circle, y=circle.y + DELTA), self.skirt),
+                self._features(i, replace(circle, radius=circle.radius - DELTA), self.skirt),
+                self._features(i, circle, longer),
+                self._features(i, circle, stronger),
+            ]
+            signs = (1, 1, -1, 1, 1)
+            # how the residual moves: (5, n, 3)
+            slopes = np.stack(
+                [-(m - self._terms[i]) @ self._weights * (s / DELTA) for m, s in zip(moved, signs, strict=True)]
+            )
+            at = np.array([3 * i, 3 * i + 1, 3 * i + 2, count - 2, count - 1])
+            gradient[at] += np.einsum("pnc,nc->p", slopes, self._residuals[i])
+            curvature[np.ix_(at, at)] += np.einsum("pnc,qnc->pq", slopes, slopes, optimize=True)
+            onto[:, at] += np.einsum("pnc,nk->cpk", slopes, self._terms[i], optimize=True)
+        inverse = np.linalg.inv(self._square)
+        curvature -= np.einsum("cpk,kl,cql->pq", onto, inverse, onto, optimize=True)
+        return gradient, curvature
+
+    def moved(self, step: Float64) -> _Problem:
+        circles = tuple(
+            ContactCircle(
+                circle.x + dx, circle.y + dy, float(np.clip(circle.radius + dr, 1.0, STEEPEST_RIM * self.ball))
+            )
+            for circle, (dx, dy, dr) in zip(self.circles, np.clip(step[:-2].reshape(-1, 3), -4, 4), strict=True)
+        )
+        length = self.skirt.length * np.exp(np.clip(step[-2], -0.5, 0.5))
+        skirt = Skirt(
+            float(np.clip(length, LENGTHS[0] * self.ball, LENGTHS[1] * self.ball)),
+            float(np.clip(self.skirt.fraction + np.clip(step[-1], -0.3, 0.3), *FRACTIONS)),
+        )
+        return _Problem(self.windows, circles, skirt, self.ball)
+
+    def _features(self, i: int, circle: ContactCircle, skirt: Skirt) -> Float64:
+        window = self.windows[i]
+        return features(
+            dent_gradient(window.u, window.v, circle, skirt, self.ball, BLUR), window.u, window.v, DEGREE, 0
+        )

@@ -1,0 +1,251 @@
+"""Tactile flow from pictures: how far each dot printed on the gel has moved, in metres.
+
+Dots are sought on a metric grid of their own, fine enough for their size whatever the canonical grid is. The reference
+tells which dot is which row and column (:mod:`calibration.markers.lattice`), and where it rests;
+:mod:`calibration.markers.tracker` follows it from there. A dot that is not seen gets the mean of its neighbours'
+motion: flow is finite everywhere, and `seen` tells which of it was measured.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.height.surface import seen_box
+from calibration.lens.rectification import Rectification
+from calibration.markers.dots import SMALLEST, DotFinder
+from calibration.markers.lattice import Lattice, NoLattice, find_lattice, spread, usual_pitch
+from calibration.markers.tracker import DotTracker
+from calibration.reference import UnusableReference
+from tacsim.models.sensor import Markers
+from tacsim.optics.grid import PixelGrid
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+RADIUS = 2.5  # of a dot on the grid on which dots are sought [px]
+MOST_MISSING = 0.3  # share of the dots in view that a reference may lack
+MOST_STRAY = 0.1  # dots beyond the lattice's rows and columns, in shares of its own
+PINHOLE_STEPS = 4
+FULL = 0.75  # share of its dots that a lattice nobody asked for must show
+LEAST_KEPT = 0.25  # share of the dots that must be seen for a flow
+
+
+class NoMarkers(UnusableReference):
+    """The reference does not show the lattice that the sensor should have."""
+
+
+class MarkersLost(RuntimeError):
+    """Too few dots are seen for a flow."""
+
+
+class MarkerFlow:
+    """The tactile flow of one sensor.
+
+    Args:
+        markers: the lattice.
+        rectify: gives the pixels of `grid`, see :func:`marker_grid`.
+        distance: from the camera's pinhole to the gel at rest [m]; None: it looks along parallel rays.
+    """
+
+    def __init__(
+        self, markers: Markers, rectify: Rectification, grid: PixelGrid, distance: float | None = None
+    ) -> None:
+        """Raises ValueError when the image shows the dots too small, or no gel."""
+        across = _native_pixels(rectify, grid)
+        if across * markers.radius < SMALLEST:
+            raise ValueError(
+                f"markers of radius {markers.radius * 1e3:g} mm are {across * markers.radius:.2g} px in the image, at "
+                f"least {SMALLEST:g} px are needed to follow them; take a finer image, or markers: null"
+            )
+        self._markers, self._distance = markers, distance
+        self._native = rectify.image_shape
+        box = seen_box(rectify.valid)
+        self._whole = _whole(rectify.valid[box], markers.radius / grid.pitch)
+        self._shrink = max(1, math.floor(across * grid.pitch + 1e-6))
+        self._map = _look_ups(rectify, self._shrink, box)
+        self._pitch = grid.pitch
+        self._origin = np.array([grid.x0, grid.y0]) + grid.pitch * np.array([box[1].start, box[0].start])
+        self._find = DotFinder(markers.radius / grid.pitch)
+        self._tracker: DotTracker | None = None
+        self._index = 0
+        self._seen: Mask = np.zeros((markers.rows, markers.columns), dtype=np.bool_)
+
+    @property
+    def seen(self) -> Mask:
+        """(rows, columns) dots that the last picture showed; the flow of the others is that of their neighbours."""
+        return self._seen
+
+    @property
+    def kept(self) -> float:
+        """Share of the reference's dots that the last picture showed."""
+        return float(self._seen.sum() / self._present.sum()) if self._tracker is not None else 0.0
+
+    def take_reference(self, image: Image, index: int = 0) -> None:
+        """Takes a native image (rows, columns, 3) without contact as rest, and forgets all motion so far. Raises
+        NoMarkers; what was the reference then stays."""
+        points = self._points(image)
+        markers = self._markers
+        expected = f"a lattice of {markers.rows} x {markers.columns} dots, {markers.pitch * 1e3:g} mm apart"
+        advice = "is the sensor's light on, is nothing touched, and are its markers those of the model or calibration?"
+        try:
+            lattice = find_lattice(points, (markers.rows, markers.columns), markers.pitch)
+        except NoLattice as nothing:
+            apart = f" {usual_pitch(points) * 1e3:.3g} mm apart" if len(points) > 1 else ""
+            raise NoMarkers(f"the reference shows {len(points)} dots{apart}, not {expected}: {advice}") from nothing
+        visible = self._in_view(lattice.positions)
+        shown = int(lattice.present.sum())
+        if shown < max(4.0, (1.0 - MOST_MISSING) * visible.sum()):
+            raise NoMarkers(f"the reference shows {shown} of {visible.sum()} dots in view of {expected}: {advice}")
+        if lattice.strays > MOST_STRAY * lattice.present.size:
+            raise NoMarkers(
+                f"the reference shows {lattice.strays} dots more than {expected}: give the true rows and columns"
+            )
+        try:
+            tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch, self._in_view)
+        except ValueError as error:
+            raise NoMarkers(f"the reference shows no {expected}: {error}") from error
+        self._tracker, self._index = tracker, index
+        self._rest, self._present = lattice.positions, lattice.present
+        self._seen = lattice.present.copy()
+
+    def __call__(self, image: Image, index: int, height: tuple[Float32, PixelGrid] | None = None) -> Float32:
+        """(rows, columns, 2) displacement against the reference along x, y [m] of the native image of frame `index`.
+
+        `height` (h, w) [m] on its grid: how deep the gel is pressed, for a camera whose distance is known.
+        Raises MarkersLost; ValueError without a reference, or for an image of another shape.
+        """
+        if self._tracker is None:
+            raise ValueError("no reference yet: call take_reference first")
+        tracked = self._tracker(self._points(image), index - self._index)
+        self._index = index
+        seen = self._present.copy()
+        seen[self._present] = tracked.seen
+        self._seen = seen
+        if tracked.kept < LEAST_KEPT:
+            self._tracker.reset()  # what so few say is no motion to go on from
+            raise MarkersLost(
+                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {LEAST_KEPT:.0%} are needed "
+                "for a flow: is the light on, and the gel whole? If so, take a fresh reference"
+            )
+        moved = np.zeros_like(self._rest)
+        moved[self._present] = tracked.displacement
+        moved = spread(moved, self._present)
+        if self._distance is not None and height is not None:
+            moved = self._onto_gel(self._rest + moved, *height) - self._rest
+        return moved.astype(np.float32)
+
+    def _points(self, image: Image) -> Float64:
+        """(n, 2) x, y of the dots in a native image [m]."""
+        import cv2
+
+        if image.dtype != np.uint8 or image.shape != (*self._native, 3):
+            raise ValueError(f"image is {image.shape} {image.dtype}, this sensor delivers {(*self._native, 3)} uint8")
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if self._shrink > 1:
+            rows, columns = (length // self._shrink for length in self._native)
+            whole = grey[: rows * self._shrink, : columns * self._shrink]
+            grey = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+        seen = cv2.remap(grey, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        centres = self._find(np.asarray(seen, dtype=np.uint8)).centres
+        column, row = np.rint(centres).astype(np.intp).T
+        found: Float64 = centres[self._whole[row, column]] * self._pitch + self._origin
+        return found
+
+    def _in_view(self, points: Float64) -> Mask:
+        """(...,) whole dots at `points` (..., 2) [m] lie in the picture and on the gel."""
+        column, row = np.rint(np.moveaxis((points - self._origin) / self._pitch, -1, 0)).astype(np.intp)
+        rows, columns = self._whole.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        return np.asarray(inside & self._whole[row.clip(0, rows - 1), column.clip(0, columns - 1)])
+
+    def _onto_gel(self, apparent: Float64, height: Float32, grid: PixelGrid) -> Float64:
+        """Where dots are (..., 2) that the pinhole shows at `apparent`: what is pressed towards it looks larger."""
+        import cv2
+
+        assert self._distance is not None
+        nothing, at = np.empty(0, dtype=np.float32), apparent
+        for _ in range(PINHOLE_STEPS):  # height is known where the dot is, not where it appears
+            pixel = ((at - (grid.x0, grid.y0)) / grid.pitch).astype(np.float32)
+            deep = cv2.remap(height, pixel, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            at = apparent * (1.0 - np.asarray(deep, dtype=np.float64) / self._distance)[..., None]
+        return at
+
+
+def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
+    """All of the gel (x, y [m]), so fine that a dot's radius is RADIUS pixels."""
+    pitch = markers.radius / RADIUS
+    columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)
+    return PixelGrid(rows, columns, pitch, -(columns - 1) / 2 * pitch, -(rows - 1) / 2 * pitch)
+
+
+def _whole(valid: Mask, radius: float) -> Mask:
+    """Places in a mask about which a whole disc of `radius` [px] is valid; the centre of a cut one is not its own."""
+    import cv2
+
+    reach = math.floor(radius)
+    padded = np.pad(valid.astype(np.uint8), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray(cv2.erode(padded, disc)[1:-1, 1:-1], dtype=np.bool_)
+
+
+def _native_pixels(rectify: Rectification, grid: PixelGrid) -> float:
+    """Pixels of the native image along a metre of the gel, in its middle, where they are fewest."""
+    row, column = (length * rectify.factor // 2 for length in grid.shape)
+    beside = rectify.pixels[row, column - 1] - rectify.pixels[row, column]
+    below = rectify.pixels[row - 1, column] - rectify.pixels[row, column]
+    step = grid.pitch / rectify.factor
+    return float(min(np.hypot(*beside), np.hypot(*below))) / step
+
+
+def _look_ups(
+    rectify: Rectification, shrink: int, box: tuple[slice, slice]
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Where the middle of each pixel in `box` lies in the native image made smaller, in OpenCV's fixed point."""
+    import cv2
+
+    rows, columns = rectify.valid.shape
+    parts = rectify.pixels.reshape(rows, rectify.factor, columns, rectify.factor, 2)
+    middle = (parts[box[0], :, box[1]].mean(axis=(1, 3), dtype=np.float64) - (shrink - 1) / 2) / shrink
+    whole, fraction = cv2.convertMaps(middle.astype(np.float32), np.empty(0, dtype=np.float32), cv2.CV_16SC2)
+    return np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)
+
+
+def find_markers(image: Image) -> tuple[Lattice, float]:
+    """The lattice [px from the middle] in a picture (H, W, 3) without contact of which nothing is known, and the radius
+    of its dots [px]: that radius is sought with which most dots fall into rows and columns. Raises NoLattice."""
+    best: tuple[Lattice, float] | None = None
+    rows, columns, _ = image.shape
+    radius = SMALLEST
+    while radius < min(rows, columns) / 12:
+        dots = DotFinder(radius)(image)
+        try:
+            lattice = find_lattice(dots.centres - ((columns - 1) / 2, (rows - 1) / 2))
+        except NoLattice:
+            pass
+        else:
+            regular = lattice.present.mean() > FULL and min(lattice.present.shape) > 2
+            if regular and (best is None or lattice.present.sum() > best[0].present.sum()):
+                best = lattice, dots.radius
+        radius *= 1.3
+    if best is None:
+        raise NoLattice("the picture shows no lattice of dark dots, at least 3 x 3")
+    return best
+
+
+def require_no_markers(image: Image) -> None:
+    """Raises UnusableReference when a picture (H, W, 3) without contact shows a lattice of dots: to a sensor that knows
+    of none each would be a dent."""
+    try:
+        lattice, _ = find_markers(image)
+    except NoLattice:
+        return
+    rows, columns = lattice.present.shape
+    raise UnusableReference(
+        f"the reference shows a lattice of {rows} x {columns} dark dots, {lattice.pitch:.3g} px apart, but the "
+        "sensor's model or calibration has no markers: give it markers, or calibrate the sensor with --markers"
+    )

@@ -1,0 +1,202 @@
+"""Where a camera sits, from pictures of one board while an arm stands in many poses.
+
+Two cases: the camera rides on the flange and the board is fixed, or the camera is fixed and the board rides. Closed
+forms (Park and Martin 1994) begin; least squares with the noise of board and robot end: a robot's error in rotation
+moves a far board by its lever arm, and no closed form knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibration.poses.ball_touch import deviation
+from calibration.poses.robust_fit import Adjusted, BadMeasurements, adjust, invert, moved, swing
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose
+
+FEWEST = 6  # poses: 36 equations for 12 numbers
+LEAST_SWING = np.radians(15.0)  # of the flange, see adjustment.swing [rad]
+SUBSETS, SUBSET = 12, 5  # starts from a few poses each, lest one bad pose spoil them all
+RESETS = 2  # times that the weights are computed anew
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeNoise:
+    """Standard deviations in each axis that the poses are weighed by [m, rad]."""
+
+    board: float = 0.5e-3  # of the board's place in the camera
+    board_turn: float = np.radians(0.15)
+    robot: float = 0.05e-3  # of the flange's place
+    robot_turn: float = np.radians(0.02)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """One picture of the board, and where the flange was."""
+
+    flange: Pose  # base_from_flange
+    board: Pose  # camera_from_board
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeFit:
+    """Where camera and board sit, and how sure that is."""
+
+    camera: Pose  # flange_from_camera; of a fixed camera base_from_camera
+    board: Pose  # base_from_board; with a fixed camera flange_from_board
+    covariance: FloatArray  # (6, 6) of `camera`: shift [m] and rotation vector [rad], axes of the frame it is given in
+    misses: FloatArray  # (n, 2) how far each board was seen from where it should be: place [m], direction [rad]
+    used: tuple[bool, ...]  # False: disagrees with the others, left out
+    scatter: float  # of the used poses over what the noise allows
+    spread: float  # of the flange's rotations, see adjustment.swing [rad]
+
+    @property
+    def deviation(self) -> tuple[float, float]:
+        """Standard deviations: of the camera's place [m], and of its direction [rad]."""
+        return deviation(self.covariance)
+
+
+def fit_hand_eye(sights: Sequence[Sight], *, fixed: bool = False, noise: HandEyeNoise | None = None) -> HandEyeFit:
+    """Fits where the camera sits to what it saw. `fixed`: the camera is, and the board rides on the flange.
+
+    Raises BadMeasurements.
+    """
+    noise = HandEyeNoise() if noise is None else noise
+    if len(sights) < FEWEST:
+        raise BadMeasurements(f"{len(sights)} poses are too few; at least {FEWEST} are needed, 15 to 30 are good")
+    flange = np.stack([se3.to_matrix(sight.flange) for sight in sights])
+    board = np.stack([se3.to_matrix(sight.board) for sight in sights])
+    spread = swing(flange[:, :3, :3])
+    if spread < LEAST_SWING:
+        raise BadMeasurements(
+            f"the flange turns too little: one direction swings by only {np.degrees(spread):.1f} degrees, "
+            f"{np.degrees(LEAST_SWING):.0f} are needed. Turn it about all axes, 30 degrees and more"
+        )
+    arm = invert(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
+    camera, mount, fit = np.eye(4), np.eye(4), None
+    starts = _starts(arm, board)
+    for _ in range(1 + RESETS):
+        if fit is not None:
+            starts = [(camera, mount)]
+        camera, mount, fit = min(
+            (_solved(arm, board, start, noise, fixed=fixed) for start in starts), key=lambda each: each[2].scatter
+        )
+    assert fit is not None
+    predicted = invert(camera) @ invert(arm) @ mount
+    turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
+    missed = np.linalg.norm(predicted[:, :3, 3] - board[:, :3, 3], axis=1)
+    return HandEyeFit(
+        camera=se3.from_matrix(camera),
+        board=se3.from_matrix(mount),
+        covariance=fit.covariance[:6, :6],
+        misses=np.stack([missed, turn], axis=1),
+        used=fit.used,
+        scatter=fit.scatter,
+        spread=spread,
+    )
+
+
+def _solved(
+    arm: FloatArray, board: FloatArray, start: tuple[FloatArray, FloatArray], noise: HandEyeNoise, *, fixed: bool
+) -> tuple[FloatArray, FloatArray, Adjusted]:
+    camera, mount = start
+    back = invert(arm)
+    seen_turn = np.swapaxes(board[:, :3, :3], 1, 2)
+    whiten = _whitening(camera, mount, arm, noise, fixed=fixed)
+
+    def residuals(change: FloatArray) -> FloatArray:
+        predicted = invert(moved(camera, change[:6])) @ back @ moved(mount, change[6:])
+        turn = Rotation.from_matrix(predicted[:, :3, :3] @ seen_turn).as_rotvec()
+        missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
+        whitened: FloatArray = np.einsum("nij,nj->ni", whiten, missed)
+        return whitened
+
+    fit = adjust(residuals, [np.zeros(12)], "poses")
+    return moved(camera, fit.parameters[:6]), moved(mount, fit.parameters[6:]), fit
+
+
+def _whitening(
+    camera: FloatArray, mount: FloatArray, arm: FloatArray, noise: HandEyeNoise, *, fixed: bool
+) -> FloatArray:
+    """(n, 6, 6) what turns a pose's residuals into six independent ones of variance 1.
+
+    The robot's error is a small motion (shift, turn) of the flange about its own origin, between `before` (flange to
+    camera) and `after` (the board in the flange): it turns the board, and shifts it by turn x lever.
+    """
+    count = len(arm)
+    before = invert(camera) @ invert(arm) if fixed else np.broadcast_to(invert(camera), (count, 4, 4))
+    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else invert(arm) @ mount
+    lever, turn = after[:, :3, 3], before[:, :3, :3]
+    effect = np.zeros((count, 6, 6))
+    effect[:, :3, :3] = effect[:, 3:, 3:] = turn
+    effect[:, :3, 3:] = turn @ -_cross(lever)
+    robot = np.diag([noise.robot**2] * 3 + [noise.robot_turn**2] * 3)
+    seen = np.diag([noise.board**2] * 3 + [noise.board_turn**2] * 3)
+    covariance = seen + effect @ robot @ np.swapaxes(effect, 1, 2)
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def _cross(vectors: FloatArray) -> FloatArray:
+    """(n, 3, 3) matrices C with C w = v x w."""
+    matrix = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    matrix[:, 0, 1], matrix[:, 0, 2], matrix[:, 1, 2] = -z, y, -x
+    return matrix - np.swapaxes(matrix, 1, 2)
+
+
+def _starts(arm: FloatArray, board: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """The closed form's camera and mount: the one that most poses agree with, of all poses and of some subsets."""
+    random = np.random.default_rng(0)
+    count = len(arm)
+    chosen = [np.arange(count)]
+    chosen += [random.choice(count, min(SUBSET, count), replace=False) for _ in range(SUBSETS)]
+    candidates = []
+    for some in chosen:
+        if swing(arm[some, :3, :3]) < LEAST_SWING / 2:
+            continue
+        camera = closed_form(arm[some], board[some])
+        mounts = arm @ camera @ board
+        between = np.linalg.norm(mounts[:, None, :3, 3] - mounts[None, :, :3, 3], axis=-1)
+        between += np.linalg.norm(mounts[:, None, :3, 0] - mounts[None, :, :3, 0], axis=-1)
+        typical = np.median(between, axis=1)
+        candidates.append((float(typical.min()), camera, mounts[int(typical.argmin())]))
+    _, camera, mount = min(candidates, key=lambda each: each[0])
+    return [(camera, mount)]
+
+
+def closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
+    """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) is the same for all i, as near as Park's method gets."""
+    import cv2
+
+    solver: Any = getattr(cv2, "calibrateHandEye", None)
+    if solver is None:  # OpenCV 5.0 has none, though it has the names of its methods
+        return park(arm, board)
+    # method= by keyword: the next positional argument is an output, and a method there is not heeded
+    turn, shift = solver(
+        list(arm[:, :3, :3]), list(arm[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )  # fmt: skip
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = turn, np.ravel(shift)
+    return found if np.isfinite(found).all() else park(arm, board)
+
+
+def park(arm: FloatArray, board: FloatArray) -> FloatArray:
+    """The same without OpenCV: Park and Martin 1994, rotation first (Procrustes over all pairs), then the shift."""
+    pairs = list(combinations(range(len(arm)), 2))
+    a = np.stack([invert(arm[j]) @ arm[i] for i, j in pairs])
+    b = np.stack([board[j] @ invert(board[i]) for i, j in pairs])
+    axes_a, axes_b = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (a, b))
+    u, _, vt = np.linalg.svd(axes_a.T @ axes_b)
+    found = np.eye(4)
+    found[:3, :3] = turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    matrix = (np.eye(3) - a[:, :3, :3]).reshape(-1, 3)
+    known = (a[:, :3, 3] - b[:, :3, 3] @ turn.T).reshape(-1)
+    found[:3, 3] = np.linalg.lstsq(matrix, known, rcond=None)[0]
+    return found

@@ -1,0 +1,132 @@
+"""Files of recorded poses, which the frames of a robot are calibrated from, and what is found, as JSON.
+
+YAML (or JSON, which is YAML): lengths and angles with units, or in m and rad. A pose is a position and a rotation
+vector, as UR writes it. What a program has recorded says how many entries there are, and has one a line, in braces: so
+a file that was cut off is told from a whole one wherever the cut is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from calibration.poses.ball_touch import Touch
+from calibration.poses.hand_eye import Sight
+from tacsim.config import load
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.hardware import Placement
+from tacsim.models.quantity import Config, Length
+from tacsim.pose import rotation
+
+Entry = TypeVar("Entry")
+
+MOST = 1000  # poses of a file
+
+Count = Annotated[int | None, Field(ge=0, le=MOST)]  # entries of a whole file; None: written by hand, not told
+
+
+def _whole(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...]:
+    """Refuses a file that was cut off."""
+    told = info.data.get("count")
+    if told is not None and told != len(entries):
+        raise PydanticCustomError(
+            "cut_off",
+            "holds {held} entries, `count` says {told}: the file was cut off, or changed by hand; record again, or "
+            "correct `count` if the rest is right",
+            {"held": len(entries), "told": told, "at": ()},
+        )
+    return entries
+
+
+class TouchEntry(Config):
+    """One touch of the ball."""
+
+    tool: Placement  # world_from_tool
+    contact: tuple[Length, Length]  # its centre in the sensor's frame, x, y [m]
+    depth: Annotated[Length, Field(ge=0)]  # of the ball in the gel [m]
+
+
+class TouchFile(Config):
+    """Touches of one fixed ball."""
+
+    ball_radius: Annotated[Length, Field(gt=0)]
+    count: Count = None
+    touches: Annotated[tuple[TouchEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
+
+    def measurements(self) -> list[Touch]:
+        return [Touch(each.tool.pose, each.contact, each.depth) for each in self.touches]
+
+
+class SightEntry(Config):
+    """One picture of the board."""
+
+    flange: Placement  # base_from_flange
+    board: Placement  # camera_from_board
+
+
+class SightFile(Config):
+    """Poses of one board, seen by one camera."""
+
+    camera: Literal["flange", "fixed"] = "flange"  # rides on the flange before a fixed board, or the other way round
+    count: Count = None
+    poses: Annotated[tuple[SightEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
+
+    def measurements(self) -> list[Sight]:
+        return [Sight(each.flange.pose, each.board.pose) for each in self.poses]
+
+
+def read_touches(path: Path) -> TouchFile:
+    """Raises tacsim.config.ConfigError."""
+    return load(TouchFile, path)
+
+
+def read_sights(path: Path) -> SightFile:
+    """Raises tacsim.config.ConfigError."""
+    return load(SightFile, path)
+
+
+def touch_file(touches: Sequence[Touch], ball_radius: float) -> TouchFile:
+    """What `write_record` shall write of touches."""
+    entries = tuple(TouchEntry(tool=placement(t.tool), contact=t.contact, depth=max(0.0, t.depth)) for t in touches)
+    return TouchFile(ball_radius=ball_radius, count=len(entries), touches=entries)
+
+
+def sight_file(sights: Sequence[Sight], *, fixed: bool) -> SightFile:
+    """What `write_record` shall write of sights."""
+    entries = tuple(SightEntry(flange=placement(s.flange), board=placement(s.board)) for s in sights)
+    return SightFile(camera="fixed" if fixed else "flange", count=len(entries), poses=entries)
+
+
+def write_record(path: Path, record: TouchFile | SightFile) -> Path:
+    """Writes a file that the functions above read, in the place of one that may be there. Raises OSError."""
+    lines = []
+    for key, value in record.model_dump(mode="json").items():
+        if isinstance(value, list):
+            entries = [yaml.safe_dump(entry, sort_keys=False, default_flow_style=True, width=1000) for entry in value]
+            lines += [f"{key}:\n", *(f"- {entry}" for entry in entries)] if entries else [f"{key}: []\n"]
+        else:
+            lines.append(yaml.safe_dump({key: value}))
+    new = path.with_name(path.name + ".new")  # the old one stays whole until the new one is
+    new.write_text("".join(lines), encoding="utf-8")
+    new.replace(path)
+    return path
+
+
+def placement(pose: Pose) -> Placement:
+    """A pose as files write it: position [m] and rotation vector [rad]."""
+    x, y, z = (float(value) for value in pose.position)
+    a, b, c = (float(value) for value in rotation(pose).as_rotvec())
+    return Placement(position=(x, y, z), rotation=(a, b, c))
+
+
+def plain(pose: Pose, covariance: FloatArray | None = None) -> dict[str, Any]:
+    """A pose for JSON [m, rad]; `covariance` (6, 6): of shift and rotation vector."""
+    found: dict[str, Any] = placement(pose).model_dump(mode="json")
+    if covariance is not None:
+        found["covariance"] = covariance.tolist()
+    return found

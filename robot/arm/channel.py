@@ -1,0 +1,218 @@
+"""What the driver of an arm and its worker process tell each other: orders at the start, then records, both ways."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from robot.arm import shared_ring
+from robot.errors import (
+    DeviceError,
+    DeviceNotConnectedError,
+    EmergencyStop,
+    LinkLost,
+    ProtectiveStop,
+    SafetyViolation,
+)
+from tacsim.interface import FloatArray
+
+HISTORY = 1024  # state records that are kept: two seconds
+COMMANDS = 8
+TOUCHES = 8
+
+
+class ArmStatus(IntEnum):
+    """How an arm is. What stands below FORCE_LIMIT ends by itself; the rest lasts until `recover`."""
+
+    CONNECTING = 0
+    OK = 1  # follows its target
+    HOLD = 2  # stands: nothing was asked, or stop() was, or no action came within action_timeout
+    OUT_OF_REACH = 3  # stands, or slows down: joints, their speed or a singularity keep it from its target
+    WAITING = 4  # stands: the other arm of a keep-out is not connected, or not well
+    BLIND = 5  # stands: what its sensors showed last is older than observation_timeout
+    FORCE_LIMIT = 10
+    WORKSPACE_LIMIT = 11
+    KEEP_OUT = 12  # came too near to the other arm
+    PARTNER_STOPPED = 13  # the other arm of a keep-out stopped, or cannot be seen
+    GEL_LIMIT = 14  # its gel was pressed or dragged too far
+    PROGRAM_STOPPED = 20  # on the controller: its watchdog, the pendant, or power
+    PROTECTIVE_STOP = 21
+    EMERGENCY_STOP = 22  # also a safeguard stop, a safety violation, a fault
+    LINK_LOST = 30
+    WORKER_DEAD = 31
+    CLOSED = 32
+
+    @property
+    def is_fault(self) -> bool:
+        return self >= ArmStatus.FORCE_LIMIT
+
+    @property
+    def text(self) -> str:
+        """What it means, and what to do."""
+        return _TEXTS[self]
+
+    @property
+    def error(self) -> type[DeviceError]:
+        """What a command raises in this state."""
+        return _ERRORS.get(self, SafetyViolation)
+
+
+_TEXTS = {
+    ArmStatus.CONNECTING: "is connecting",
+    ArmStatus.OK: "follows its target",
+    ArmStatus.HOLD: "stands still: no fresh action",
+    ArmStatus.OUT_OF_REACH: "cannot go on towards its target: a joint, its speed or a singularity forbids it",
+    ArmStatus.WAITING: "stands still: the other arm of a keep-out is not connected, or not well",
+    ArmStatus.BLIND: "stands still: the last observation is older than observation_timeout; see the cameras",
+    ArmStatus.FORCE_LIMIT: "felt more than limits.force or limits.torque and stopped; look why, then recover()",
+    ArmStatus.WORKSPACE_LIMIT: "is outside its workspace and stopped; bring it back with the pendant, then recover()",
+    ArmStatus.KEEP_OUT: "came too near to the other arm and stopped; look why, then recover()",
+    ArmStatus.PARTNER_STOPPED: "stopped because the other arm did; recover() that one, then this",
+    ArmStatus.GEL_LIMIT: "pressed or dragged its gel farther than limits.depth or limits.shear and stopped; move it "
+    "away, then recover()",
+    ArmStatus.PROGRAM_STOPPED: "has no running program any more (watchdog, pendant or power); look why, then recover()",
+    ArmStatus.PROTECTIVE_STOP: "made a protective stop; look why, then recover()",
+    ArmStatus.EMERGENCY_STOP: "has an emergency or safeguard stop; a person must release it, then recover()",
+    ArmStatus.LINK_LOST: "sends no packages any more; the controller stops by its own watchdog; see the cable, then "
+    "recover()",
+    ArmStatus.WORKER_DEAD: "lost its worker process; the controller stops by its watchdog; recover() starts another",
+    ArmStatus.CLOSED: "is closed",
+}
+_ERRORS: dict[ArmStatus, type[DeviceError]] = {
+    ArmStatus.CONNECTING: DeviceNotConnectedError,
+    ArmStatus.PROGRAM_STOPPED: ProtectiveStop,
+    ArmStatus.PROTECTIVE_STOP: ProtectiveStop,
+    ArmStatus.EMERGENCY_STOP: EmergencyStop,
+    ArmStatus.LINK_LOST: LinkLost,
+    ArmStatus.WORKER_DEAD: DeviceNotConnectedError,
+    ArmStatus.CLOSED: DeviceNotConnectedError,
+}
+
+
+class Kind(IntEnum):
+    """What a command asks for."""
+
+    HOLD = 0
+    TARGET = 1
+    ZERO_WRENCH = 2
+    CLOSE = 3
+
+
+# One controller package and what the worker makes of it. Written each period, and once more when a fault is found.
+STATE = np.dtype(
+    [
+        ("time", np.float64),  # when the package was first seen, monotonic [s]
+        ("beat", np.float64),  # when the record was written [s]
+        ("stamp", np.float64),  # the controller's own clock [s]
+        ("joints", np.float64, 6),  # [rad]
+        ("joint_speeds", np.float64, 6),  # [rad/s]
+        ("tcp_pose", np.float64, 6),  # base axes, position and rotation vector [m, rad]
+        ("tcp_speed", np.float64, 6),  # [m/s, rad/s]
+        ("tcp_force", np.float64, 6),  # [N, N m]
+        ("position", np.float64, 3),  # of the sensor in the world [m]
+        ("stop", np.float64, 3),  # where the sensor would come to rest [m]
+        ("target", np.float64, 3),  # where the servo target is now [m]
+        ("top_speed", np.float64),  # limits.speed [m/s]
+        ("status", np.int64),
+        ("resting", np.int64),  # the servo target is at rest
+        ("taken", np.int64),  # commands taken so far
+        ("zeroed", np.int64),  # wrench zeroings done by this worker
+        ("rejected", np.int64),  # commands that were no poses
+        ("shortened", np.int64),  # targets that were cut at the workspace
+        ("busy_until", np.float64),  # the worker waits for the controller, at the latest until then [s]
+        ("cycles", np.int64),  # periods of this worker
+        ("overruns", np.int64),  # periods that were missed
+        ("period", np.float64, 3),  # median, 99th percentile, maximum of the last ones [s]
+    ]
+)
+COMMAND = np.dtype([("time", np.float64), ("kind", np.int64), ("pose", np.float64, 7)])  # position, quaternion x y z w
+# What the sensors show, told by the driver after every observation: when the oldest picture was exposed, and how deep
+# and how far the arm's own gel is pressed and dragged (NaN: it cannot tell). A `seen` of NaN: not watched by now.
+TOUCH = np.dtype([("seen", np.float64), ("depth", np.float64), ("shear", np.float64)])
+
+
+@dataclass(frozen=True)
+class Partner:
+    """The other arm of a keep-out."""
+
+    segment: str
+    distance: float  # [m]
+
+
+@dataclass(frozen=True)
+class Orders:
+    """All that a worker is told, in plain numbers: it loads neither pydantic nor SciPy and so is ready soon."""
+
+    name: str
+    host: str
+    model: str
+    refused_serial: str | None  # of a controller that is a mock, while the arm is to be a real one
+    realtime: bool  # ask for real-time priority
+    parent: int  # process number of the driver
+    segment: str
+    world_from_base: list[list[float]]
+    flange_from_tool: list[list[float]]
+    tool_from_sensor: list[list[float]]
+    tcp: list[float]  # flange_from_tool as a UR pose
+    mass: float
+    mass_centre: list[float]
+    lower: list[float]
+    upper: list[float]
+    planes: list[list[list[float]]]
+    speed: float
+    turn_rate: float
+    acceleration: float
+    turn_acceleration: float
+    joint_speed: float
+    force: float
+    torque: float
+    depth: float | None
+    shear: float | None
+    link_timeout: float
+    action_timeout: float
+    observation_timeout: float
+    watchdog: float
+    lookahead: float
+    gain: float
+    partners: list[Partner]
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> Orders:
+        given = json.loads(text)
+        return Orders(**{**given, "partners": [Partner(**partner) for partner in given["partners"]]})
+
+
+class Link:
+    """The shared memory of one arm: states from its worker; commands, and what its sensors show, from its driver."""
+
+    _STATES = shared_ring.Ring.size(STATE, HISTORY)
+    _BOTH = _STATES + shared_ring.Ring.size(COMMAND, COMMANDS)
+    SIZE = _BOTH + shared_ring.Ring.size(TOUCH, TOUCHES)
+
+    def __init__(self, segment: shared_ring.Segment) -> None:
+        view = memoryview(segment.memory)
+        self.states = shared_ring.Ring(view[: self._STATES], STATE, HISTORY)
+        self.commands = shared_ring.Ring(view[self._STATES : self._BOTH], COMMAND, COMMANDS)
+        self.touches = shared_ring.Ring(view[self._BOTH :], TOUCH, TOUCHES)
+
+
+def command(time: float, kind: Kind, pose: FloatArray | None = None) -> shared_ring.Record:
+    """A command record; `pose` (7,) for Kind.TARGET."""
+    record = np.zeros((), COMMAND)
+    record["time"], record["kind"] = time, kind
+    if pose is not None:
+        record["pose"] = pose
+    return record
+
+
+def touch(seen: float, depth: float, shear: float) -> shared_ring.Record:
+    """A touch record; see TOUCH."""
+    record = np.zeros((), TOUCH)
+    record["seen"], record["depth"], record["shear"] = seen, depth, shear
+    return record

@@ -1,0 +1,72 @@
+"""The one place where poses, speeds and forces of a UR controller turn into those of the rig, and back.
+
+A controller speaks of its tool centre point (TCP), in the axes of the base, poses as position and rotation vector; the
+rig speaks of the sensor, in the world. The controller's force is what the surroundings do to the tool, so its sign is
+that of `ArmState.wrench`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot.arm.kinematics import inverse_frame, matrix, rotation_vector
+from tacsim.interface import FloatArray, Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """One package, and where that puts the sensor."""
+
+    joints: FloatArray  # (6,) [rad]
+    flange: FloatArray  # base_from_flange (4, 4) as the controller has it
+    sensor: FloatArray  # world_from_sensor (4, 4)
+    twist: FloatArray  # (6,) of the sensor's origin, world axes [m/s, rad/s]
+    wrench: FloatArray  # (6,) what the object does to the sensor, about its origin, its axes [N, N m]
+
+
+class ArmFrames:
+    """The fixed frames of one arm, each (4, 4): `world_from_base`, `flange_from_tool`, `tool_from_sensor`."""
+
+    def __init__(self, world_from_base: FloatArray, flange_from_tool: FloatArray, tool_from_sensor: FloatArray) -> None:
+        self.world_from_base, self.flange_from_tool, self.tool_from_sensor = (
+            np.array(frame, dtype=np.float64) for frame in (world_from_base, flange_from_tool, tool_from_sensor)
+        )
+        self._tool_from_flange = inverse_frame(self.flange_from_tool)
+        self._base_from_world = inverse_frame(self.world_from_base)
+        self._sensor_from_flange = inverse_frame(self.flange_from_tool @ self.tool_from_sensor)
+
+    def flange(self, world_from_sensor: FloatArray) -> FloatArray:
+        """base_from_flange (4, 4) that brings the sensor to a pose (4, 4)."""
+        frame: FloatArray = self._base_from_world @ world_from_sensor @ self._sensor_from_flange
+        return frame
+
+    def measure(self, joints: FloatArray, pose: FloatArray, speed: FloatArray, force: FloatArray) -> Measured:
+        """What one package says, from joints (6,) and the controller's TCP pose, speed and force, each (6,)."""
+        base_from_tool = matrix(pose)
+        base_from_sensor = base_from_tool @ self.tool_from_sensor
+        lever = base_from_sensor[:3, 3] - base_from_tool[:3, 3]
+        to_world, to_sensor = self.world_from_base[:3, :3], base_from_sensor[:3, :3].T
+        return Measured(
+            joints=joints,
+            flange=base_from_tool @ self._tool_from_flange,
+            sensor=self.world_from_base @ base_from_sensor,
+            twist=np.concatenate([to_world @ (speed[:3] + _cross(speed[3:], lever)), to_world @ speed[3:]]),
+            wrench=np.concatenate([to_sensor @ force[:3], to_sensor @ (force[3:] - _cross(lever, force[:3]))]),
+        )
+
+
+def pose_of(frame: FloatArray) -> Pose:
+    """A frame (4, 4) as a Pose; without SciPy, which is slow for one pose."""
+    vector = rotation_vector(frame[:3, :3])
+    half = 0.5 * math.sqrt(float(vector @ vector))
+    factor = 0.5 * (math.sin(half) / half if half > 1e-9 else 1.0)
+    return Pose(frame[:3, 3], np.array([*(factor * vector), math.cos(half)]))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """np.cross of two vectors, at a tenth of its price."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

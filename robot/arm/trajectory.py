@@ -1,0 +1,137 @@
+"""From where an arm is to where it shall be, one short period at a time, within limits of speed and acceleration.
+
+The way is planned for the sensor's origin and its axes, each with limits of its own: in every period the velocity
+changes by no more than acceleration times period, and the speed is never higher than what still allows to stop on the
+target. The laws are those of discrete time, so they hold for the poses that are sent, to the last digit and not only
+on average: the second difference of the positions is within the acceleration, and the end is met without overshoot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from robot.arm.kinematics import rotation as turn
+from robot.arm.kinematics import rotation_vector
+from tacsim.interface import FloatArray
+
+PERIOD = 2e-3  # of the servo loop [s]
+
+
+class Rates(Protocol):
+    """Limits of a motion; tacsim.models.hardware.ArmLimits has them."""
+
+    @property
+    def speed(self) -> float: ...  # [m/s]
+    @property
+    def acceleration(self) -> float: ...  # [m/s^2]
+    @property
+    def turn_rate(self) -> float: ...  # [rad/s]
+    @property
+    def turn_acceleration(self) -> float: ...  # [rad/s^2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Where a frame is and how it moves, in the axes of the world."""
+
+    position: FloatArray  # (3,) [m]
+    rotation: FloatArray  # (3, 3) world_from_sensor
+    velocity: FloatArray  # (3,) [m/s]
+    spin: FloatArray  # (3,) angular velocity [rad/s]
+
+    @property
+    def at_rest(self) -> bool:
+        return not self.velocity.any() and not self.spin.any()
+
+
+def resting(position: FloatArray, rotation: FloatArray) -> Motion:
+    """At rest at `position` (3,) [m] with axes `rotation` (3, 3)."""
+    return Motion(np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64), np.zeros(3), np.zeros(3))
+
+
+def landing_speed(distance: float, acceleration: float, period: float = PERIOD) -> float:
+    """The highest speed of the next period that still stops `distance` [m] ahead, exactly there [m/s].
+
+    n periods that each brake by a = acceleration * period cover, from speed u, period * (n u - a n (n - 1) / 2). The
+    least n whose last speed is at most a gives u; between whole n the law is linear, so it has no steps.
+    """
+    slowing = acceleration * period
+    n = max(1, math.ceil(0.5 * (math.sqrt(1.0 + 8.0 * distance / (slowing * period)) - 1.0)))
+    return distance / (n * period) + 0.5 * slowing * (n - 1)
+
+
+def stopping_way(speed: float, acceleration: float, period: float = PERIOD) -> float:
+    """How far it goes on from `speed` when every further period brakes as hard as allowed; at most v^2 / 2a [m]."""
+    slowing = acceleration * period
+    n = math.floor(speed / slowing)
+    return period * (n * speed - 0.5 * slowing * n * (n + 1))
+
+
+def towards(
+    now: Motion,
+    position: FloatArray,
+    rotation: FloatArray,
+    rates: Rates,
+    admissible: Callable[[Motion], bool] | None = None,
+    period: float = PERIOD,
+) -> Motion:
+    """One period nearer to the target `position` (3,) [m] and `rotation` (3, 3).
+
+    `admissible` says whether a motion may be begun, judged by where it could still be stopped; what may not be is
+    braked instead, straight on, which only comes back to a stopping point that was admissible before.
+    """
+    velocity, moved, arrived = _approach(position - now.position, now.velocity, rates.speed, rates.acceleration, period)
+    spin, turned, facing = _approach(
+        rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration, period
+    )
+    step = Motion(
+        position.copy() if arrived else now.position + moved,
+        rotation.copy() if facing else turn(turned) @ now.rotation,
+        velocity,
+        spin,
+    )
+    if admissible is None or admissible(step):
+        return step
+    held = braking(now, rates.acceleration, rates.turn_acceleration, period)
+    return replace(held, rotation=step.rotation, spin=step.spin)  # walls stop the origin; it may still turn
+
+
+def braking(now: Motion, deceleration: float, turn_deceleration: float, period: float = PERIOD) -> Motion:
+    """One period nearer to rest, straight on."""
+    velocity = _slower(now.velocity, deceleration * period)
+    spin = _slower(now.spin, turn_deceleration * period)
+    return Motion(now.position + velocity * period, turn(spin * period) @ now.rotation, velocity, spin)
+
+
+def stopping_point(motion: Motion, deceleration: float, period: float = PERIOD) -> FloatArray:
+    """(3,) where the origin comes to rest when it brakes from now on [m]."""
+    speed = math.sqrt(float(motion.velocity @ motion.velocity))
+    if speed == 0.0:
+        return motion.position
+    point: FloatArray = motion.position + motion.velocity * (stopping_way(speed, deceleration, period) / speed)
+    return point
+
+
+def _approach(
+    error: FloatArray, velocity: FloatArray, top: float, acceleration: float, period: float
+) -> tuple[FloatArray, FloatArray, bool]:
+    """The next velocity (3,) towards a point `error` (3,) away, the way of one period, and whether that ends there."""
+    distance = math.sqrt(float(error @ error))
+    speed = min(top, landing_speed(distance, acceleration, period))
+    wanted = error * (speed / distance) if distance > 0.0 else np.zeros(3)
+    change = wanted - velocity
+    excess = math.sqrt(float(change @ change)) / (acceleration * period)
+    if excess > 1.0 + 1e-12:
+        wanted = velocity + change / excess
+        return wanted, wanted * period, False
+    return wanted, wanted * period, speed * period >= distance * (1.0 - 1e-12)
+
+
+def _slower(velocity: FloatArray, change: float) -> FloatArray:
+    speed = math.sqrt(float(velocity @ velocity))
+    return np.zeros(3) if speed <= change else velocity * (1.0 - change / speed)

@@ -1,0 +1,308 @@
+"""The camera of a tactile sensor behind the contract: real, mock, or a folder or video as a stand-in.
+
+A thread reads all frames as they come and keeps the newest; a consumer that pauses gets no old ones. What fails is
+closed and opened again, with back-off. A frame is never delivered beyond its age limit.
+"""
+
+from __future__ import annotations
+
+import atexit
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Self
+
+from robot.camera import stamp as strip
+from robot.camera.capture import Capture, open_capture, source_kind
+from robot.camera.picture import DamagedFrame, Picture, WrongSource
+from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
+from tacsim.interface import EndOfEpisode, SensorSpec, TactileFrame
+from tacsim.models.hardware import CameraSensorConfig
+
+BACK_OFF = (0.05, 0.8)  # first and longest wait before a source is opened again: back within a second [s]
+CLOSE_TIMEOUT = 5.0  # only a name server that does not answer takes longer than a read or a connection [s]
+MAX_STAMP_AGE = 60.0  # a stamp beyond it is of another machine's clock [s]
+FPS_WINDOW = 60  # frames over which the rate is measured
+
+ClockSource = Literal["stamp", "device", "arrival"]
+
+
+class StaleFrame(StaleObservationError, TimeoutError):
+    """No frame within the age limit came in time. A TimeoutError, as the contract of TactileSource says."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraStatus:
+    """How a camera does."""
+
+    open: bool  # frames may come; False while it is being reopened, and after the end
+    fps: float | None  # measured over the last frames since it was opened; None before the second [Hz]
+    age: float | None  # of the newest frame, since exposure; None before the first [s]
+    clock: ClockSource | None  # where its time of exposure is from; `arrival`: minus the calibrated latency
+    frames: int  # received whole
+    dropped: int  # lost on the way, as far as it can be known (see Camera); each is a gap in `index`
+    damaged: int  # received, but not readable
+    reopened: int  # times the source was opened again
+    error: str | None  # why it is not open, or what ended the last opening
+
+
+class Camera:
+    """A `TactileSource` that reads the source its facts name.
+
+    `read` gives the newest frame, at once if it is within the age limit. Between two exposures that is the same frame
+    again, with the same `index`: compare it to tell a new one from one that was seen.
+
+    `index` grows by one a frame and by one more for each that was lost: by the numbers of the stamps; without them by
+    the device's clock; without that (arrival says too little) only damaged frames count. The time of an interruption
+    counts with all of them, at the rate of the facts.
+    Safe to use from several threads.
+    """
+
+    def __init__(self, config: CameraSensorConfig, name: str, connect_timeout: float = 5.0) -> None:
+        """Opens the source and waits for the first frame, at most `connect_timeout` [s].
+
+        Raises WrongSource (a DeviceError) when the source is not what the facts say, DeviceNotConnectedError when no
+        frame came.
+        """
+        source_kind(config, name)
+        self._facts, self._name = config, name
+        self.spec = SensorSpec(image_shape=(config.height, config.width), height=False, flow=False, arm=config.arm)
+        self._stop = threading.Event()
+        self._changed = threading.Condition()  # guards all that follows
+        self._capture: Capture | None = None
+        self._frame: TactileFrame | None = None
+        self._stamp: strip.Stamp | None = None  # of _frame
+        self._clock: ClockSource | None = None
+        self._arrivals: deque[float] = deque(maxlen=FPS_WINDOW)
+        self._received = self._dropped = self._damaged = self._openings = 0
+        self._unread = 0  # damaged since the last whole frame
+        self._refusal: str | None = None  # why the source is wrong at present
+        self._error: str | None = None
+        self._over = False
+        self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
+        # A thread that still runs when the interpreter goes would be cut in the middle of native code.
+        atexit.register(self.close)
+        self._thread.start()
+        try:
+            self._await_first(connect_timeout)
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self, timeout: float) -> TactileFrame:
+        """The newest frame, (height, width, 3) without the strip. Waits at most `timeout` [s] for one within the age
+        limit, else raises StaleFrame (a TimeoutError). Raises WrongSource while the source is not what the facts say,
+        EndOfEpisode when a video or folder is over, DeviceNotConnectedError after `close`."""
+        return self._wait_until(timeout, image=None)
+
+    def wait_for(self, image_number: int, timeout: float) -> TactileFrame:
+        """A frame that shows the picture `image_number` of the mock camera (MockCamera.push) or a later one.
+
+        Raises as `read`, and ValueError for a source without stamps.
+        """
+        if not self._facts.stamped:
+            raise ValueError(f"sensor '{self._name}': wait_for needs a stamped source; this one has no picture numbers")
+        return self._wait_until(timeout, image=image_number)
+
+    @property
+    def stamp(self) -> strip.Stamp | None:
+        """What the strip of the newest frame says; None without stamps."""
+        with self._changed:
+            return self._stamp
+
+    @property
+    def image_number(self) -> int | None:
+        """Number of the pushed picture that the newest frame shows; None without stamps."""
+        with self._changed:
+            return None if self._stamp is None else self._stamp.image
+
+    @property
+    def status(self) -> CameraStatus:
+        """How the camera does now."""
+        with self._changed:
+            fps = None
+            if len(self._arrivals) > 1 and self._arrivals[-1] > self._arrivals[0]:
+                fps = (len(self._arrivals) - 1) / (self._arrivals[-1] - self._arrivals[0])
+            return CameraStatus(
+                open=self._capture is not None,
+                fps=fps,
+                age=None if self._frame is None else time.monotonic() - self._frame.time,
+                clock=self._clock,
+                frames=self._received,
+                dropped=self._dropped,
+                damaged=self._damaged,
+                reopened=max(0, self._openings - 1),
+                error=self._error,
+            )
+
+    def close(self) -> None:
+        """Ends the thread and gives the source back; harmless a second time."""
+        self._stop.set()
+        with self._changed:
+            if self._capture is not None:
+                self._capture.interrupt()
+            self._changed.notify_all()
+        if self._thread is not threading.current_thread():
+            self._thread.join(CLOSE_TIMEOUT)
+        atexit.unregister(self.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _await_first(self, timeout: float) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._frame is not None or self._refusal is not None or self._over, timeout)
+            if self._refusal is not None:
+                raise WrongSource(self._refusal)
+            if self._frame is None and not self._over:
+                raise DeviceNotConnectedError(
+                    f"sensor '{self._name}': no picture from {self._facts.source} within {timeout:.3g} s; "
+                    f"{self._error or 'the source is silent'}"
+                )
+
+    def _wait_until(self, timeout: float, image: int | None) -> TactileFrame:
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while True:
+                now = time.monotonic()
+                if self._stop.is_set():
+                    raise DeviceNotConnectedError(f"sensor '{self._name}': the camera is closed")
+                if self._refusal is not None:
+                    raise WrongSource(self._refusal)
+                if self._over:
+                    raise EndOfEpisode(self._error)
+                frame = self._frame
+                shown = image is None or (self._stamp is not None and self._stamp.image >= image)
+                if frame is not None and shown and now - frame.time <= self._facts.max_age:
+                    return frame
+                if now >= deadline:
+                    raise StaleFrame(self._late(now, timeout, image))
+                self._changed.wait(deadline - now)
+
+    def _late(self, now: float, timeout: float, image: int | None) -> str:
+        what = (
+            f"sensor '{self._name}': no frame {'' if image is None else f'of picture {image} '}within {timeout:.3g} s"
+        )
+        if self._frame is None:
+            newest = "none came yet"
+        else:
+            newest = (
+                f"the newest is {1e3 * (now - self._frame.time):.0f} ms old, limit {1e3 * self._facts.max_age:.0f} ms"
+            )
+            if image is not None and self._stamp is not None:
+                newest += f", and shows picture {self._stamp.image}"
+        return f"{what}: {newest}; {self._error or 'the source is open'} ({self._facts.source})"
+
+    # What the thread does
+
+    def _run(self) -> None:
+        wait = BACK_OFF[0]
+        while not self._stop.is_set():
+            received = self._received
+            live = self._attend()
+            if not live:
+                return
+            wait = BACK_OFF[0] if self._received > received else min(2.0 * wait, BACK_OFF[1])
+            self._stop.wait(wait)
+
+    def _attend(self) -> bool:
+        """Opens the source and takes its frames until it fails; False when there is nothing to open again."""
+        capture: Capture | None = None
+        refused = False
+        try:
+            capture = open_capture(self._facts, self._name, self._stop)
+            with self._changed:
+                self._capture = capture
+                self._openings += 1
+                self._arrivals.clear()
+            while not self._stop.is_set():
+                try:
+                    self._take(capture.read())
+                except DamagedFrame as damage:
+                    self._count_damaged(str(damage))
+        except EndOfEpisode as end:
+            return self._end(str(end))
+        except Exception as failure:  # OpenCV raises errors of its own; whatever it was, the thread must live
+            refused = isinstance(failure, WrongSource)
+            self._lose(failure, refused)
+        finally:
+            with self._changed:
+                self._capture = None
+            if capture is not None:
+                capture.close()
+        return capture is None or capture.live
+
+    def _take(self, picture: Picture) -> None:
+        image, mark = picture.image, None
+        if self._facts.stamped:
+            image, mark = strip.split(image)
+            if mark is None:
+                raise DamagedFrame(
+                    f"sensor '{self._name}': a frame of {self._facts.source} without a readable stamp; it is damaged, "
+                    "or the source burns none in (stamped: false)"
+                )
+        clock: ClockSource
+        if mark is not None:
+            exposure, clock = mark.clock * 1e-6, "stamp"
+            if not 0.0 <= picture.arrival - exposure <= MAX_STAMP_AGE:
+                raise WrongSource(
+                    f"sensor '{self._name}': a stamp {picture.arrival - exposure:.3g} s before arrival: the clock of "
+                    "another machine. Stamped sources must run on this one"
+                )
+        elif picture.exposure is not None:
+            exposure, clock = picture.exposure, "device"
+        else:
+            exposure, clock = picture.arrival - self._facts.latency, "arrival"
+        image.flags.writeable = False  # the same frame may be given to several readers
+        with self._changed:
+            if mark is not None and self._stamp is not None and mark.clock <= self._stamp.clock:
+                return  # seen already: sent again to who comes anew
+            lost = self._lost(mark, exposure, clock)
+            index = 0 if self._frame is None else self._frame.index + 1 + lost
+            self._frame, self._stamp, self._clock = TactileFrame(image=image, time=exposure, index=index), mark, clock
+            self._received += 1
+            self._dropped += lost
+            self._unread = 0
+            self._arrivals.append(picture.arrival)
+            self._refusal = self._error = None
+            self._changed.notify_all()
+
+    def _lost(self, mark: strip.Stamp | None, exposure: float, clock: ClockSource) -> int:
+        """Frames that are missing before this one."""
+        if self._frame is None:
+            return 0
+        numbered = -1
+        if mark is not None and self._stamp is not None:
+            numbered = mark.frame - self._stamp.frame - 1
+        if self._arrivals and clock != "device":
+            return max(numbered, 0) if mark is not None else self._unread
+        # After an interruption numbers may have begun anew: a restarted camera counts from 1.
+        return max(numbered, self._unread, round((exposure - self._frame.time) * self._facts.fps) - 1)
+
+    def _count_damaged(self, error: str) -> None:
+        with self._changed:
+            self._damaged += 1
+            self._unread += 1
+            self._error = error
+
+    def _lose(self, failure: Exception, refused: bool) -> None:
+        text = str(failure) or type(failure).__name__
+        if not isinstance(failure, DeviceError) and self._name not in text:
+            text = f"sensor '{self._name}': {self._facts.source}: {text}"
+        with self._changed:
+            self._error = text
+            self._refusal = text if refused else None
+            self._changed.notify_all()
+
+    def _end(self, text: str) -> bool:
+        with self._changed:
+            self._over, self._error = True, text
+            self._changed.notify_all()
+        return False

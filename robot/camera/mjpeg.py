@@ -1,0 +1,211 @@
+"""MJPEG over HTTP: one opened stream, read with the standard library and Pillow.
+
+Not with OpenCV's FFmpeg: here sizes are checked before anything is decoded, every wait has a deadline (FFmpeg's cover
+no header that never ends), no proxy is asked, and no native thread is left at exit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import io
+import math
+import socket
+import time
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.camera.picture import (
+    CONNECT_TIMEOUT,
+    READ_TIMEOUT,
+    DamagedFrame,
+    Picture,
+    WrongSource,
+    frame_size,
+    wrong_size,
+)
+from tacsim.models.hardware import CameraSensorConfig
+
+_MAX_LINE = 8192  # of the header of a part [bytes]
+_MAX_LINES = 64
+_CHUNK = 65536
+
+
+class MjpegCapture:
+    """MJPEG over HTTP (multipart/x-mixed-replace), with or without lengths of the parts, chunked or not."""
+
+    live = True
+
+    def __init__(self, config: CameraSensorConfig, name: str) -> None:
+        self._what = f"sensor '{name}': {config.source}"
+        self._size = frame_size(config)
+        self._timeout = READ_TIMEOUT + 3.0 / config.fps
+        # Uncompressed pictures need less; a part that is longer is no picture of this size.
+        self._limit = 3 * self._size[0] * self._size[1] + _CHUNK
+        self._buffer = bytearray()
+        self._socket = _connect(config.source, self._what)
+        try:
+            self._answer, self._boundary = self._ask(config.source)
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def _ask(self, url: str) -> tuple[http.client.HTTPResponse, bytes]:
+        parts = urlsplit(url)
+        target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+        request = f"GET {target} HTTP/1.1\r\nHost: {parts.netloc}\r\nUser-Agent: tacsim\r\nConnection: close\r\n\r\n"
+        self._socket.sendall(request.encode("ascii", "strict"))
+        answer = http.client.HTTPResponse(self._socket, method="GET")
+        try:
+            answer.begin()
+        except http.client.HTTPException as error:
+            answer.close()
+            raise WrongSource(f"{self._what}: no HTTP answer ({type(error).__name__}: {error})") from error
+        kind = answer.headers.get_content_type()
+        boundary = answer.headers.get_boundary()
+        if answer.status != 200:
+            reason = f"HTTP status {answer.status} {answer.reason}; check the path (mjpg-streamer: /?action=stream)"
+        elif kind != "multipart/x-mixed-replace":
+            reason = f"content of type {kind}, not an MJPEG stream (multipart/x-mixed-replace); check the path"
+        elif not boundary:
+            reason = "a stream without boundary; is that an MJPEG camera?"
+        else:
+            return answer, b"--" + boundary.strip('"').removeprefix("--").encode("latin-1")
+        answer.close()
+        raise WrongSource(f"{self._what}: {reason}")
+
+    def read(self) -> Picture:
+        self._socket.deadline = time.monotonic() + self._timeout
+        try:
+            data = self._part()
+        except http.client.HTTPException as error:
+            raise ConnectionError(f"{self._what}: the stream broke off ({type(error).__name__})") from error
+        return Picture(self._decode(data), time.monotonic(), None)
+
+    def _part(self) -> bytes:
+        """The bytes of the next picture."""
+        line = self._line()
+        skipped = 0
+        while not line.startswith(self._boundary):  # the end of the line after a picture; junk before the first
+            skipped += len(line) + 2
+            if skipped > self._limit:
+                raise WrongSource(f"{self._what}: no boundary within {skipped} bytes; is that an MJPEG camera?")
+            line = self._line()
+        length = None
+        for _ in range(_MAX_LINES):
+            line = self._line()
+            if not line:
+                break
+            key, _, value = line.partition(b":")
+            if key.strip().lower() == b"content-length" and value.strip().isdigit() and len(value) < 20:
+                length = int(value)
+        else:
+            raise WrongSource(
+                f"{self._what}: a part with more than {_MAX_LINES} header lines; is that an MJPEG camera?"
+            )
+        if length is None:
+            return self._until_boundary()
+        if length > self._limit:
+            raise WrongSource(
+                f"{self._what}: a picture of {length} bytes; {self._size[1]} x {self._size[0]} px need "
+                f"at most {self._limit}"
+            )
+        while len(self._buffer) < length:
+            self._receive()
+        return self._take(length)
+
+    def _until_boundary(self) -> bytes:
+        mark, start = b"\r\n" + self._boundary, 0
+        while (end := self._buffer.find(mark, start)) < 0:
+            if len(self._buffer) > self._limit:
+                raise WrongSource(f"{self._what}: no end of the picture within {self._limit} bytes")
+            start = max(0, len(self._buffer) - len(mark))
+            self._receive()
+        return self._take(end)
+
+    def _line(self) -> bytes:
+        start = 0
+        while (end := self._buffer.find(b"\n", start)) < 0 and len(self._buffer) <= _MAX_LINE:
+            start = len(self._buffer)
+            self._receive()
+        if not 0 <= end <= _MAX_LINE:
+            raise WrongSource(f"{self._what}: a line of more than {_MAX_LINE} bytes; is that an MJPEG camera?")
+        return self._take(end + 1).rstrip(b"\r\n")
+
+    def _receive(self) -> None:
+        data = self._answer.read1(_CHUNK)
+        if not data:
+            raise ConnectionError(f"{self._what}: the camera ended the stream")
+        self._buffer += data
+
+    def _take(self, count: int) -> bytes:
+        data = bytes(self._buffer[:count])
+        del self._buffer[:count]
+        return data
+
+    def _decode(self, data: bytes) -> NDArray[np.uint8]:
+        from PIL import Image
+
+        try:
+            with Image.open(io.BytesIO(data), formats=("JPEG",)) as picture:
+                if picture.size != self._size[::-1]:
+                    raise wrong_size(self._what, (picture.size[1], picture.size[0]), self._size)
+                return np.array(picture.convert("RGB"))
+        except WrongSource:
+            raise
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+            raise WrongSource(f"{self._what}: {error}; expected are {self._size[1]} x {self._size[0]} px") from error
+        except Exception as error:  # a decoder that is fed damaged bytes may raise anything
+            raise DamagedFrame(f"{self._what}: no readable JPEG: {error}") from error
+
+    def interrupt(self) -> None:
+        with contextlib.suppress(OSError):  # it may be closed already
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._answer.close()
+        self._socket.close()
+
+
+class DeadlineSocket(socket.socket):
+    """A socket whose receiving ends at a deadline, however slowly bytes drip."""
+
+    deadline = math.inf  # monotonic clock [s]
+
+    def recv_into(self, *arguments: Any) -> int:
+        left = self.deadline - time.monotonic()
+        if left <= 0.0:
+            raise TimeoutError("no whole frame came in time")
+        self.settimeout(left)
+        return super().recv_into(*arguments)
+
+
+def _connect(url: str, what: str) -> DeadlineSocket:
+    """A connected socket; its deadline is set for the header. Raises OSError, WrongSource for no address."""
+    deadline = time.monotonic() + CONNECT_TIMEOUT
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port or 80
+    except ValueError as error:
+        raise WrongSource(f"{what}: no address ({error})") from error
+    if not host or parts.username is not None or not url.isascii() or not url.isprintable() or " " in url:
+        raise WrongSource(f"{what}: an address looks like http://host:port/?action=stream (no user, no blanks)")
+    failure: OSError = TimeoutError(f"{what}: nobody answers")
+    for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        connection = DeadlineSocket(family, kind, protocol)
+        try:
+            connection.settimeout(max(1e-3, deadline - time.monotonic()))
+            connection.connect(address)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.deadline = deadline
+            return connection
+        except OSError as error:
+            connection.close()
+            failure = error
+        except BaseException:
+            connection.close()
+            raise
+    raise failure

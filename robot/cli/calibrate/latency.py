@@ -1,0 +1,68 @@
+"""`tacsim calibrate latency`: how much later a camera's pictures come than the states of the arm that carries it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import Overrides, busy, notes, quantity, results
+from robot.cli.run import ask
+
+
+def latency(
+    rig: Annotated[str, typer.Argument(help="A rig of hardware, or the path of its file.")],
+    arm: Annotated[str, typer.Option("--arm", help="The arm that taps.")],
+    sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries.")],
+    taps: Annotated[int, typer.Option(min=3, max=100, help="How many; more make it surer.")] = 8,
+    depth: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="How deep, beyond the first touch.")
+    ] = "0.2 mm",
+    lift: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="How far back between taps.")
+    ] = "1 mm",
+    set_: Overrides = None,
+) -> None:
+    """Measure how late a camera is: its arm taps on something firm, and both records are laid over each other.
+
+    The arm MOVES: an episode's start (a person is asked before it approaches), then small taps along the sensor's z.
+    Put something firm, fixed to the table or held by the other arm, before the gel.
+
+    Example: tacsim calibrate latency ur5e --arm upper --sensor upper
+    """
+    from calibration.poses.latency import estimate_latency
+    from robot.open import CannotOpen, open_rig
+    from robot.procedures.taps import CannotTap, TapPlan, entries, record_taps, untimed
+    from tacsim.config import load_rig
+    from tacsim.models.hardware import UrArmConfig
+
+    for what, length in (("--depth", depth), ("--lift", lift)):
+        if not 0.0 < length <= 5e-3:
+            raise typer.BadParameter(f"{1e3 * length:g} mm; allowed: above 0, at most 5 mm", param_hint=what)
+    config = load_rig(rig, overrides=set_ or []).config
+    try:
+        opened = untimed(config, arm, sensor)
+    except CannotTap as wrong:
+        raise CannotOpen(str(wrong)) from wrong
+    with Interrupt() as interrupt:
+        with busy("tapping"), open_rig(opened, confirm=ask) as running:
+            taken = record_taps(running, opened, arm, sensor, TapPlan(taps, depth, lift), interrupt)
+        if interrupt():
+            complain("stopped by a signal; nothing is measured")
+            raise typer.Exit(interrupt.exit_code)
+    found = estimate_latency(taken.arm_times, taken.depth, taken.frame_times, taken.touch)
+    results.print(
+        f"sensors.{sensor} is {1e3 * found.seconds:.1f} ms later than arms.{arm}, ± {1e3 * found.uncertainty:.1f} ms "
+        f"(correlation {found.correlation:.3f}, {found.samples} pictures)"
+    )
+    there = config.arms[arm]
+    assert isinstance(there, UrArmConfig)
+    if taken.clock != "arrival":
+        notes.print("The pictures bring their time of exposure along: what is left is the arm's.")
+        if found.seconds > 3.0 * found.uncertainty:
+            notes.print("warning: yet they seem later than the arm; is the arm's own latency in the file too large?")
+    results.print("Write into the rig file:")
+    for key, seconds in entries(found, taken.clock, arm, there, sensor).items():
+        results.print(f"  {key}: {1e3 * seconds:.1f} ms")

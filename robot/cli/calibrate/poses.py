@@ -1,0 +1,371 @@
+"""`tacsim calibrate touch` and `tacsim calibrate hand-eye`: where sensors and cameras sit on an arm."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, progress, quantity, results, say_files
+from robot.cli.output import writing as writing_into
+from robot.cli.run import ask
+
+if TYPE_CHECKING:
+    from calibration.poses.ball_touch import TouchNoise
+    from calibration.poses.records import SightFile, TouchFile
+    from robot.procedures.ball_touches import TouchPlan
+    from robot.procedures.board_poses import SightPlan
+    from tacsim.interface import Pose
+    from tacsim.models.rig import RigConfig
+
+Rig = Annotated[
+    str | None, typer.Option("--rig", help="A rig of hardware, or the path of its file: measure now, with its arm.")
+]
+
+
+def _length(help_: str) -> Any:
+    return typer.Option(parser=quantity("length"), metavar="LENGTH", help=help_)
+
+
+def touch(
+    touches: Annotated[Path | None, typer.Argument(help="File of recorded touches (YAML); or give --rig.")] = None,
+    rig: Rig = None,
+    arm: Annotated[str, typer.Option("--arm", help="The arm that touches; with --rig.")] = "",
+    sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries; with --rig.")] = "",
+    ball_radius: Annotated[Any, _length("Of the ball; with --rig.")] = None,
+    number: Annotated[int, typer.Option("--touches", min=6, max=200, help="How many; more make it surer.")] = 24,
+    tilt: Annotated[
+        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Largest tilt of the sensor.")
+    ] = "25 deg",
+    spread: Annotated[Any, _length("How far from the middle of the gel the ball is met.")] = "3 mm",
+    depth: Annotated[Any, _length("How deep the ball is pressed into the gel.")] = "0.4 mm",
+    lift: Annotated[Any, _length("How far back along the sensor's axis between touches.")] = "6 mm",
+    noise_centre: Annotated[Any, _length("Standard deviation of the contact's centre, each axis.")] = "0.03 mm",
+    noise_depth: Annotated[Any, _length("Standard deviation of the depth.")] = "0.05 mm",
+    noise_robot: Annotated[Any, _length("Standard deviation of the arm's position, each axis.")] = "0.05 mm",
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Find where a sensor sits on its arm (tool_from_sensor), from touches of one fixed ball with many tilts.
+
+    With --rig the arm MOVES: to its start, which must lie straight above the ball, then down to the ball again and
+    again, tilted about it. The ball must stand fixed and free, so that the tilted sensor meets nothing else; a person
+    is asked first. tool_from_sensor of the rig file is the first guess and may be off by a few millimetres and degrees.
+
+    Example: tacsim calibrate touch --rig ur5e --arm upper --sensor upper --ball-radius "4 mm"
+    """
+    from calibration.poses.ball_touch import TouchNoise
+    from calibration.poses.records import read_touches
+
+    noise = TouchNoise(
+        _within(noise_centre, 1e-6, 1e-2, "--noise-centre"),
+        _within(noise_depth, 1e-6, 1e-2, "--noise-depth"),
+        _within(noise_robot, 0.0, 1e-2, "--noise-robot"),
+    )
+    _one_source(touches, rig)
+    folder = new_directory(out, "touch")
+    if touches is not None:
+        _tell_touch(read_touches(touches), noise, folder, arm or "ARM")
+        return
+    from robot.procedures.ball_touches import TouchPlan
+
+    assert rig is not None
+    if not (arm and sensor and ball_radius):
+        raise typer.BadParameter("with --rig, give --arm, --sensor and --ball-radius")
+    plan = TouchPlan(
+        ball_radius=_within(ball_radius, 0.5e-3, 50e-3, "--ball-radius"),
+        touches=number,
+        tilt=_within(tilt, 0.15, 0.8, "--tilt"),
+        spread=_within(spread, 0.5e-3, 20e-3, "--spread"),
+        depth=_within(depth, 0.05e-3, 2e-3, "--depth"),
+        lift=_within(lift, 2e-3, 50e-3, "--lift"),
+    )
+    _tell_touch(_touched(rig, arm, sensor, plan, set_ or [], folder), noise, folder, arm)
+
+
+def _touched(rig: str, arm: str, sensor: str, plan: TouchPlan, overrides: list[str], folder: Path) -> TouchFile:
+    """Touches now; what was recorded is kept in `folder`, whatever ends it."""
+    from calibration.poses.records import touch_file
+    from robot.open import CannotOpen, open_rig
+    from robot.procedures.ball_touches import CannotTouch, alone, record_touches
+    from tacsim.config import load_rig
+
+    config = load_rig(rig, overrides=overrides).config
+    try:
+        opened = alone(config, arm, sensor)
+    except CannotTouch as wrong:
+        raise CannotOpen(str(wrong)) from wrong
+    _confirm(config, f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?")
+    with (
+        Interrupt() as interrupt,
+        _kept(folder / "touches.yaml", "touch") as keep,
+        progress() as bar,
+        open_rig(opened, confirm=lambda question: True) as running,
+    ):
+        row = bar.add_task("touching", total=plan.touches)
+        taken = record_touches(
+            running,
+            opened,
+            arm,
+            sensor,
+            plan,
+            interrupt,
+            lambda done: bar.update(row, completed=done),
+            lambda touches: keep(touch_file(touches, plan.ball_radius)),
+        )
+    _end_if_stopped(interrupt, f"{len(taken.touches)} touches")
+    for missed in taken.missed:
+        notes.print(f"left out: {missed}", markup=False)
+    return touch_file(taken.touches, plan.ball_radius)
+
+
+@contextmanager
+def _kept(path: Path, command: str) -> Iterator[Callable[[TouchFile | SightFile], None]]:
+    """Gives what writes each state of a record to `path`, and says at the end where it is, also of a failure."""
+    from calibration.poses.records import write_record
+
+    def keep(record: TouchFile | SightFile) -> None:
+        with writing_into(made(path.parent)):
+            write_record(path, record)
+
+    try:
+        yield keep
+    finally:
+        if path.exists():
+            again = f"tacsim calibrate {command} {shlex.quote(str(path))}"
+            notes.print(f"recorded: {path}; to calibrate from it again, without the arm: {again}", markup=False)
+
+
+def _end_if_stopped(interrupt: Interrupt, what: str) -> None:
+    if interrupt():
+        complain(f"stopped by a signal; {what} are kept, nothing is calibrated")
+        raise typer.Exit(interrupt.exit_code)
+
+
+def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
+    from calibration.poses.ball_touch import fit_touches
+    from calibration.poses.records import plain
+
+    with busy(f"fitting {len(record.touches)} touches"):
+        fit = fit_touches(record.measurements(), record.ball_radius, noise)
+    _table(
+        "Where each touch puts the ball, off where it is, along the sensor's axes",
+        ("touch", "x [mm]", "y [mm]", "z [mm]"),
+        [(str(i + 1), *(f"{1e3 * v:.3f}" for v in miss)) for i, miss in enumerate(fit.misses)],
+        fit.used,
+    )
+    (place, turn), (best, best_turn) = fit.deviation, fit.best_deviation
+    results.print(
+        f"tool_from_sensor: ± {1e3 * place:.3f} mm, ± {_degrees(turn):.3f} deg (at best, by Cramer and Rao, "
+        f"{1e3 * best:.3f} mm, {_degrees(best_turn):.3f} deg); scatter {fit.scatter:.2f} of what the noise allows"
+    )
+    _snippet(arm, fit.tool_from_sensor)
+    report = {
+        "tool_from_sensor": plain(fit.tool_from_sensor, fit.covariance),
+        "bound": fit.bound.tolist(),
+        "ball": fit.ball.tolist(),
+        "ball_radius": record.ball_radius,
+        "residuals": fit.misses.tolist(),
+        "used": list(fit.used),
+        "scatter": fit.scatter,
+        "units": "m, rad",
+    }
+    _keep(folder, "touch.json", report)
+
+
+def hand_eye(
+    poses: Annotated[
+        Path | None, typer.Argument(help="File of recorded poses of flange and board (YAML); or give --rig.")
+    ] = None,
+    rig: Rig = None,
+    arm: Annotated[str, typer.Option("--arm", help="The arm that moves; with --rig.")] = "",
+    camera: Annotated[str, typer.Option(help="Its source, as in a rig file; with --rig.")] = "",
+    lens: Annotated[Path | None, typer.Option(help="lens.yaml of `tacsim calibrate lens`; with --rig.")] = None,
+    board: Annotated[str, typer.Option(help="charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]; with --rig.")] = "",
+    fixed: Annotated[bool, typer.Option("--fixed", help="The camera stands, the board rides; with --rig.")] = False,
+    number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20,
+    tilt: Annotated[
+        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Largest tilt about each axis.")
+    ] = "30 deg",
+    pivot: Annotated[Any, _length("How far before the sensor the point is that it turns about.")] = "0 mm",
+    noise_board: Annotated[Any, _length("Standard deviation of the board's place, each axis.")] = "0.5 mm",
+    noise_turn: Annotated[
+        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="The same of its direction.")
+    ] = "0.15 deg",
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Find where a camera sits on an arm's flange, or fixed beside the arm, from poses in which it saw one board.
+
+    Each entry of POSES has the flange's pose in the base and the board's in the camera; `camera: fixed` says that the
+    camera stands and the board rides on the flange.
+
+    With --rig the arm MOVES: from where it stands, with the board in view, it turns its sensor to all sides about a
+    point before it (--pivot: the board, for a camera that rides along), within its limits; a person is asked first.
+
+    Example: tacsim calibrate hand-eye poses.yaml
+    """
+    import math
+
+    from calibration.errors import Unusable
+    from calibration.poses.hand_eye import HandEyeNoise
+    from calibration.poses.records import read_sights
+
+    noise = HandEyeNoise(
+        board=_within(noise_board, 1e-6, 0.1, "--noise-board"),
+        board_turn=_within(noise_turn, 1e-6, math.radians(20.0), "--noise-turn"),
+    )
+    _one_source(poses, rig)
+    folder = new_directory(out, "hand-eye")
+    if poses is not None:
+        _tell_hand_eye(read_sights(poses), noise, folder)
+        return
+    from calibration.lens.board import parse_board
+    from calibration.lens.view import Lens
+    from robot.procedures.board_poses import SightPlan
+    from tacsim.config import load
+
+    if not (rig and arm and camera and lens and board):
+        raise typer.BadParameter("with --rig, give --arm, --camera, --lens and --board")
+    described = parse_board(board)
+    if described.kind == "dots":
+        raise Unusable("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
+    plan = SightPlan(
+        board=described,
+        lens=load(Lens, lens),
+        poses=number,
+        tilt=_within(tilt, 0.1, 1.0, "--tilt"),
+        pivot=_within(pivot, 0.0, 2.0, "--pivot"),
+    )
+    _tell_hand_eye(_sighted(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
+
+
+def _sighted(
+    rig: str, arm: str, camera: str, plan: SightPlan, overrides: list[str], folder: Path, *, fixed: bool
+) -> SightFile:
+    """Looks now; what was recorded is kept in `folder`, whatever ends it."""
+    from calibration.poses.records import sight_file
+    from robot.procedures.board_poses import open_camera, opened, record_sights
+    from tacsim.config import load_rig
+
+    config = load_rig(rig, overrides=overrides).config
+    _confirm(config, f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?")
+    with (
+        Interrupt() as interrupt,
+        _kept(folder / "poses.yaml", "hand-eye") as keep,
+        progress() as bar,
+        opened(config, arm) as mover,
+        open_camera(camera, plan.lens) as eye,
+    ):
+        row = bar.add_task("looking", total=plan.poses)
+        taken = record_sights(
+            mover,
+            eye,
+            plan,
+            interrupt,
+            lambda done: bar.update(row, completed=done),
+            lambda sights: keep(sight_file(sights, fixed=fixed)),
+        )
+    _end_if_stopped(interrupt, f"{len(taken.sights)} poses")
+    for missed in taken.missed:
+        notes.print(f"left out: {missed}", markup=False)
+    return sight_file(taken.sights, fixed=fixed)
+
+
+def _tell_hand_eye(record: SightFile, noise: Any, folder: Path) -> None:
+    from calibration.poses.hand_eye import fit_hand_eye
+    from calibration.poses.records import plain
+
+    fixed = record.camera == "fixed"
+    with busy(f"fitting {len(record.poses)} poses"):
+        fit = fit_hand_eye(record.measurements(), fixed=fixed, noise=noise)
+    _table(
+        "How far each board was seen from where it should be",
+        ("pose", "place [mm]", "direction [deg]"),
+        [(str(i + 1), f"{1e3 * m[0]:.3f}", f"{_degrees(m[1]):.3f}") for i, m in enumerate(fit.misses)],
+        fit.used,
+    )
+    place, turn = fit.deviation
+    name, board = ("base_from_camera", "flange_from_board") if fixed else ("flange_from_camera", "base_from_board")
+    results.print(
+        f"{name}: ± {1e3 * place:.3f} mm, ± {_degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
+        f"allows; the flange's directions swing by {_degrees(fit.spread):.0f} deg"
+    )
+    results.print(f"  {name}: {_placed(fit.camera)}", markup=False)
+    report = {
+        name: plain(fit.camera, fit.covariance),
+        board: plain(fit.board),
+        "residuals": fit.misses.tolist(),
+        "used": list(fit.used),
+        "scatter": fit.scatter,
+        "units": "m, rad",
+    }
+    _keep(folder, "hand-eye.json", report)
+
+
+def _one_source(file: Path | None, rig: str | None) -> None:
+    if (file is None) == (rig is None):
+        raise typer.BadParameter("give either a file of recorded poses, or --rig to measure now")
+
+
+def _within(value: float, low: float, high: float, option: str) -> float:
+    if not low <= value <= high:
+        raise typer.BadParameter(f"{value:g}; allowed: {low:g} to {high:g} (SI units)", param_hint=option)
+    return value
+
+
+def _confirm(config: RigConfig, question: str) -> None:
+    """Asks a person, where an arm is no mock."""
+    from robot.open import CannotOpen
+    from tacsim.models.hardware import UrArmConfig
+
+    real = any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values())
+    if real and not ask(f"Rig '{config.name}': {question}"):
+        raise CannotOpen("nobody confirmed (at a terminal); nothing was moved")
+
+
+def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]], used: tuple[bool, ...]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 1), title=title, title_justify="left")
+    for column in (*columns, ""):
+        table.add_column(column, justify="right")
+    for row, good in zip(rows, used, strict=True):
+        table.add_row(*row, "" if good else "disagrees, left out")
+    Console(highlight=False).print(table)
+
+
+def _snippet(arm: str, pose: Pose) -> None:
+    results.print("Write into the rig file:")
+    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placed(pose)}", markup=False)
+
+
+def _placed(pose: Pose) -> str:
+    """A pose as a rig file writes it, to the tenth of a micrometre."""
+    from calibration.poses.records import placement
+
+    placed = placement(pose)
+    position = ", ".join(f"{1e3 * each:.4f} mm" for each in placed.position)
+    rotation = ", ".join(f"{_degrees(each):.4f} deg" for each in placed.rotation)
+    return f"{{ position: [{position}], rotation: [{rotation}] }}"
+
+
+def _degrees(radians: float) -> float:
+    import math
+
+    return math.degrees(radians)
+
+
+def _keep(folder: Path, name: str, report: dict[str, Any]) -> None:
+    path = folder / name
+    with writing_into(made(folder)):
+        path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    say_files(path)

@@ -1,0 +1,271 @@
+"""`tacsim calibrate`: from frames to the calibration of a sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from robot.cli.calibrate.presses import pressed
+from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, quantity, say_files, writing
+
+if TYPE_CHECKING:
+    from calibration.bundle import Calibration
+    from calibration.lens.view import GelView
+    from calibration.light.ball_press import Fit
+    from calibration.light.image_folder import Frames
+    from tacsim.models.sensor import CameraNoise, Markers
+
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
+
+
+@calibrate.callback()
+def _group() -> None:
+    """Calibrate what stands behind a rig."""
+
+
+@calibrate.command(
+    epilog='Example: [bold]tacsim calibrate sensor frames --ball-radius "2.92 mm" --pixel-pitch "0.0593 mm"[/]'
+)
+def sensor(
+    frames: Annotated[
+        Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
+    ] = None,
+    ball_radius: Annotated[
+        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help='Of the ball, for example "2.92 mm".')
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(metavar="RIG/SENSOR", help="Press now, before this camera of a rig; no arm is connected."),
+    ] = None,
+    presses: Annotated[int, typer.Option(min=1, max=100, help="How many; with --camera.")] = 8,
+    pixel_pitch: Annotated[
+        Any,
+        typer.Option(
+            parser=quantity("length"), metavar="LENGTH", help="Distance of two pixels on the gel; or give --view."
+        ),
+    ] = None,
+    view: Annotated[
+        Path | None,
+        typer.Option(help="view.yaml of `tacsim calibrate lens`: frames are rectified by it.", show_default=False),
+    ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            help="The picture without contact; the camera's noise is told by more of them, background_1.png and so on "
+            "beside it.",
+            show_default="background.png or the like in FRAMES",
+        ),
+    ] = None,
+    serial: Annotated[
+        str, typer.Option(help="Serial number of the sensor that the calibration belongs to.")
+    ] = "unknown",
+    markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """Calibrate a sensor's light from presses of a ball: colour of every slope, and slope of every colour.
+
+    Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, and prints how
+    well each press is predicted by the others.
+
+    With --camera it leads you through it: the gel without contact, then press after press, each judged at once. The
+    pictures are kept in frames/ beside the bundle, to calibrate from them again; Ctrl-C keeps what was taken.
+    """
+    if (frames is None) == (camera is None):
+        raise typer.BadParameter("give either a folder of frames, or --camera to press now")
+    if ball_radius is None:
+        raise typer.BadParameter("give the ball's radius: without it no slope is known", param_hint="--ball-radius")
+    if (pixel_pitch is None) == (view is None):
+        raise typer.BadParameter("give either --pixel-pitch or --view")
+    seen = None if view is None else _load_view(view)
+    ball, pitch = ball_radius, pixel_pitch if seen is None else seen.pixel_pitch
+    if not (ball > 0 and pitch > 0):
+        raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
+    folder = new_directory(out, "calibration")
+    with busy("loading"):
+        from calibration.light.ball_press import BadPresses, calibrate_light
+        from calibration.light.image_folder import read_presses, rectified
+        from calibration.markers.dots import DotEraser
+    try:
+        if camera is not None:
+            read = pressed(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
+        else:
+            assert frames is not None
+            read = read_presses(frames, reference)
+        if seen is not None:
+            read = rectified(read, seen)
+        if read.estimated:
+            notes.print("no picture without contact: the median of all presses stands for it")
+        found = _markers(read, pitch) if markers else None
+        erase = None if found is None else DotEraser(found.radius / pitch)
+        with busy(f"calibrating from {len(read.presses)} presses"):
+            fit = calibrate_light(read.reference, read.presses, ball / pitch, erase)
+    except BadPresses as error:
+        hint = "FRAMES" if camera is None else "--camera"
+        raise typer.BadParameter(str(error), param_hint=hint) from None
+    _write(folder, fit, read, serial, ball, pitch, found, view=seen)
+
+
+def _write(
+    folder: Path,
+    fit: Fit,
+    read: Frames,
+    serial: str,
+    ball: float,
+    pitch: float,
+    found: Markers | None,
+    *,
+    view: GelView | None,
+) -> None:
+    """Shows the calibration and writes its bundle."""
+    from calibration.bundle import write_bundle
+    from calibration.light.residual_picture import draw
+
+    _show(fit, pitch)
+    if found is None:
+        _look_for_dots(fit)
+    if found is not None:
+        notes.print(
+            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
+            f"{found.radius * 1e3:.2g} mm"
+        )
+    noise = _noise(read)
+    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, view, noise)
+    with writing(made(folder)):
+        written = [write_bundle(folder, bundle, fit.reference)]
+        if fit.scores:
+            written.append(folder / "residuals.png")
+            draw(fit, written[-1])
+    say_files(*written)
+
+
+def _load_view(path: Path) -> GelView:
+    from calibration.lens.view import GelView
+    from tacsim.config import load
+
+    return load(GelView, path)
+
+
+def _markers(read: Frames, pitch: float) -> Markers:
+    """The lattice of dots in the picture without contact."""
+    from calibration.markers.flow import find_markers
+    from calibration.markers.lattice import NoLattice
+    from tacsim.models.sensor import Markers
+
+    try:
+        lattice, radius = find_markers(read.reference)
+    except NoLattice as nothing:
+        raise typer.BadParameter(
+            f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
+        ) from None
+    rows, columns = lattice.present.shape
+    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+
+
+def _noise(read: Frames) -> CameraNoise | None:
+    """The camera's noise, and a word on it."""
+    from calibration.light.noise import NoiseUnknown, measure_noise
+
+    try:
+        noise = measure_noise(read.untouched)
+    except NoiseUnknown as why:
+        notes.print(f"camera's noise not measured: {why}", markup=False)
+        return None
+    spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
+    notes.print(
+        f"camera's noise, from {len(read.untouched)} pictures without contact: R, G, B {spread} grey levels; "
+        f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
+    )
+    return noise
+
+
+def _look_for_dots(fit: Fit) -> None:
+    """A word on dots that nobody told of."""
+    from calibration.markers.flow import require_no_markers
+    from calibration.reference import UnusableReference
+
+    try:
+        require_no_markers(fit.reference)
+    except UnusableReference:
+        notes.print("look at this: dots seem to be printed on the gel; give --markers, or each will pass for a dent")
+
+
+def _bundle(
+    fit: Fit,
+    serial: str,
+    ball: float,
+    pitch: float,
+    names: list[str],
+    markers: Markers | None,
+    view: GelView | None,
+    noise: CameraNoise | None,
+) -> Calibration:
+    from datetime import UTC, datetime
+    from importlib import metadata
+
+    from calibration.bundle import FORMAT, Calibration, Provenance, Residual
+    from tacsim.models.sensor import SensorGeometry
+
+    rows, columns, _ = fit.reference.shape
+    return Calibration(
+        format=FORMAT,
+        serial=serial,
+        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch) if view is None else view.geometry,
+        gel_size=(columns * pitch, rows * pitch),
+        forward=fit.forward,
+        inverse=fit.inverse,
+        skirt_length=fit.skirt.length * pitch,
+        skirt_fraction=fit.skirt.fraction,
+        view=view,
+        markers=markers,
+        noise=noise,
+        residuals=tuple(
+            Residual(
+                frame=score.name,
+                circle=(score.circle.x, score.circle.y, score.circle.radius),
+                error=score.error,
+                nothing=score.nothing,
+                correlation=score.correlation,
+                angle=score.angle,
+            )
+            for score in fit.scores
+        ),
+        provenance=Provenance(
+            made=datetime.now(UTC).isoformat(timespec="seconds"),
+            software=f"tacsim {metadata.version('tacsim')}",
+            ball_radius=ball,
+            frames=tuple(names),
+            left_out=dict(fit.left_out),
+            warnings=fit.warnings,
+        ),
+        reference="0" * 64,  # write_bundle sets it
+    )
+
+
+def _show(fit: Fit, pitch: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 1), title="Each press predicted by all the others", title_justify="left")
+    table.add_column("frame")
+    for column in ("contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]"):
+        table.add_column(column, justify="right")
+    for score in fit.scores:
+        table.add_row(
+            score.name, f"{score.circle.radius * pitch * 1e3:.3f}", f"{score.error:.1f}", f"{score.nothing:.1f}",
+            f"{score.correlation:.3f}", f"{score.angle:.1f}",
+        )  # fmt: skip
+    console = Console(highlight=False)
+    if fit.scores:
+        console.print(table)
+    order = fit.order
+    console.print(
+        f"model: degree {order.degree} in the normal, {order.position} in the place; calibrated up to a slope of "
+        f"{fit.steepest:.2f}; skirt {fit.skirt.length * pitch * 1e3:.2f} mm x {fit.skirt.fraction:.2f}"
+    )
+    for name, why in fit.left_out:
+        notes.print(f"left out: {name}: {why}", markup=False)
+    for warning in fit.warnings:
+        notes.print(f"look at this: {warning}", markup=False)

@@ -1,0 +1,88 @@
+"""`tacsim schema` and `tacsim doctor`: what may be said, and what the machine is like."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from robot.cli.output import Overrides, busy
+
+if TYPE_CHECKING:
+    from robot.doctor import machine
+
+MARKS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[bold red]fail[/]"}
+
+
+def schema(
+    kind: Annotated[str, typer.Argument(help="What the file describes, for example rig or scene; or bench.")] = "rig",
+) -> None:
+    """Print the JSON schema of a configuration file; editors complete and check YAML with it.
+
+    `bench` is the schema of what `tacsim bench --json` writes.
+
+    Example: tacsim schema rig > rig.schema.json
+    """
+    import json
+
+    from tacsim.config import KINDS, json_schema
+
+    if kind == "bench":
+        from benchmarks.harness import schema as report
+
+        typer.echo(json.dumps(report.json_schema(), indent=2))
+        return
+    if kind not in KINDS:
+        raise typer.BadParameter(f"no kind '{kind}'; allowed: {', '.join(KINDS)}, bench", param_hint="KIND")
+    typer.echo(json.dumps(json_schema(kind), indent=2))
+
+
+def doctor(
+    rig: Annotated[
+        str | None,
+        typer.Option("--rig", metavar="FILE", help="Look at this rig instead: network, versions, cameras, limits."),
+    ] = None,
+    set_: Overrides = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Check Python, packages, OpenCV, Taichi and the machine, or a rig; exit code 1 if something must be mended.
+
+    Nothing moves: arms are asked, not commanded.
+
+    Example: tacsim doctor --rig ur5e
+    """
+    import json
+
+    from robot.doctor import machine
+
+    if rig is None:
+        checks = machine.examine()
+    else:
+        from robot.doctor.rig import examine_rig
+        from robot.open import check_sensors
+        from tacsim.config import load_rig
+
+        with busy("looking at the rig"):
+            config = load_rig(rig, overrides=set_ or []).config
+            check_sensors(config)
+            checks = examine_rig(config)
+    report = machine.as_json(checks)
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+    else:
+        _print_checks(checks)
+    raise typer.Exit(0 if report["ok"] else 1)
+
+
+def _print_checks(checks: list[machine.Check]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for check in checks:
+        words = Text(check.found)
+        if check.advice:
+            words.append(f"\n→ {check.advice}", style="italic")
+        table.add_row(MARKS[check.state], check.name, words)
+    Console().print(table)

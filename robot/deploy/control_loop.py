@@ -1,0 +1,173 @@
+"""The control loop: a policy on a rig, step by step, judged by a task and handed to a recorder."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Protocol
+
+from tacsim.control.contact_signal import contact_signal
+from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
+from tacsim.record.episode import Episode, EpisodeMeta, Step
+from tacsim.rig import Rig
+from tacsim.tasks import Task, judge
+
+PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
+
+
+class EpisodeFailed(RuntimeError):
+    """An error, the `__cause__`, ended an episode early. What was done is in `episode`; the arms are stopped."""
+
+    def __init__(self, message: str, episode: Episode) -> None:
+        super().__init__(message)
+        self.episode = episode
+
+
+class RecordingFailed(RuntimeError):
+    """Nothing can be recorded any more, e.g. because the disk is full."""
+
+
+class StepRecorder(Protocol):
+    """What takes the steps of an episode: tacsim.record.writer.Recorder."""
+
+    @property
+    def error(self) -> Exception | None:
+        """What ended the recording early."""
+        ...
+
+    def write(self, step: Step) -> bool: ...
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSetup:
+    """What the record says of an episode beyond what rig and task know."""
+
+    policy: str = "policy"
+    seed: int = 0
+    attachments: Mapping[str, bytes] = field(default_factory=dict)
+
+
+def run_episode(
+    rig: Rig,
+    policy: Policy,
+    task: Task | None,
+    steps: int,
+    *,
+    setup: EpisodeSetup = EpisodeSetup(),
+    recorder: Callable[[EpisodeMeta], StepRecorder] | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Episode:
+    """Resets rig and policy, then runs exactly `steps` control steps; fewer only when a recording is over, `stop` says
+    so, or on Ctrl-C. The episode's step 0 is the state after reset. Where the rig knows no truth, nothing is judged.
+
+    Args:
+        recorder: opens the recording, once the references without contact are there (they are attached).
+        on_step: called after each step, e.g. for a progress bar.
+        stop: asked before each step.
+
+    Raises:
+        IncompatibleRig: the rig lacks what policy or task needs; nothing has moved.
+        EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the episode is kept in the exception.
+    """
+    if steps < 0:
+        raise ValueError(f"steps must be 0 or more, got {steps}")
+    rig.require(policy.needs, f"policy '{setup.policy}'")
+    if task is not None:
+        rig.require(task.needs, f"task '{task.config.kind}'")
+    started = time.perf_counter()
+    observation = rig.reset(setup.seed)
+    start = rig.truth()
+    episode = Episode(_meta(rig, task, setup))
+    sink = None if recorder is None else recorder(episode.meta)
+
+    def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
+        step = _step(len(episode.steps), rig, task, start, observation, action, sent, time.perf_counter() - started)
+        episode.steps.append(step)
+        if sink is not None and not sink.write(step):
+            episode.dropped += 1
+            if sink.error is not None:
+                raise RecordingFailed(f"the recording ended early: {sink.error}")
+        if on_step is not None:
+            on_step(step)
+
+    try:
+        policy.reset()
+        keep(observation, None, {})
+        while len(episode.steps) <= steps and not stop():
+            started = time.perf_counter()
+            action = policy(observation)
+            observation, sent = rig.step(action)
+            keep(observation, action, sent)
+    except EndOfEpisode:
+        pass
+    except KeyboardInterrupt:
+        pass
+    except (Exception, SystemExit) as failure:  # a policy may call sys.exit
+        done = max(len(episode.steps) - 1, 0)
+        why = f"{type(failure).__name__}: {failure}"
+        raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", episode) from failure
+    finally:
+        rig.stop()
+    return episode
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that make the numbers, without importing them."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
+    from tacsim.record.images import reference_attachments
+
+    return EpisodeMeta(
+        rig=rig.name,
+        task=None if task is None else task.config.kind,
+        policy=setup.policy,
+        seed=setup.seed,
+        spec=rig.spec,
+        versions=versions(),
+        attachments={**setup.attachments, **reference_attachments(rig.references)},
+        goal=None if task is None else task.config.goal,
+    )
+
+
+def _step(
+    index: int,
+    rig: Rig,
+    task: Task | None,
+    start: Truth | None,
+    observation: Observation,
+    action: Action | None,
+    sent: Mapping[str, Pose | None],
+    seconds: float,
+) -> Step:
+    """The record of what the rig delivered, with what the task says of it."""
+    info = {f"contact_signal_{name}": contact_signal(touch) for name, touch in observation.tactile.items()}
+    info |= rig.diagnostics()
+    truth, outcome = rig.truth(), None
+    if truth is not None and start is not None:
+        moved = truth.position - start.position
+        info |= {"body_height": truth.height, "body_x": float(moved[0]), "body_y": float(moved[1])}
+        outcome = None if task is None else judge(task, truth, start)
+    return Step(
+        index=index,
+        time=observation.time,
+        frames=rig.frames,
+        arms=observation.arms,
+        action=action,
+        sent=sent,
+        reward=None if outcome is None else outcome.reward,
+        distance=None if outcome is None else outcome.distance,
+        info=info,
+        seconds=seconds,
+    )

@@ -1,0 +1,182 @@
+"""Looks at the machine: does what tacsim needs stand here, and what should be done about what does not."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+PYTHONS = ((3, 11), (3, 14))  # from, up to but without
+OPENCV = "opencv-contrib-python-headless"  # the one distribution that may provide cv2 here
+State = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing looked at."""
+
+    name: str
+    state: State
+    found: str
+    advice: str = ""  # what to do next; empty when all is well
+
+
+def examine() -> list[Check]:
+    """All checks, in the order in which problems should be mended. A check that itself breaks is a `fail`."""
+    checks: list[Check] = []
+    for look in (python, packages, second_opencv, opencv, taichi, ur_rtde, processors, realtime, working_directory):
+        checks += _guarded(look)
+    return checks
+
+
+def as_json(checks: Iterable[Check]) -> dict[str, Any]:
+    """`{"ok": bool, "checks": [{name, state, found, advice}]}`; ok means that nothing failed."""
+    listed = [asdict(check) for check in checks]
+    return {"ok": all(check["state"] != "fail" for check in listed), "checks": listed}
+
+
+def _guarded(look: Callable[[], list[Check]]) -> list[Check]:
+    try:
+        return look()
+    except Exception as error:  # a broken installation can fail in any way, and that is the finding
+        name = look.__name__.replace("_", " ")
+        advice = "reinstall the packages: make run builds the environment anew"
+        return [Check(name, "fail", f"{type(error).__name__}: {error}", advice)]
+
+
+def python() -> list[Check]:
+    """Version of the interpreter."""
+    low, high = PYTHONS
+    found = f"{platform.python_version()} at {sys.executable}"
+    if low <= sys.version_info[:2] < high:
+        return [Check("python", "ok", found)]
+    span = f"{low[0]}.{low[1]} to {high[0]}.{high[1] - 1}"
+    return [Check("python", "fail", found, f"use Python {span}, for example: make run PYTHON=python3.12")]
+
+
+def packages(distribution: str = "tacsim") -> list[Check]:
+    """Installed versions against what the distribution requires on this machine."""
+    try:
+        lines = metadata.requires(distribution) or []
+    except metadata.PackageNotFoundError:
+        advice = "install it, from the checkout: python -m pip install -e ."
+        return [Check("packages", "warn", f"{distribution} itself is not installed; its pins are unknown", advice)]
+    wanted = [Requirement(line) for line in lines]
+    needed = [need for need in wanted if need.marker is None or need.marker.evaluate({"extra": ""})]
+    return [_package(need) for need in needed]
+
+
+def _package(need: Requirement) -> Check:
+    name = f"package {need.name}"
+    try:
+        version = metadata.version(need.name)
+    except metadata.PackageNotFoundError:
+        return Check(name, "fail", "not installed", f"python -m pip install '{need.name}{need.specifier}'")
+    if need.specifier.contains(version, prereleases=True):
+        return Check(name, "ok", version)
+    advice = f"python -m pip install '{need.name}{need.specifier}'"
+    return Check(name, "fail", f"{version}, but {need.specifier} is needed", advice)
+
+
+def second_opencv() -> list[Check]:
+    """Other opencv-* distributions write into the same cv2 folder; which files win is chance."""
+    installed = {canonicalize_name(found.name): found.version for found in metadata.distributions() if found.name}
+    others = sorted(name for name in installed if name.startswith("opencv-") and name != OPENCV)
+    if not others:
+        return [Check("one cv2", "ok", "no other opencv package")]
+    found = ", ".join(f"{name} {installed[name]}" for name in others) + f" beside {OPENCV}"
+    advice = (
+        f"python -m pip uninstall -y {' '.join(others)} && "
+        f"python -m pip install --force-reinstall --no-deps {OPENCV}=={installed.get(canonicalize_name(OPENCV), '4.*')}"
+    )
+    return [Check("one cv2", "fail", found, advice)]
+
+
+def opencv() -> list[Check]:
+    """cv2 imports and can do hand-eye calibration (5.0.0.93 lost it)."""
+    import cv2
+
+    found = f"{cv2.__version__} at {Path(cv2.__file__).parent}"
+    if hasattr(cv2, "calibrateHandEye"):
+        return [Check("cv2.calibrateHandEye", "ok", found)]
+    return [Check("cv2.calibrateHandEye", "fail", f"missing in {found}", f"python -m pip install '{OPENCV}>=4.13,<5'")]
+
+
+def taichi() -> list[Check]:
+    """Taichi starts, on which arch, and where its compiled kernels are kept."""
+    if sys.platform == "linux" and platform.machine() == "aarch64":
+        advice = "simulate on another machine; hardware and replay work here"
+        return [Check("taichi", "warn", "no Taichi wheel exists for linux aarch64", advice)]
+    from tacsim.compute.runtime import DEVICE, available, start, ti
+
+    if not available(DEVICE):
+        advice = "unset TACSIM_DEVICE to compute on the processor, or install the device's driver"
+        return [Check("taichi", "fail", f"TACSIM_DEVICE is '{DEVICE}', which is not there", advice)]
+    arch = start()
+    version = ".".join(str(part) for part in ti.__version__)
+    return [Check("taichi", "ok", f"{version}, arch {arch}"), kernel_cache(Path(ti.cfg.offline_cache_file_path))]
+
+
+def kernel_cache(folder: Path) -> Check:
+    """The folder of compiled kernels: without it every start compiles for tens of seconds."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        advice = (
+            "make it writable, or set TI_OFFLINE_CACHE_FILE_PATH to a folder that is; until then every start compiles"
+        )
+        return Check("kernel cache", "warn", f"{folder} is not writable", advice)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.exists() else 0
+    return Check("kernel cache", "ok", f"{folder}, {size / 1e6:.1f} MB" + ("" if size else " (first run compiles)"))
+
+
+def ur_rtde() -> list[Check]:
+    """The driver of the UR arms imports."""
+    try:
+        for module in ("rtde_control", "rtde_receive"):
+            importlib.import_module(module)
+    except ImportError as error:
+        advice = "UR arms can't be driven from here (wheels: Linux x86_64, Windows; Python below 3.13); the rest works"
+        return [Check("ur_rtde", "warn", str(error), advice)]
+    return [Check("ur_rtde", "ok", metadata.version("ur_rtde"))]
+
+
+def processors() -> list[Check]:
+    """CPU cores that this process may use."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if count > 1:
+        return [Check("processors", "ok", f"{count}")]
+    return [Check("processors", "warn", f"{count}", "simulation is built for two or more; expect it to be slow")]
+
+
+def realtime() -> list[Check]:
+    """Whether the processes that talk to arms may run before all others."""
+    from robot.arm.realtime import allowed
+
+    if allowed():
+        return [Check("real-time priority", "ok", "allowed")]
+    advice = (
+        "only arms need it: their 2 ms loop then waits for other programs. Allow it by `USER - rtprio 20` in "
+        "/etc/security/limits.conf (then log in again), or CAP_SYS_NICE for a container"
+    )
+    return [Check("real-time priority", "warn", "not allowed", advice)]
+
+
+def working_directory() -> list[Check]:
+    """Episodes are written below the working directory."""
+    folder = Path.cwd()
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return [Check("write permission", "ok", str(folder))]
+    except OSError as error:
+        advice = "go to a folder of yours, or give --out"
+        return [Check("write permission", "fail", f"{folder}: {error.strerror}", advice)]

@@ -1,0 +1,175 @@
+"""Looks at a rig of hardware before anything moves: network, versions, remote control, cameras, limits.
+
+Connects to the dashboard and to the RTDE port of each arm, and reads each camera for a second. It never becomes a
+commander: no input register is claimed and no program is sent, so it may look at an arm that another program drives.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+import struct
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from robot.arm.dashboard import PORT as DASHBOARD
+from robot.arm.dashboard import Dashboard
+from robot.arm.kinematics import Kinematics
+from robot.camera.camera import Camera
+from robot.doctor.machine import Check
+from robot.errors import DeviceError
+from robot.mock import MOCK_SERIAL
+from robot.mock.cell.cell import MockBench, frames_of
+from tacsim import pose as se3
+from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
+from tacsim.models.rig import RigConfig
+
+PORTS = {DASHBOARD: "dashboard", 30003: "script", 30004: "RTDE"}
+TIMEOUT = 2.0  # of each connection [s]
+LOOK = 1.0  # how long a camera is looked at [s]
+OLDEST = (5, 6)  # PolyScope: remote control can be asked for since then
+SLOW = 0.8  # a camera this share slower than asked for is worth a word
+
+
+def examine_rig(config: RigConfig) -> list[Check]:
+    """All checks of one rig. Mocks that its file asks for are started for as long as it takes."""
+    if not any(
+        isinstance(part, UrArmConfig | CameraSensorConfig) for part in (*config.arms.values(), *config.sensors.values())
+    ):
+        return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
+    try:
+        with MockBench(config):
+            checks = [
+                check for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) for check in _arm(name, arm)
+            ]
+            for name, sensor in config.sensors.items():
+                if isinstance(sensor, CameraSensorConfig):
+                    checks.append(_camera(name, sensor))
+    except (DeviceError, ValueError, RuntimeError) as failure:
+        return [Check("rig", "fail", str(failure), "mend the rig file")]
+    return checks
+
+
+def _arm(name: str, config: UrArmConfig) -> Iterator[Check]:
+    closed = [f"{port} ({what})" for port, what in PORTS.items() if not _open(config.host, port)]
+    if closed:
+        advice = "is the controller on, the address right, and the service allowed (Settings, Security, Services)?"
+        yield Check(f"{name}: network", "fail", f"{config.host}: no answer at {', '.join(closed)}", advice)
+        return
+    yield Check(f"{name}: network", "ok", f"{config.host}: ports {', '.join(map(str, PORTS))} answer")
+    try:
+        with Dashboard(config.host, TIMEOUT) as dashboard:
+            yield from _controller(name, config, dashboard)
+    except DeviceError as failure:
+        yield Check(f"{name}: dashboard", "fail", str(failure), "restart the controller, and look at its log")
+    yield _protocol(name, config)
+    yield _limits(name, config)
+    yield _start(name, config)
+
+
+def _open(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), TIMEOUT).close()
+    except OSError:
+        return False
+    return True
+
+
+def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
+    version = dashboard.ask("PolyscopeVersion")
+    found = re.search(r"(\d+)\.(\d+)\.\d+", version)
+    fit = found is not None and (int(found[1]), int(found[2])) >= OLDEST
+    advice = (
+        ""
+        if fit
+        else f"update PolyScope to {OLDEST[0]}.{OLDEST[1]} or later: older ones cannot be asked for remote control"
+    )
+    yield Check(f"{name}: PolyScope", "ok" if fit else "warn", version, advice)
+    model, serial = dashboard.model(), dashboard.serial()
+    wrong = model is not None and not config.model.startswith(model)
+    yield Check(
+        f"{name}: model",
+        "fail" if wrong else "ok",
+        f"{(model or 'not told').upper()}, serial number {serial}",
+        f"the file says {config.model}; correct one of the two" if wrong else "",
+    )
+    mock = serial == MOCK_SERIAL
+    if mock != (config.mock is not None):
+        yield Check(
+            f"{name}: kind", "fail", "a mock" if mock else "a real arm", "the file says otherwise (`mock:` block)"
+        )
+    try:
+        dashboard.require_ready(f"arm '{name}'")
+        yield Check(f"{name}: ready", "ok", "powered, no stop, in remote control")
+    except DeviceError as failure:
+        yield Check(f"{name}: ready", "fail", str(failure), "see to it at the pendant, then look again")
+
+
+def _protocol(name: str, config: UrArmConfig) -> Check:
+    """RTDE version 2, asked for as a client would, without claiming anything."""
+    label = f"{name}: RTDE"
+    try:
+        with socket.create_connection((config.host, 30004), TIMEOUT) as line:
+            line.sendall(struct.pack(">HBH", 5, ord("V"), 2))
+            answer = b""
+            while len(answer) < 4:
+                part = line.recv(64)
+                if not part:
+                    raise OSError("closed")
+                answer += part
+    except OSError as failure:
+        return Check(label, "fail", f"no answer ({failure})", "restart the controller")
+    accepted = answer[2] == ord("V") and answer[3] == 1
+    advice = "" if accepted else "RTDE version 2 needs PolyScope 3.5 or later"
+    return Check(label, "ok" if accepted else "fail", "version 2" if accepted else f"refused: {answer.hex()}", advice)
+
+
+def _limits(name: str, config: UrArmConfig) -> Check:
+    limits = config.limits
+    size = 1e3 * (np.array(limits.workspace.upper) - limits.workspace.lower)
+    words = (
+        f"workspace {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} mm, {len(limits.planes)} walls, "
+        f"{1e3 * limits.speed:.0f} mm/s, {limits.acceleration:g} m/s², {limits.force:g} N, {limits.torque:g} N m"
+    )
+    advice = "these guard the work, not people: set the safety limits on the pendant too" if config.mock is None else ""
+    return Check(f"{name}: limits", "ok", words, advice)
+
+
+def _start(name: str, config: UrArmConfig) -> Check:
+    """The start pose lies within the workspace and the reach."""
+    label = f"{name}: start"
+    if config.start is None:
+        if config.mock is not None:
+            return Check(label, "ok", "where the scene says")
+        return Check(label, "fail", "missing", "give start: world_from_sensor, clear of everything")
+    place = np.array(config.start.position)
+    if (place < config.limits.workspace.lower).any() or (place > config.limits.workspace.upper).any():
+        return Check(label, "fail", f"{place.tolist()} m is outside the workspace", "correct start or limits.workspace")
+    kinematics = Kinematics(config.model)
+    postures = kinematics.solutions(frames_of(config).flange(se3.to_matrix(config.start.pose)), np.zeros(6))
+    if not postures:
+        return Check(
+            label, "fail", f"{place.tolist()} m is out of reach", "correct start, world_from_base, or the mount"
+        )
+    far = max(kinematics.singularity(posture) for posture in postures)
+    state, advice = ("ok", "") if far > 0.05 else ("warn", "near a singular posture: place the base elsewhere")
+    return Check(label, state, f"within reach, {far:.2f} from a singularity (0.1 to 0.3 is good)", advice)  # type: ignore[arg-type]
+
+
+def _camera(name: str, config: CameraSensorConfig) -> Check:
+    label = f"{name}: camera"
+    try:
+        with Camera(config, name, TIMEOUT + 1.0) as camera:
+            time.sleep(LOOK)
+            status = camera.status
+    except DeviceError as failure:
+        return Check(label, "fail", str(failure), "see cable, address, and what else uses the camera")
+    fps, age = status.fps or 0.0, status.age or 0.0
+    words = (
+        f"{config.width} x {config.height} px, {fps:.1f} frames/s, newest {1e3 * age:.0f} ms old, {status.dropped} lost"
+    )
+    if fps < SLOW * config.fps or status.damaged:
+        return Check(label, "warn", words, f"{config.fps:g} frames/s were asked for: exposure, USB hub, or cable?")
+    return Check(label, "ok", words)

@@ -1,0 +1,276 @@
+"""A whole mock bench: controllers, cameras, and the simulated gels and body that they hold and look at.
+
+Poses of the mock arms go to the simulator, contact forces come back into the arms and tactile pictures into the
+cameras. Where nothing is simulated (a rig without scene), the controllers stand alone.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from typing import Self
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.arm.kinematics import Kinematics, matrix
+from robot.arm.tcp import ArmFrames, pose_of
+from robot.errors import DeviceError
+from robot.mock.camera.camera import MockCamera
+from robot.mock.cell.sim_server import Scenery, Twin
+from robot.mock.ur.fault_client import Door
+from robot.mock.ur.handle import MockArms
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose, Truth
+from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
+from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.sensor import SensorModel
+
+POSTURE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: elbow up [rad]
+FREE_RUN = 5e-3  # shortest time between two looks at the arms while running free [s]
+
+
+class MockBench:
+    """Starts the mocks that a rig file asks for. A context manager; `close` ends every process.
+
+    Attributes:
+        doors: of the controllers, by arm.
+        cameras: by sensor.
+        start: world_from_sensor of each mock arm where an episode begins.
+    """
+
+    def __init__(self, config: RigConfig) -> None:
+        """Raises DeviceError (MockError, TwinError) when a mock cannot be started."""
+        self._facts = config
+        self.doors: dict[str, Door] = {}
+        self._controllers: MockArms | None = None
+        self.cameras: dict[str, MockCamera] = {}
+        self.start: dict[str, Pose] = {}
+        self._twin: Twin | None = None
+        self._scenery: Scenery | None = None
+        self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
+        self._lock = threading.Lock()  # of the twin
+        self._stop = threading.Event()
+        self._free: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._looks = 0  # while running free
+        self._mocked = {
+            name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
+        }
+        self._frames = {name: frames_of(arm) for name, arm in self._mocked.items()}
+        with ExitStack() as stack:
+            stack.callback(self.close)
+            models = self._models()
+            if config.scene is not None and models:
+                self._twin = Twin(config.scene, models, config.canonical, config.contact)
+            for name, sensor in config.sensors.items():
+                if isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
+                    self.cameras[name] = _camera(name, sensor)
+            self.start = {name: self._start_of(name, arm) for name, arm in self._mocked.items()}
+            if self._mocked:
+                self._controllers = MockArms(
+                    [arm.host for arm in self._mocked.values()],
+                    model=[arm.model for arm in self._mocked.values()],
+                    joints=[self._joints(name, arm) for name, arm in self._mocked.items()],
+                    realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._mocked.values()),
+                )
+                self.doors = dict(zip(self._mocked, self._controllers.doors, strict=True))
+            stack.pop_all()
+
+    def _models(self) -> dict[str, SensorModel]:
+        """Of the sensors that are simulated: in front of a mock camera, or looked at without one."""
+        found: dict[str, SensorModel] = {}
+        for name, sensor in self._facts.sensors.items():
+            if isinstance(sensor, SimSensorConfig):
+                found[name] = sensor.model
+            elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
+                assert sensor.model is not None  # a mock camera without one is refused with the file
+                found[name] = sensor.model
+        return found
+
+    def _carried(self, arm: str) -> str | None:
+        """The sensor that an arm carries."""
+        return next((name for name, sensor in self._facts.sensors.items() if sensor.arm == arm), None)
+
+    def _start_of(self, name: str, arm: UrArmConfig) -> Pose:
+        """Where the rig file says; else where the scene has that sensor at its beginning."""
+        if arm.start is not None:
+            return arm.start.pose
+        sensor = self._carried(name)
+        if self._twin is None or sensor is None or sensor not in self._twin.initial:
+            raise DeviceError(
+                f"arms.{name}.start: where does an episode begin? No scene says it; give the sensor's pose"
+            )
+        return self._twin.initial[sensor]
+
+    def _joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
+        """Joints at power-on: those of the rig file, else such that the sensor is at its start: of all postures the one
+        farthest from a singularity."""
+        if arm.mock is not None and arm.mock.joints is not None:
+            return arm.mock.joints
+        kinematics = Kinematics(arm.model)
+        flange = self._frames[name].flange(se3.to_matrix(self.start[name]))
+        postures = kinematics.solutions(flange, np.array(POSTURE))
+        if not postures:
+            raise DeviceError(
+                f"arms.{name}: its start {np.round(self.start[name].position, 4).tolist()} m is out of reach of a "
+                f"{arm.model} whose base stands at {list(arm.world_from_base.position)} m"
+            )
+        chosen: list[float] = max(postures, key=lambda q: round(kinematics.singularity(q), 6)).tolist()
+        return chosen
+
+    # -------------------------------------------------------------- the bench
+
+    @property
+    def simulated(self) -> bool:
+        return self._twin is not None
+
+    @property
+    def knows_truth(self) -> bool:
+        """True if there is a simulated body."""
+        scene = self._facts.scene
+        simulated = self._twin is not None and self._facts.contact == "simulated"
+        return simulated and scene is not None and scene.body is not None
+
+    @property
+    def scenery(self) -> Scenery | None:
+        """What the bench looked like last; None before the first look. Raises DeviceError if it follows no more."""
+        self.check()
+        return self._scenery
+
+    def poses(self) -> dict[str, Pose]:
+        """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
+        found = {}
+        for name, door in self.doors.items():
+            sensor = self._carried(name)
+            if sensor is not None:
+                tool = matrix(np.array(door.state().pose))
+                frames = self._frames[name]
+                found[sensor] = pose_of(frames.world_from_base @ tool @ frames.tool_from_sensor)
+        return found
+
+    def place(self) -> None:
+        """A person's part: puts a fresh body between the sensors."""
+        if self._twin is not None:
+            with self._lock:
+                self._show(self._twin.place(self.poses()))
+
+    def step(self, pause: float = 0.0) -> Mapping[str, int]:
+        """Follows the arms once: forces into the controllers and, after a `pause` [s], pictures into the cameras.
+
+        Returns the number of each camera's newest picture. Raises TwinError.
+        """
+        if self._twin is None:
+            return {}
+        with self._lock:
+            return self._show(self._twin.move(self.poses()), pause)
+
+    def _show(self, scenery: Scenery, pause: float = 0.0) -> Mapping[str, int]:
+        self._scenery = scenery
+        for name, door in self.doors.items():
+            sensor = self._carried(name)
+            if sensor is not None and sensor in scenery.wrenches:
+                door.wrench(self._at_tool(name, scenery.wrenches[sensor]).tolist())
+        time.sleep(pause)
+        for name, camera in self.cameras.items():  # which go on showing their last picture
+            picture = scenery.images[name]
+            if name not in self._pushed or not np.array_equal(self._pushed[name][0], picture):
+                self._pushed[name] = picture, camera.push(picture)
+        return {name: number for name, (_, number) in self._pushed.items()}
+
+    def _at_tool(self, name: str, wrench: FloatArray) -> FloatArray:
+        """A wrench (6,) about the sensor, in its axes, as the controller has it: about the TCP, in the base's axes."""
+        frames = self._frames[name]
+        tool = se3.from_matrix(frames.tool_from_sensor)
+        at_tool = se3.transform_wrench(tool, wrench)
+        turn = matrix(np.array(self.doors[name].state().pose))[:3, :3]
+        return np.concatenate([turn @ at_tool[:3], turn @ at_tool[3:]])
+
+    def truth(self) -> Truth | None:
+        return None if self._scenery is None else self._scenery.truth
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """How the last simulated motion went, and how long it took [s]."""
+        if self._scenery is None:
+            return {}
+        return {**self._scenery.stats, "twin_seconds": self._scenery.seconds}
+
+    # ---------------------------------------------------------- running free
+
+    def run_free(self) -> None:
+        """From now on follows the arms as fast as it can, in a thread."""
+        if self._twin is not None and self._free is None:
+            self._free = threading.Thread(target=self._follow, name="mock bench", daemon=True)
+            self._free.start()
+
+    def catch_up(self) -> None:
+        """While running free: waits until the bench has looked at the arms anew, from now on. An approach that did not
+        wait would go on while the simulator is still busy with the first touch.
+
+        Raises DeviceError if it follows no more.
+        """
+        wanted = self._looks + 2  # the look under way may have begun before
+        while self._looks < wanted:
+            self.check()
+            time.sleep(FREE_RUN)
+
+    def check(self) -> None:
+        """Raises DeviceError if the thread that follows the arms has failed."""
+        if self._failure is not None:
+            raise DeviceError(f"the mock bench follows the arms no more: {self._failure}") from self._failure
+
+    def _follow(self) -> None:
+        try:
+            while not self._stop.wait(FREE_RUN):
+                self.step()
+                self._looks += 1
+        except Exception as failure:
+            if not self._stop.is_set():
+                self._failure = failure
+
+    def close(self) -> None:
+        """Ends all mocks; again does nothing."""
+        self._stop.set()
+        if self._free is not None:
+            self._free.join(5.0)
+        with ExitStack() as stack:  # each is closed even when another fails
+            for camera in self.cameras.values():
+                stack.callback(camera.close)
+            if self._controllers is not None:
+                stack.callback(self._controllers.close)
+            if self._twin is not None:
+                stack.callback(self._twin.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def frames_of(arm: UrArmConfig) -> ArmFrames:
+    return ArmFrames(
+        *(se3.to_matrix(p.pose) for p in (arm.world_from_base, arm.flange_from_tool, arm.tool_from_sensor))
+    )
+
+
+def _camera(name: str, config: CameraSensorConfig) -> MockCamera:
+    assert config.mock is not None
+    url = urlsplit(config.source)
+    if url.scheme != "http" or url.hostname is None or url.port is None:
+        raise DeviceError(
+            f"sensors.{name}.source: a mock camera needs an address on loopback such as "
+            f"http://127.0.0.2:8081/?action=stream, got {config.source}"
+        )
+    return MockCamera(
+        url.hostname,
+        url.port,
+        config.width,
+        config.height,
+        config.mock.fps,
+        config.mock.quality,
+        stamped=config.stamped,
+    )

@@ -1,0 +1,143 @@
+"""In place of the simulated bench: in front of each sensor a rigid ball, and its contact with the gel in closed form.
+
+Quick enough for real time, where the simulator is not: for tests of timing (`tacsim calibrate latency` on mocks).
+Hertz's contact of a ball with an elastic half-space (Johnson, Contact Mechanics, 1985, 3.4 and 4.2): radius a with
+a^2 = R d, force F = 4/3 E* sqrt(R) d^1.5 with E* = E / (1 - nu^2), surface deflection
+
+    u(r) = d - r^2 / 2R                                                  r < a
+    u(r) = ((2 a^2 - r^2) asin(a / r) + a sqrt(r^2 - a^2)) / (pi R)      r >= a
+
+There is no friction, no tilt of the dent, no body and no truth about one: tasks need the simulator.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from itertools import count
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose, SurfaceMap
+from tacsim.models.scene import GelSurface
+
+if TYPE_CHECKING:
+    from tacsim.models.scene import Scene
+    from tacsim.models.sensor import CanonicalGrid, SensorModel
+
+RADIUS = 4e-3  # of the balls [m]
+GAP = 0.2e-3  # between gel and ball at the beginning: two balls, one on the other, between two gels [m]
+SPACING = 0.25e-3  # of the nodes on which the surface is given [m]
+GRAIN = 10e-6  # places that are nearer than this to each other show one picture [m]
+KEPT = 512  # pictures
+
+
+class HertzBench:
+    """What the simulator's process holds instead of a world: the places of the sensors, the balls, and the pictures.
+
+    Raises ValueError for a sensor that the scene has not.
+    """
+
+    def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
+        from tacsim.optics.noise import noise_source
+        from tacsim.optics.render import Renderer
+
+        unknown = sorted(set(models) - set(scene.sensors))
+        if unknown:
+            raise ValueError(f"scene '{scene.name}' has no sensor '{unknown[0]}'; it has {', '.join(scene.sensors)}")
+        self._gel, self._grid, self._models = scene.gel, grid, dict(models)
+        above = Pose(np.array([0.0, 0.0, 4 * RADIUS + 2 * GAP]), np.array([1.0, 0.0, 0.0, 0.0]))
+        self._poses = {name: above if name == "upper" else Pose() for name in scene.sensors}
+        ahead = Pose(np.array([0.0, 0.0, RADIUS + GAP]))
+        self._balls = {name: se3.compose(pose, ahead).position for name, pose in self._poses.items()}
+        self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
+        self._noise = {name: noise_source(model, name) for name, model in models.items()}
+        self._looks = count()
+        self._drawn: OrderedDict[tuple[str | int, ...], tuple[NDArray[np.uint8], SurfaceMap]] = OrderedDict()
+
+    @property
+    def stats(self) -> Mapping[str, float]:
+        """Nothing is iterated here."""
+        return {}
+
+    def truth(self) -> None:
+        """There is no body."""
+
+    def poses(self) -> dict[str, Pose]:
+        """world_from_sensor of each."""
+        return dict(self._poses)
+
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        """The balls hang where they hang."""
+        self.move(poses)
+
+    def move(self, poses: Mapping[str, Pose]) -> None:
+        """Raises ValueError for a ball that would go through the gel; the sensors stay where they were then."""
+        moved = {**self._poses, **poses}
+        for name, ball in self._balls.items():
+            depth = _contact(moved[name], ball)[0]
+            if depth >= self._gel.size[2]:
+                raise ValueError(
+                    f"sensor '{name}' is pressed {1e3 * depth:.2f} mm into a ball, its gel is "
+                    f"{1e3 * self._gel.size[2]:g} mm thick"
+                )
+        self._poses = moved
+
+    def wrench(self, name: str) -> FloatArray:
+        """(6,) on the sensor, about its origin, its axes [N, N m]."""
+        depth, x, y = _contact(self._poses[name], self._balls[name])
+        return self._wrench(depth, x, y)
+
+    def look(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
+        """Picture (H, W, 3) and surface of a sensor."""
+        image, surface = self._look(name, *_contact(self._poses[name], self._balls[name]))
+        noise = self._noise[name]
+        return image if noise is None else noise(image, next(self._looks)), surface
+
+    def _wrench(self, depth: float, x: float, y: float) -> FloatArray:
+        """(6,) on the sensor, about its origin: the ball pushes along its -z."""
+        material = self._gel.material
+        modulus = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
+        force = 4.0 / 3.0 * modulus * np.sqrt(RADIUS) * max(0.0, depth) ** 1.5
+        return np.array([0.0, 0.0, -force, -y * force, x * force, 0.0])
+
+    def _look(self, name: str, depth: float, x: float, y: float) -> tuple[NDArray[np.uint8], SurfaceMap]:
+        from tacsim.optics.surface import surface_map
+
+        # All places without touch look the same.
+        place = (depth, x, y) if depth > 0.0 else (0.0, 0.0, 0.0)
+        steps = tuple(round(value / GRAIN) for value in place)
+        key: tuple[str | int, ...] = (name, *steps)
+        if key in self._drawn:
+            self._drawn.move_to_end(key)
+            return self._drawn[key]
+        surface = dent(self._gel.size[:2], *(GRAIN * step for step in steps))
+        markers = self._models[name].markers
+        found = self._renderers[name](surface), surface_map(surface, grid=self._grid, markers=markers)
+        self._drawn[key] = found
+        if len(self._drawn) > KEPT:
+            self._drawn.popitem(last=False)
+        return found
+
+
+def _contact(sensor: Pose, ball: FloatArray) -> tuple[float, float, float]:
+    """How deep a ball lies in the gel, negative before it, and where on it: x, y [m]."""
+    x, y, z = se3.transform(se3.inverse(sensor), ball).tolist()
+    return RADIUS - z, x, y
+
+
+def dent(size: tuple[float, float], depth: float, x: float, y: float) -> GelSurface:
+    """The surface of a gel of `size` (x, y) [m] into which a ball of RADIUS is pressed by `depth` at x, y [m]."""
+    counts = [round(length / SPACING) + 1 for length in size]
+    axes = [np.linspace(-length / 2, length / 2, count) for length, count in zip(size, counts, strict=True)]
+    r = np.hypot(*np.meshgrid(axes[0] - x, axes[1] - y, indexing="ij"))
+    displacement = np.zeros((*counts, 3), np.float32)
+    if depth > 0.0:
+        a = np.sqrt(RADIUS * depth)
+        far = np.maximum(r, a)
+        outside = ((2 * a**2 - far**2) * np.arcsin(a / far) + a * np.sqrt(far**2 - a**2)) / (np.pi * RADIUS)
+        displacement[..., 2] = -np.where(r < a, depth - r**2 / (2 * RADIUS), outside)
+    return GelSurface(displacement, SPACING, (-size[0] / 2, -size[1] / 2))

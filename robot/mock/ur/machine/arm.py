@@ -1,0 +1,149 @@
+"""The arm of the mock: where its joints are wanted, where they are, and what lies between.
+
+The target is what the controller's interpolator asks for; the actual joints follow it as a critically damped servo of
+second order does. With SERVO_RATE = 500 rad/s the actual joints trail a steady motion by 4 ms and settle within about
+20 ms; real arms are in this order, and their true dynamics are not modelled (no masses, no friction, no flexibility).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot.arm.kinematics import JOINT_RANGE, Kinematics, pose
+from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
+
+PERIOD = 0.002  # one control period [s]
+SERVO_RATE = 500.0  # of the joint servos [rad/s]
+JOINT_ACCELERATION = 40.0  # top acceleration in servo motion [rad/s^2]
+COAST = 8.0  # deceleration of the leading joint when nothing commands the arm [rad/s^2]
+BRAKE = 20.0  # the same in a protective or emergency stop [rad/s^2]
+HOME = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)  # tool down, in front of the base
+HISTORY = 2500  # periods of joint positions that are kept
+REST = 1e-9  # joint speed below which the arm rests [rad/s]
+
+Motion = Iterator[None]  # a motion as generator: one `yield` is one control period
+
+
+class ProgramError(Exception):
+    """A run-time error of the program: on the controller it ends the program."""
+
+
+class Arm:
+    """Joints (6,) [rad], their speeds [rad/s], and what follows from them. All poses and twists in base axes."""
+
+    def __init__(self, model: Model = "ur5e", joints: Sequence[float] = HOME) -> None:
+        self.kinematics = Kinematics(model)
+        self.tool = np.eye(4)  # flange_from_tcp
+        self.target_q = np.array(joints, dtype=np.float64)
+        if self.target_q.shape != (6,) or not np.isfinite(self.target_q).all():
+            raise ValueError(f"joints must be 6 finite angles [rad], got {list(joints)}")
+        if float(np.abs(self.target_q).max()) > JOINT_RANGE:
+            raise ValueError(f"joints must lie within +-2 pi rad, got {list(joints)}")
+        self.target_qd, self.target_qdd = np.zeros(6), np.zeros(6)
+        self.q, self.qd = self.target_q.copy(), np.zeros(6)
+        self.scale = 1.0  # speed scaling now, 0 to 1
+        self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
+        self.history: deque[FloatArray] = deque([self.q] * HISTORY, maxlen=HISTORY)
+        self._next: FloatArray | None = None
+        self.look()
+
+    # -- commands of a motion: at most one a control period ----------------------------------------------------------
+
+    def follow(self, q: FloatArray) -> None:
+        """Asks for joints q at the end of this control period."""
+        if not np.isfinite(q).all():
+            raise ProgramError("motion command with a number that is not finite")
+        if self._next is not None:
+            raise ProgramError("another thread is already controlling the robot")
+        self._next = q
+
+    def drive(self, qd: FloatArray) -> None:
+        """Asks for joint speeds qd [rad/s] during this control period."""
+        self.follow(self.target_q + qd * PERIOD)
+
+    def solve(self, frame: FloatArray, seed: FloatArray | None = None) -> FloatArray:
+        """Joints for a frame of the TCP; ProgramError where the arm does not reach."""
+        q = self.kinematics.inverse(frame, self.target_q if seed is None else seed, self.tool)
+        if q is None:
+            where = ", ".join(f"{value:.4g}" for value in frame[:3, 3])
+            raise ProgramError(f"get_inverse_kin: no solution for the pose at ({where}) m")
+        return q
+
+    def joint_speeds_of(self, twist: FloatArray) -> FloatArray:
+        """Joint speeds that give the TCP this twist; ProgramError in a singular pose."""
+        try:
+            speeds = np.linalg.solve(self.jacobian, twist)
+        except np.linalg.LinAlgError:
+            raise ProgramError("the arm is in a singular pose") from None
+        return np.asarray(speeds, dtype=np.float64)
+
+    # -- one control period ------------------------------------------------------------------------------------------
+
+    @property
+    def commanded(self) -> bool:
+        """True once a motion has asked for something in this control period."""
+        return self._next is not None
+
+    def advance(self, deceleration: float = COAST) -> None:
+        """Ends the control period; an arm that nobody commands is braked."""
+        wanted, before, start = self._next, self.target_qd, self.target_q
+        self._next = None
+        if wanted is not None:
+            self.target_qd = (wanted - self.target_q) / PERIOD
+            self.target_q = wanted
+        elif before.any():
+            self.target_qd = slowed(before, deceleration)
+            self.target_q = self.target_q + self.target_qd * PERIOD
+        self.target_qdd = (self.target_qd - before) / PERIOD
+        self._servo(start)
+        self.history.append(self.q)
+        self.look()
+
+    def halt(self) -> None:
+        """Brakes have closed: speeds are zero, and the target is where the arm is."""
+        self.target_q, self.target_qd, self.target_qdd = self.q.copy(), np.zeros(6), np.zeros(6)
+        self.qd = np.zeros(6)
+        self._next = None
+        self.look()
+
+    def look(self) -> None:
+        """Renews frames, Jacobian and twists after the joints or the tool have changed."""
+        self.target_frame, self.jacobian = self.kinematics.forward_and_jacobian(self.target_q, self.tool)
+        self.frame, actual_jacobian = self.kinematics.forward_and_jacobian(self.q, self.tool)
+        self.target_twist: FloatArray = self.jacobian @ self.target_qd
+        self.twist: FloatArray = actual_jacobian @ self.qd
+
+    @property
+    def pose(self) -> FloatArray:
+        """UR pose (6,) of the TCP."""
+        return pose(self.frame)
+
+    @property
+    def rests(self) -> bool:
+        """True when neither target nor actual joints move."""
+        return not self.target_qd.any() and float(np.abs(self.qd).max()) < REST
+
+    def _servo(self, before: FloatArray) -> None:
+        """One period of q'' = w^2 (target - q) - 2 w q', solved exactly for a target in steady motion."""
+        speed, trail = self.target_qd, 2.0 / SERVO_RATE * self.target_qd
+        error, rate = self.q - before + trail, self.qd - speed
+        drift, decay = (rate + SERVO_RATE * error) * PERIOD, math.exp(-SERVO_RATE * PERIOD)
+        error, rate = (error + drift) * decay, (rate - SERVO_RATE * drift) * decay
+        self.q, self.qd = self.target_q - trail + error, rate + speed
+        if not speed.any() and float(np.abs(rate).max()) < REST and float(np.abs(error).max()) < 1e-12:
+            self.q, self.qd = self.target_q.copy(), np.zeros(6)  # the tail of the exponential has no meaning
+
+
+def slowed(speeds: FloatArray, deceleration: float) -> FloatArray:
+    """Speeds after one period of braking: the largest falls by `deceleration`, the others in proportion."""
+    fastest = float(np.abs(speeds).max())
+    left = fastest - deceleration * PERIOD
+    return speeds * (left / fastest) if left > 1e-12 else np.zeros_like(speeds)

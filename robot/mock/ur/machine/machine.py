@@ -1,0 +1,320 @@
+"""The robot behind the sockets: arm, load, power, safety, registers, inputs and outputs, and the running program.
+
+No sockets and no clock here: `tick` is one control period. So the whole behaviour can be tested in simulated time.
+
+Transitions that take a real robot seconds take POWER_UP and RELEASE periods. A protective stop ends the program (a real
+controller may only pause it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
+from robot.mock.ur.machine.load import GRAVITY, Load, cross
+from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, admit
+from robot.mock.ur.machine.script import Program
+from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
+
+REGISTERS = 48  # of each kind and direction
+POWER_UP = 50  # periods from power on to idle
+RELEASE = 50  # periods from idle to running
+SLIDER_RATE = 5.0  # how fast the speed scaling follows the slider [1/s]
+UNLOCK_DELAY = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
+
+Version = tuple[int, int, int, int]
+
+
+class Mode(IntEnum):
+    """robot_mode of the RTDE."""
+
+    BOOTING = 2
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    RUNNING = 7
+
+
+class Safety(IntEnum):
+    """safety_mode of the RTDE."""
+
+    NORMAL = 1
+    REDUCED = 2
+    PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
+    ROBOT_EMERGENCY_STOP = 7
+    FAULT = 9
+
+
+SAFETY_BITS = {  # safety_status_bits: bit 10 is "stopped due to safety"
+    Safety.NORMAL: 1 << 0,
+    Safety.REDUCED: 1 << 1,
+    Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    Safety.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
+    Safety.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
+    Safety.FAULT: 1 << 9 | 1 << 10,
+}
+
+
+class Runtime(IntEnum):
+    """runtime_state of the RTDE."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+
+
+class Outputs:
+    """Digital and analog outputs."""
+
+    def __init__(self) -> None:
+        self.digital = 0  # bits 0-7 standard, 8-15 configurable, 16-17 tool
+        self.analog = [0.0, 0.0]  # fraction of the range
+        self.analog_is_voltage = [False, False]
+
+    def analog_value(self, index: int) -> float:
+        """Of a standard analog output: [V] of 0-10 V, or [A] of 4-20 mA."""
+        part = self.analog[index]
+        return 10.0 * part if self.analog_is_voltage[index] else 0.004 + 0.016 * part
+
+
+class Machine:
+    """One robot. `log` keeps the last lines of what happened, each with its time [s]."""
+
+    def __init__(
+        self, model: Model = "ur5e", joints: Sequence[float] = HOME, version: Version = (5, 11, 0, 108150)
+    ) -> None:
+        self.version = version
+        self.arm, self.load, self.outputs = Arm(model, joints), Load(), Outputs()
+        self.ticks = 0
+        self.mode, self.safety = Mode.RUNNING, Safety.NORMAL
+        self.in_int, self.in_double = [0] * REGISTERS, [0.0] * REGISTERS
+        self.out_int, self.out_double = [0] * REGISTERS, [0.0] * REGISTERS
+        self.in_bits = [False] * 128
+        self.slider = 1.0
+        self.payload, self.payload_centre, self.payload_inertia = 0.0, np.zeros(3), np.zeros(6)
+        self.gravity: FloatArray = np.array([0.0, 0.0, GRAVITY])  # acceleration of the base, as set_gravity has it
+        self.program: Program | None = None
+        self.paused = False
+        self.freedrive: tuple[FloatArray, tuple[int, ...]] | None = None  # frame and free axes
+        self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
+        self.fed = 0  # tick of the watchdog's last meal
+        self.stop_reason = ""  # why the last program ended
+        self.stopped_at = -math.inf  # time of the last protective stop [s]
+        self.unlock_delay = UNLOCK_DELAY
+        self.clock_offset = 0.0  # of the timestamp that is sent [s]
+        self.work_time = 0.0  # what the last control period took to compute [s]
+        self.log: deque[tuple[float, str]] = deque(maxlen=200)
+        self._changing: tuple[int, Mode] | None = None  # tick at which the mode changes
+
+    @property
+    def time(self) -> float:
+        """Since power-on, in control periods [s]."""
+        return self.ticks * PERIOD
+
+    @property
+    def operational(self) -> bool:
+        """True when a program may run."""
+        return self.mode is Mode.RUNNING and self.safety in (Safety.NORMAL, Safety.REDUCED)
+
+    @property
+    def runtime(self) -> Runtime:
+        if self.program is None:
+            return Runtime.STOPPED
+        if not self.paused:
+            return Runtime.PLAYING
+        return Runtime.PAUSED if self.arm.rests else Runtime.PAUSING
+
+    @property
+    def status_bits(self) -> int:
+        """robot_status_bits: power on, program running, teach button, power button."""
+        powered = self.mode in (Mode.IDLE, Mode.RUNNING)
+        return powered << 0 | (self.program is not None) << 1 | (self.freedrive is not None) << 2
+
+    @property
+    def safety_status_bits(self) -> int:
+        return SAFETY_BITS[self.safety]
+
+    @property
+    def raw_wrench(self) -> FloatArray:
+        """Load on the flange in its axes, with the weight of the payload and no zero taken off (6,) [N, N m]."""
+        if self.payload == 0.0 and not self.load.true.any():
+            return np.zeros(6)
+        flange = self.arm.kinematics.forward(self.arm.q)
+        weight = -self.payload * flange[:3, :3].T @ self.gravity
+        own = np.concatenate([weight, cross(self.payload_centre, weight)])
+        return own + self.load.at_flange(self.load.true, self.arm, flange)
+
+    @property
+    def steady(self) -> bool:
+        """is_steady(): at rest, and not compliant."""
+        compliant = self.freedrive is not None or (self.program is not None and self.program.compliant)
+        return self.arm.rests and not compliant
+
+    def say(self, text: str) -> None:
+        self.log.append((self.time, text))
+
+    # -- program -----------------------------------------------------------------------------------------------------
+
+    def start(self, text: str) -> bool:
+        """Runs an uploaded program instead of the present one; False where the robot is in no state to."""
+        if not self.operational:
+            self.say(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
+            return False
+        program = Program(self, text)
+        if program.kind != "def":
+            self.say(f"not run: {text[:60]!r}... is no program, or a secondary one")
+            return False
+        self.stop("replaced by another program")
+        if not program.known:
+            self.say(f"program '{program.name}' ended: the mock runs no URScript but ur_rtde's control script")
+            self.stop_reason = f"'{program.name}' is not ur_rtde's control script"
+            return False
+        self.program, self.paused = program, False
+        self.say(f"program '{program.name}' started")
+        return True
+
+    def stop(self, why: str) -> None:
+        """Ends the program; the arm coasts to rest."""
+        self.watchdog, self.freedrive, self.arm.waypoint = None, None, None
+        if self.program is not None:
+            self.program, self.stop_reason = None, why
+            self.say(f"program stopped: {why}")
+
+    # -- safety and power --------------------------------------------------------------------------------------------
+
+    def protective_stop(self, why: str) -> None:
+        if self.safety in (Safety.NORMAL, Safety.REDUCED, Safety.SAFEGUARD_STOP):
+            self.safety, self.stopped_at = Safety.PROTECTIVE_STOP, self.time
+            self.say(f"protective stop: {why}")
+            self.stop(f"protective stop: {why}")
+
+    def emergency_stop(self) -> None:
+        self.safety = Safety.ROBOT_EMERGENCY_STOP
+        self.say("emergency stop")
+        self.stop("emergency stop")
+
+    def safeguard_stop(self, on: bool) -> None:
+        """Pauses a running program; it goes on when the gate is closed again."""
+        if on and self.operational:
+            self.safety, self.paused = Safety.SAFEGUARD_STOP, True
+            self.say("safeguard stop")
+        elif not on and self.safety is Safety.SAFEGUARD_STOP:
+            self.safety, self.paused = Safety.NORMAL, False
+
+    def unlock(self) -> bool:
+        """Ends a protective stop; False where it is too early."""
+        if self.safety is Safety.PROTECTIVE_STOP:
+            if self.time - self.stopped_at < self.unlock_delay:
+                return False
+            self.safety = Safety.NORMAL
+        return True
+
+    def release_emergency_stop(self) -> None:
+        """The button is pulled out again. The arm stays without power."""
+        if self.safety is Safety.ROBOT_EMERGENCY_STOP:
+            self.safety, self.mode, self._changing = Safety.NORMAL, Mode.POWER_OFF, None
+
+    def power_off(self) -> None:
+        self.stop("power off")
+        self.mode, self._changing = Mode.POWER_OFF, None
+        self.arm.halt()
+
+    def power_on(self) -> None:
+        if self.mode is Mode.POWER_OFF and self.safety is not Safety.ROBOT_EMERGENCY_STOP:
+            self.mode, self._changing = Mode.POWER_ON, (self.ticks + POWER_UP, Mode.IDLE)
+
+    def release_brakes(self) -> None:
+        """From idle to running; powers on first where needed."""
+        if self.safety is Safety.ROBOT_EMERGENCY_STOP or self.mode is Mode.RUNNING:
+            return
+        wait = RELEASE + (0 if self.mode is Mode.IDLE else POWER_UP)
+        self.mode = Mode.IDLE if self.mode is Mode.IDLE else Mode.POWER_ON
+        self._changing = (self.ticks + wait, Mode.RUNNING)
+
+    def recover(self) -> None:
+        """All that a person would do after a stop, at once: release, unlock, power, brakes."""
+        self.safety, self.mode, self._changing, self.paused = Safety.NORMAL, Mode.RUNNING, None, False
+
+    # -- one control period ------------------------------------------------------------------------------------------
+
+    def tick(self) -> None:
+        """Watchdog, program, motion, forces, safety: in this order."""
+        self.ticks += 1
+        self._power()
+        if self.watchdog is not None and (self.ticks - self.fed) * PERIOD > self.watchdog[1]:
+            self.stop(
+                f"RTDE watchdog: input_int_register_{self.watchdog[0]} was not written for {self.watchdog[1]:g} s"
+            )
+        self._scale()
+        if self.program is not None and not (self.paused and self.arm.scale == 0.0):
+            self._guarded(self.program.step)
+        if self.freedrive is not None and not self.arm.commanded:
+            self._guarded(self._give_way)
+        self.arm.advance(COAST if self.safety in (Safety.NORMAL, Safety.REDUCED) else BRAKE)
+        self.load.look(self.arm)
+        self.load.history.append(self.load.felt)
+        self._watch()
+
+    def _guarded(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except ProgramError as error:
+            self.stop(str(error))
+
+    def _give_way(self) -> None:
+        assert self.freedrive is not None
+        damping = np.repeat([FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING], 3)
+        frame, free = self.freedrive
+        admit(self.arm, frame, free, self.load.true / damping, np.array([0.25] * 3 + [1.0] * 3))
+
+    def _power(self) -> None:
+        if self._changing is not None and self.ticks >= self._changing[0]:
+            self.mode, self._changing = self._changing[1], None
+        if self.safety is Safety.ROBOT_EMERGENCY_STOP and self.mode is not Mode.POWER_OFF and self.arm.rests:
+            self.power_off()
+
+    def _scale(self) -> None:
+        wanted, step = 0.0 if self.paused else self.slider, SLIDER_RATE * PERIOD
+        self.arm.scale += max(-step, min(step, wanted - self.arm.scale))
+        if abs(self.arm.scale - wanted) < 1e-12:
+            self.arm.scale = wanted
+
+    def _watch(self) -> None:
+        """The robot's own limits."""
+        if self.safety not in (Safety.NORMAL, Safety.REDUCED):
+            return
+        arm = self.arm
+        force = math.sqrt(sum(value * value for value in self.load.true[:3].tolist()))
+        if force > self.load.force_limit:
+            self.protective_stop(f"force of {force:.0f} N, limit {self.load.force_limit:g} N")
+        fast = np.abs(arm.target_qd) > arm.kinematics.joint_speeds * 1.001
+        if fast.any():
+            joint = int(np.argmax(fast))
+            self.protective_stop(f"joint {joint + 1} at {abs(arm.target_qd[joint]):.2f} rad/s, too fast")
+        beyond = np.abs(arm.target_q) > 2 * math.pi
+        if beyond.any() and arm.target_qd.any():
+            self.protective_stop(f"joint {int(np.argmax(beyond)) + 1} at the end of its range")
+
+    # -- what comes in -----------------------------------------------------------------------------------------------
+
+    def feed(self, register: int) -> None:
+        """Tells the watchdog that an input_int_register was written."""
+        if self.watchdog is not None and register == self.watchdog[0]:
+            self.fed = self.ticks
+
+    def set_slider(self, fraction: float) -> None:
+        if 0.0 <= fraction <= 1.0:
+            self.slider = fraction
+        else:
+            self.say(f"speed slider {fraction} ignored: not within 0 and 1")

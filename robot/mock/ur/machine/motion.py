@@ -1,0 +1,265 @@
+"""Motions of URScript as generators: one `yield` is one control period.
+
+Where the real thing is not published, the mock does the plain thing, and says so:
+
+* movej, movel, paths: trapezoidal speed. In movel a turn counts as its angle, so that `a` and `v` are rad/s^2 and rad/s
+  when it is longer (as number) than the way. A move that begins while the arm moves brakes first.
+* paths: waypoints with a blend radius are rounded by a parabola that begins and ends that far from the waypoint. A
+  blended stretch is run at the smallest speed and acceleration of its waypoints. movej in a path stops at each one.
+* servoj: a lag of first order with the time constant `lookahead_time`, within the joints' top speeds and 40 rad/s^2.
+  `gain` has no effect.
+* force mode: an admittance. A compliant axis moves at (force missing) / FORCE_DAMPING, within its limit; the others
+  hold still. Only frames of type 2, and no other motion besides.
+* freedrive, teach mode: an admittance to the wrench on the tool.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from robot.arm.kinematics import motion, rotation, rotation_vector
+from robot.mock.ur.machine.arm import JOINT_ACCELERATION, PERIOD, Arm, Motion, ProgramError, slowed
+from tacsim.interface import FloatArray
+
+FORCE_DAMPING = 1000.0  # [N/(m/s)], and [N m/(rad/s)]
+FREEDRIVE_DAMPING = 200.0  # [N/(m/s)]
+FREEDRIVE_TURN_DAMPING = 20.0  # [N m/(rad/s)]
+ADMITTANCE_ACCELERATION = 2.0  # of force mode and freedrive [m/s^2, rad/s^2]
+
+
+def between(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
+    """The frame (4, 4) a fraction s of the way from a to b: straight line, one axis of rotation."""
+    frame = np.eye(4)
+    frame[:3, 3] = a[:3, 3] + s * (b[:3, 3] - a[:3, 3])
+    frame[:3, :3] = rotation(s * rotation_vector(b[:3, :3] @ a[:3, :3].T)) @ a[:3, :3]
+    return frame
+
+
+def way(a: FloatArray, b: FloatArray) -> float:
+    """Length of the way between two frames: metres, or radians if those are more."""
+    step = motion(a, b)
+    return max(float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:])))
+
+
+def trapezoid(arm: Arm, length: float, speed: float, acceleration: float) -> Iterator[float]:
+    """Distances from 0 to `length`, one a period: speed up, cruise, slow down. Time runs with the speed scaling."""
+    if not (speed > 0 and acceleration > 0 and math.isfinite(length + speed + acceleration)):
+        raise ProgramError(f"speed and acceleration must be positive, got v={speed:g}, a={acceleration:g}")
+    if length < 1e-9:
+        return
+    ramp = min(speed / acceleration, math.sqrt(length / acceleration))
+    top = acceleration * ramp
+    total = ramp + length / top
+    time = 0.0
+    while (time := time + PERIOD * arm.scale) < total:
+        if time < ramp:
+            yield 0.5 * acceleration * time * time
+        elif time < total - ramp:
+            yield top * (time - 0.5 * ramp)
+        else:
+            yield length - 0.5 * acceleration * (total - time) ** 2
+    yield length
+
+
+def movej(arm: Arm, q: FloatArray, acceleration: float, speed: float) -> Motion:
+    """All joints arrive together; speed [rad/s] and acceleration [rad/s^2] are those of the leading joint."""
+    yield from stopj(arm, acceleration)
+    start, step = arm.target_q, np.asarray(q, dtype=np.float64) - arm.target_q
+    length = float(np.abs(step).max())
+    arm.waypoint = arm.kinematics.forward(q, arm.tool)
+    for s in trapezoid(arm, length, speed, acceleration):
+        arm.follow(start + s / length * step)
+        yield
+    arm.waypoint = None
+
+
+def movel(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> Motion:
+    """The TCP on a straight line to the frame `goal`."""
+    return path(arm, [Waypoint(goal, acceleration, speed, 0.0)])
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """One corner of a path of straight lines."""
+
+    frame: FloatArray  # (4, 4)
+    acceleration: float  # [m/s^2]
+    speed: float  # [m/s]
+    blend: float  # radius [m]
+
+
+def path(arm: Arm, waypoints: Sequence[Waypoint]) -> Motion:
+    """Straight lines from waypoint to waypoint; blended ones in one go, a stop at all others."""
+    first = 0
+    while first < len(waypoints):
+        last = first
+        while last + 1 < len(waypoints) and waypoints[last].blend > 0:
+            last += 1
+        stretch = waypoints[first : last + 1]
+        acceleration = min(point.acceleration for point in stretch)
+        yield from stopl(arm, acceleration)
+        pieces = _pieces([arm.target_frame, *(point.frame for point in stretch)], [point.blend for point in stretch])
+        arm.waypoint = stretch[-1].frame
+        ends = np.cumsum([piece.length for piece in pieces])
+        for s in trapezoid(arm, float(ends[-1]), min(point.speed for point in stretch), acceleration):
+            index = min(int(np.searchsorted(ends, s)), len(pieces) - 1)
+            piece = pieces[index]
+            arm.follow(arm.solve(piece.at(piece.length - (float(ends[index]) - s))))
+            yield
+        arm.waypoint = None
+        first = last + 1
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A line, or the rounding of a corner, by its length."""
+
+    length: float
+    at: Callable[[float], FloatArray]  # distance to frame (4, 4)
+
+
+def _pieces(corners: list[FloatArray], blends: list[float]) -> list[Piece]:
+    pieces, here = [], corners[0]
+    for index, corner in enumerate(corners[1:]):
+        radius = blends[index] if index + 2 < len(corners) else 0.0
+        if radius > 0:
+            following = corners[index + 2]
+            arriving, leaving = (float(np.linalg.norm((a - corner)[:3, 3])) for a in (here, following))
+            # A rounding takes at most half of each of its two lines, so that neighbours do not overlap.
+            radius = min(radius, 0.5 * min(arriving, leaving))
+        if radius < 1e-9:
+            pieces.append(_line(here, corner))
+            here = corner
+            continue
+        begin, end = between(corner, here, radius / arriving), between(corner, following, radius / leaving)
+        pieces += [_line(here, begin), _rounding(begin, corner, end)]
+        here = end
+    return pieces
+
+
+def _line(a: FloatArray, b: FloatArray) -> Piece:
+    length = way(a, b)
+    return Piece(length, lambda s: between(a, b, s / length if length > 0 else 1.0))
+
+
+def _rounding(a: FloatArray, corner: FloatArray, b: FloatArray) -> Piece:
+    def at(u: float) -> FloatArray:
+        return between(between(a, corner, u), between(corner, b, u), u)
+
+    share = np.linspace(0.0, 1.0, 33)
+    frames = [at(float(u)) for u in share]
+    lengths = np.concatenate([[0.0], np.cumsum([way(p, q) for p, q in pairwise(frames)])])
+    return Piece(float(lengths[-1]), lambda s: at(float(np.interp(s, lengths, share))))
+
+
+def stopj(arm: Arm, deceleration: float) -> Motion:
+    """Brakes the joints, the leading one at `deceleration` [rad/s^2]."""
+    rate = _positive(deceleration, "deceleration")
+    while arm.target_qd.any():
+        arm.drive(slowed(arm.target_qd, rate))
+        yield
+
+
+def stopl(arm: Arm, deceleration: float) -> Motion:
+    """Brakes the TCP along its direction at `deceleration` [m/s^2], or [rad/s^2] where it rather turns."""
+    rate = _positive(deceleration, "deceleration")
+    while arm.target_qd.any():
+        twist = arm.target_twist
+        size = max(float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:])))
+        left = size - rate * PERIOD
+        if left < 1e-12:
+            arm.drive(np.zeros(6))
+        else:
+            arm.drive(arm.joint_speeds_of(twist * (left / size)))
+        yield
+
+
+def servoj(arm: Arm, q: FloatArray, time: float, lookahead: float) -> Motion:
+    """Follows joints q for `time` [s]."""
+    if not (math.isfinite(time) and lookahead > 0):
+        raise ProgramError(f"servoj: lookahead_time must be positive and t finite, got {lookahead:g}, {time:g}")
+    for _ in range(max(1, round(time / PERIOD))):
+        left = q - arm.target_q
+        # As fast as the lag asks for, but never faster than could still be braked.
+        brakable = np.sqrt(JOINT_ACCELERATION * np.abs(left))
+        top = np.minimum(arm.kinematics.joint_speeds, brakable)
+        wanted = np.clip(left / max(lookahead, PERIOD), -top, top)
+        change = np.clip(wanted - arm.target_qd, -JOINT_ACCELERATION * PERIOD, JOINT_ACCELERATION * PERIOD)
+        arm.drive((arm.target_qd + change) * (1.0 if arm.scale > 0 else 0.0))
+        yield
+
+
+def speedj(arm: Arm, qd: FloatArray, acceleration: float, time: float) -> Motion:
+    """Joint speeds qd [rad/s]; ends after `time` [s], or with time 0 once they are reached."""
+    return _speed(acceleration, time, lambda: _ramp(arm.target_qd, arm.scale * qd, acceleration, joint=True), arm.drive)
+
+
+def speedl(arm: Arm, twist: FloatArray, acceleration: float, time: float) -> Motion:
+    """Twist of the TCP in base axes; ends after `time` [s], or with time 0 once it is reached."""
+
+    def drive(wanted: FloatArray) -> None:
+        arm.drive(arm.joint_speeds_of(wanted))
+
+    return _speed(
+        acceleration, time, lambda: _ramp(arm.target_twist, arm.scale * twist, acceleration, joint=False), drive
+    )
+
+
+def _speed(
+    acceleration: float, time: float, step: Callable[[], tuple[FloatArray, bool]], drive: Callable[[FloatArray], None]
+) -> Motion:
+    _positive(acceleration, "acceleration")
+    if not math.isfinite(time):
+        raise ProgramError(f"time must be finite, got {time:g}")
+    periods = 0
+    while True:
+        wanted, reached = step()
+        drive(wanted)
+        periods += 1
+        yield
+        if reached if time <= 0 else periods * PERIOD >= time - 1e-9:
+            return
+
+
+def _ramp(now: FloatArray, wanted: FloatArray, acceleration: float, *, joint: bool) -> tuple[FloatArray, bool]:
+    """One period nearer to the wanted speed; and whether it is reached."""
+    change = wanted - now
+    size = float(np.abs(change).max()) if joint else max(map(float, (_norm(change[:3]), _norm(change[3:]))))
+    limit = acceleration * PERIOD
+    return (wanted, True) if size <= limit else (now + change * (limit / size), False)
+
+
+def servoc(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> Motion:
+    """Towards a frame at a bounded speed, braking in time; one control period."""
+    step = motion(arm.target_frame, goal)
+    size = max(_norm(step[:3]), _norm(step[3:]))
+    pace = min(speed, math.sqrt(acceleration * size), size / (4 * PERIOD))
+    twist, _ = _ramp(arm.target_twist, step * (pace / size if size > 1e-12 else 0.0), acceleration, joint=False)
+    arm.drive(arm.joint_speeds_of(arm.scale * twist))
+    yield
+
+
+def admit(arm: Arm, frame: FloatArray, free: Sequence[float], push: FloatArray, limits: FloatArray) -> None:
+    """One control period of compliance: the free axes of `frame` move at `push` (base axes, as a twist), at most
+    `limits`; the others hold still."""
+    turn = frame[:3, :3]
+    local = np.concatenate([turn.T @ push[:3], turn.T @ push[3:]])
+    local = np.where(np.asarray(free) != 0, np.clip(local, -limits, limits), 0.0)
+    wanted = np.concatenate([turn @ local[:3], turn @ local[3:]])
+    twist, _ = _ramp(arm.target_twist, arm.scale * wanted, ADMITTANCE_ACCELERATION, joint=False)
+    arm.drive(arm.joint_speeds_of(twist))
+
+
+def _norm(vector: FloatArray) -> float:
+    return float(np.linalg.norm(vector))
+
+
+def _positive(value: float, name: str) -> float:
+    if not (value > 0 and math.isfinite(value)):
+        raise ProgramError(f"{name} must be positive, got {value:g}")
+    return value

@@ -1,0 +1,188 @@
+"""The register protocol: what ur_rtde's control script does when it runs on a controller.
+
+The text of the script is recognised, not interpreted: which registers it uses, which calls its `$version` lines left in
+it, and the path that was written into it. Its loop, its threads and its answers are done here and in
+`robot.mock.ur.machine.commands`, by the numbers of ur_rtde 1.6.5.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot.arm.kinematics import matrix
+from robot.mock.ur.machine.arm import Arm, Motion, ProgramError
+from robot.mock.ur.machine.commands import COMMANDS, NEEDS, NOT_MODELLED, REALTIME
+from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from robot.mock.ur.machine.machine import Machine
+
+READY, DONE = 1, 2  # answers in output_int_register_0
+STOP_SCRIPT = 255  # the command that ends the script
+
+
+class Program:
+    """One running program. `step` is one control period."""
+
+    def __init__(self, machine: Machine, text: str) -> None:
+        self.machine: Machine = machine
+        self.arm: Arm = machine.arm
+        self.text = _of_version(text, machine.version)
+        named = re.search(r"^\s*(def|sec)\s+(\w+)", self.text, re.M)
+        self.kind, self.name = named.groups() if named else ("", "?")
+        self.known = self.name == "rtde_control"
+        self.int_offset, self.float_offset = (self._offset(kind) for kind in ("int", "float"))
+        self.threads: dict[str, Motion] = {}
+        self.calls: dict[str, Callable[[], Motion]] = {}  # what a repeating thread does next
+        self.stops_linear = False  # whether stopJ and stopL are stopl: see commands.stop
+        self.speeds_linear = True  # whether the last speed command was speedl
+        self.internal = 0  # a command that the script gives itself
+        self.contact_steps = 0
+        self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # pose asked for, its joints
+        self._writes = self._operation = 0  # of the asynchronous word
+        self._main = self._loop()
+
+    @property
+    def compliant(self) -> bool:
+        return "force" in self.threads
+
+    def step(self) -> None:
+        """Main program, then its threads. Raises ProgramError where the program ends with an error."""
+        if not _go_on(self._main):
+            self.machine.stop("stopped by its client")
+            return
+        for name, thread in list(self.threads.items()):
+            if self.threads.get(name) is thread and not _go_on(thread):
+                self.threads.pop(name, None)
+
+    # -- registers ---------------------------------------------------------------------------------------------------
+
+    def double(self, index: int) -> float:
+        return self.machine.in_double[index + self.float_offset]
+
+    def doubles(self, first: int, count: int = 6) -> FloatArray:
+        begin = first + self.float_offset
+        return np.array(self.machine.in_double[begin : begin + count])
+
+    def frame(self, first: int) -> FloatArray:
+        """The pose in six registers, as frame (4, 4)."""
+        values = self.doubles(first)
+        if not np.isfinite(values).all():
+            raise ProgramError("pose with a number that is not finite")
+        return matrix(values)
+
+    def integer(self, index: int) -> int:
+        return self.machine.in_int[index + self.int_offset]
+
+    def answer(self, values: FloatArray) -> None:
+        begin = self.float_offset
+        self.machine.out_double[begin : begin + len(values)] = values.tolist()
+
+    def answer_integer(self, value: int, index: int = 1) -> None:
+        self.machine.out_int[index + self.int_offset] = value
+
+    def _offset(self, kind: str) -> int:
+        found = re.search(rf"reg_offset_{kind} = # {kind} register offset\s*(\d+)", self.text)
+        return int(found.group(1)) if found else 0
+
+    # -- threads -----------------------------------------------------------------------------------------------------
+
+    def run(self, name: str, work: Motion, *, tracked: bool = False) -> None:
+        """Starts a thread. `tracked`: the asynchronous word tells of it."""
+
+        def tracking() -> Motion:
+            self.signal(0)
+            yield from work
+            self.signal(-1)
+
+        self.threads[name] = tracking() if tracked else work
+
+    def repeat(self, name: str, call: Callable[[], Motion]) -> None:
+        """What the thread shall do for ever from its next round on; starts it where it does not run."""
+
+        def rounds() -> Motion:
+            while True:
+                yield from self.calls[name]()
+
+        self.calls[name] = call
+        if name not in self.threads:
+            self.run(name, rounds())
+
+    def kill(self, name: str) -> bool:
+        """Ends a thread; False where it does not run."""
+        killed = self.threads.pop(name, None) is not None
+        if killed and name in ("move", "stop"):
+            self.signal(-1)
+            self.arm.waypoint = None
+        return killed
+
+    def signal(self, progress: int) -> None:
+        """The asynchronous word: 0 begins an operation, more is its progress, -1 its end."""
+        self._writes = (self._writes + 1) % 128
+        if progress == 0:
+            self._operation = (self._operation + 1) % 128
+        word = self._writes << 16 | self._operation << 24
+        self.answer_integer(word | (min(progress, 32767) | 1 << 15 if progress >= 0 else 0), 2)
+
+    # -- the script's loop -------------------------------------------------------------------------------------------
+
+    def _loop(self) -> Motion:
+        self.signal(-1)
+        self.answer_integer(READY, 0)
+        executing = False
+        while True:
+            command = self.integer(0)
+            if command == 0:
+                command, self.internal = self.internal, 0
+            if command in REALTIME:
+                yield from self._process(command)
+                self.answer_integer(READY, 0)
+            elif command == 0:
+                executing = False
+                self.answer_integer(READY, 0)
+            elif not executing:
+                if command == STOP_SCRIPT:
+                    return
+                yield from self._process(command)
+                self.answer_integer(DONE, 0)
+                executing = True
+            yield
+
+    def _process(self, command: int) -> Motion:
+        if NEEDS.get(command, "") not in self.text:
+            return
+        if command in NOT_MODELLED:
+            raise ProgramError(f"{NOT_MODELLED[command]} is not modelled by the mock")
+        work = COMMANDS.get(command)
+        if work is not None:
+            yield from work(self) or ()
+
+
+def _go_on(work: Motion) -> bool:
+    """One control period of `work`; False when it has ended."""
+    try:
+        next(work)
+    except StopIteration:
+        return False
+    return True
+
+
+def _of_version(text: str, version: tuple[int, ...]) -> str:
+    """The text without lines for newer controllers. `$5.10|3.15 line` needs 5.10, or 3.15 of that major version."""
+
+    def kept(line: str) -> Iterator[str]:
+        mark = re.match(r"\s*\$([\d.|]+)(.*)", line)
+        if mark is None:
+            yield line
+            return
+        for least in mark.group(1).split("|"):
+            wanted = tuple(int(number) for number in least.split(".") if number)
+            if wanted[:1] == version[:1] and version >= wanted:
+                yield mark.group(2)
+                return
+
+    return "\n".join(part for line in text.splitlines() for part in kept(line))

@@ -1,0 +1,319 @@
+"""One mock controller on its address: the sockets of the RTDE, the script ports and the dashboard, and one tick."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot.mock.ur.machine.arm import HOME, PERIOD
+from robot.mock.ur.machine.machine import Machine, Version
+from robot.mock.ur.wire import dashboard
+from robot.mock.ur.wire.connection import Connection
+from robot.mock.ur.wire.fields import Value, apply
+from robot.mock.ur.wire.rtde import BadPackage, Session, packages
+
+if TYPE_CHECKING:
+    from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
+
+RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
+PORTS = (RTDE, DASHBOARD, *SCRIPTS)
+SERIAL = "00000000001"  # no real arm has it: whoever must not talk to a mock can tell
+MAX_CLIENTS = 256  # of one controller; more are closed at once
+MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
+KEPT = 200_000  # input packages that are remembered
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """What a controller is like at power-on."""
+
+    host: str
+    model: Model = "ur5e"
+    joints: tuple[float, ...] = HOME
+    version: Version = (5, 11, 0, 108150)
+    serial: str = SERIAL
+
+
+@dataclass
+class Faults:
+    """What is wrong at present. The defaults: nothing."""
+
+    silence: bool = False  # no data packages; everything else answers
+    black_hole: bool = False  # nothing is read, nothing answered; connections open
+    dashboard_mute: bool = False
+    partial: bool = False  # data packages arrive in two halves, a period apart
+    nan: bool = False  # what is measured is not a number
+    remote_control: bool = True
+    delay: float = 0.0  # of everything sent [s]
+    drop: float = 0.0  # probability for each data package
+    chance: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    claimed: set[str] = field(default_factory=set)  # input names that a field bus holds
+
+
+@dataclass(frozen=True)
+class Received:
+    """An input package as it arrived."""
+
+    number: int
+    tick: int
+    values: dict[str, Value | tuple[Value, ...]]
+
+
+class Controller:
+    """Serves one host. The loop around it calls `tick` once a control period; sockets call back in between."""
+
+    def __init__(self, config: ControllerConfig, selector: selectors.BaseSelector) -> None:
+        self.config, self._selector = config, selector
+        self.faults = Faults()
+        self.machine = Machine(config.model, config.joints, config.version)
+        self.ticks = self.overruns = 0
+        self.sent = self.dropped = 0  # data packages
+        self.received: deque[Received] = deque(maxlen=KEPT)
+        self.arrived = 0  # input packages so far
+        self.clients: dict[Connection, Session | None] = {}
+        self._listeners: list[socket.socket] = []
+        self._boot_at: int | None = None  # tick at which a power cycle ends
+        self._rate = (time.monotonic(), 0, 0.0)  # begun, ticks then, rate of the span before
+        self.listen()
+
+    # -- life --------------------------------------------------------------------------------------------------------
+
+    def listen(self) -> None:
+        """Opens the ports. Raises OSError that names host and port."""
+        if self._listeners:
+            return
+        for port in PORTS:
+            self._listeners.append(open_port(self.config.host, port))
+            self._watch(self._listeners[-1], partial(self._accept, self._listeners[-1], port))
+
+    def refuse(self) -> None:
+        """Closes the ports; who is connected stays."""
+        for listener in self._listeners:
+            if not self.faults.black_hole:  # else nobody watches it
+                self._unwatch(listener)
+            listener.close()
+        self._listeners.clear()
+
+    def close(self) -> None:
+        self.cut(PORTS, reset=False)
+        self.refuse()
+
+    def reset(self) -> None:
+        """As at power-on: no clients, no faults, joints where they began. Ticks and counts go on."""
+        self.cut(PORTS, reset=True)
+        self.black_hole(False)
+        self._boot_at = None
+        self.faults = Faults()
+        self.machine = Machine(self.config.model, self.config.joints, self.config.version)
+        self.received.clear()
+        self.listen()
+
+    def power_cycle(self, seconds: float) -> None:
+        """Off and on again: clients are cut, ports closed for so long, then the robot is there without power."""
+        self.cut(PORTS, reset=True)
+        self.refuse()
+        joints = tuple(float(angle) for angle in self.machine.arm.q)
+        self.machine = Machine(self.config.model, joints, self.machine.version)
+        self.machine.power_off()
+        self._boot_at = self.ticks + max(1, round(seconds / PERIOD))
+
+    def cut(self, ports: Sequence[int], *, reset: bool) -> int:
+        """Closes the connections to these ports; says how many."""
+        chosen = [client for client in self.clients if client.port in ports]
+        for client in chosen:
+            self._drop(client, reset=reset)
+        return len(chosen)
+
+    def black_hole(self, on: bool) -> None:
+        """Takes the hands off all sockets, which stay open, or takes them up again."""
+        if on == self.faults.black_hole:
+            return
+        self.faults.black_hole = on
+        for client in self.clients:
+            if on:
+                self._unwatch(client.socket)
+            else:
+                self._watch(client.socket, partial(self._read, client))
+        for listener in self._listeners:
+            if on:
+                self._unwatch(listener)
+            else:
+                self._watch(listener, partial(self._accept, listener, listener.getsockname()[1]))
+
+    # -- one control period ------------------------------------------------------------------------------------------
+
+    def tick(self) -> None:
+        begun = time.perf_counter()
+        self.ticks += 1
+        if self._boot_at is not None:
+            if self.ticks < self._boot_at:
+                return
+            self._boot_at = None
+            self.listen()
+        self.machine.tick()
+        if not self.faults.black_hole:
+            self._publish()
+        if self.ticks % 500 == 0:
+            now, (then, count, _) = time.monotonic(), self._rate
+            self._rate = now, self.ticks, (self.ticks - count) / max(now - then, 1e-9)
+        self.machine.work_time = time.perf_counter() - begun
+
+    @property
+    def tick_rate(self) -> float:
+        """Control periods a second, over the last 500 of them [1/s]; 0 before that."""
+        return self._rate[2]
+
+    def _publish(self) -> None:
+        now = time.monotonic()
+        made: dict[tuple[str, ...], bytes] = {}  # clients with the same recipe get the same bytes
+        for client, session in list(self.clients.items()):
+            if not client.flush(now):
+                self._drop(client)
+            elif session is not None and session.streaming and session.output is not None:
+                recipe = session.output
+                if self.ticks % recipe.every or self.faults.silence:
+                    continue
+                if self.faults.drop > 0 and self.faults.chance.random() < self.faults.drop:
+                    self.dropped += 1
+                    continue
+                data = made.get(recipe.names)
+                if data is None:
+                    data = made[recipe.names] = recipe.pack(self.machine, spoilt=self.faults.nan)
+                self._stream(client, data)
+
+    def _stream(self, client: Connection, data: bytes) -> None:
+        sent, dropped = client.sent, client.dropped
+        client.send(data, droppable=True, due=self._due(), halved=self.faults.partial)
+        self.sent += client.sent - sent
+        self.dropped += client.dropped - dropped
+
+    def _due(self) -> float:
+        return time.monotonic() + self.faults.delay if self.faults.delay > 0 else 0.0
+
+    # -- sockets -----------------------------------------------------------------------------------------------------
+
+    def _watch(self, sock: socket.socket, work: Callable[[], None]) -> None:
+        self._selector.register(sock, selectors.EVENT_READ, work)
+
+    def _unwatch(self, sock: socket.socket) -> None:
+        self._selector.unregister(sock)
+
+    def _accept(self, listener: socket.socket, port: int) -> None:
+        try:
+            sock, _ = listener.accept()
+        except OSError:
+            return  # gone again
+        if len(self.clients) >= MAX_CLIENTS:
+            self.machine.say(f"client of port {port} closed: {MAX_CLIENTS} are connected already")
+            sock.close()
+            return
+        client = Connection(sock, port)
+        session = None
+        if port == RTDE:
+            session = Session(lambda: self.machine, self._taken, self._write)
+        self.clients[client] = session
+        self._watch(sock, partial(self._read, client))
+        if port == DASHBOARD and not self.faults.dashboard_mute:
+            client.send(dashboard.GREETING.encode() + b"\n", due=self._due())
+
+    def _drop(self, client: Connection, *, reset: bool = False) -> None:
+        if client in self.clients:
+            del self.clients[client]
+            if not self.faults.black_hole:
+                self._unwatch(client.socket)
+            client.close(reset=reset)
+
+    def _read(self, client: Connection) -> None:
+        if client not in self.clients:
+            return
+        alive = client.read()
+        try:
+            if client.port == RTDE:
+                self._serve_rtde(client)
+            elif client.port == DASHBOARD:
+                self._serve_dashboard(client)
+            else:
+                self._serve_script(client)
+        except BadPackage as error:
+            self.machine.say(f"port {client.port}: client cut: {error}")
+            alive = False
+        if not alive:
+            self._drop(client)
+
+    def _serve_rtde(self, client: Connection) -> None:
+        session = self.clients[client]
+        assert session is not None
+        for kind, payload in packages(client.received):
+            reply = session.handle(kind, payload)
+            if reply is not None:
+                client.send(reply, due=self._due())
+
+    def _serve_dashboard(self, client: Connection) -> None:
+        while (end := client.received.find(b"\n")) >= 0:
+            line = client.received[:end].decode("utf-8", errors="replace").strip()
+            del client.received[: end + 1]
+            if self.faults.dashboard_mute:
+                continue
+            if line.lower() in ("quit", "shutdown"):
+                client.send(b"Disconnected\n" if line.lower() == "quit" else b"Shutting down\n")
+                self._drop(client)
+                return
+            reply = dashboard.answer(self.machine, line, self.config.serial, remote=self.faults.remote_control)
+            client.send(reply.encode() + b"\n", due=self._due())
+        if len(client.received) > MAX_LINE:
+            raise BadPackage(f"a dashboard line of more than {MAX_LINE} bytes")
+
+    def _serve_script(self, client: Connection) -> None:
+        """A program begins with `def` or `sec` and ends with an `end` that is not indented."""
+        while True:
+            text = bytes(client.received)
+            lines = text.split(b"\n")
+            last = next((i for i, line in enumerate(lines[:-1]) if line.rstrip() == b"end"), None)
+            if last is None and lines[-1] == b"end":
+                last = len(lines) - 1
+            if last is None:
+                break
+            program = b"\n".join(lines[: last + 1]).decode("utf-8", errors="replace")
+            client.received[:] = b"\n".join(lines[last + 1 :])
+            if self.faults.remote_control:
+                self.machine.start(program)
+            else:
+                self.machine.say("program refused: the robot is not in remote control")
+        if len(client.received) > MAX_PROGRAM:
+            raise BadPackage(f"a program of more than {MAX_PROGRAM} bytes")
+
+    # -- input registers ---------------------------------------------------------------------------------------------
+
+    def _taken(self, asking: Session) -> set[str]:
+        others = (session.claims for session in self.clients.values() if session is not None and session is not asking)
+        return self.faults.claimed.union(*others)
+
+    def _write(self, values: dict[str, Value | tuple[Value, ...]]) -> None:
+        self.arrived += 1
+        self.received.append(Received(self.arrived, self.ticks, values))
+        apply(self.machine, values)
+
+
+def open_port(host: str, port: int) -> socket.socket:
+    """A listening socket. Raises OSError that names host and port."""
+    listener = socket.socket()
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        reason = (error.strerror or str(error)).lower()
+        raise OSError(
+            error.errno, f"mock controller: cannot listen on {host}:{port}: {reason}; is another mock running there?"
+        ) from None
+    listener.setblocking(False)
+    return listener

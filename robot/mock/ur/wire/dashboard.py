@@ -1,0 +1,125 @@
+"""The dashboard server: a line of text in, a line of text out (Dashboard Server e-Series, Universal Robots)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from robot.mock.ur.machine.machine import Machine, Runtime, Safety
+
+GREETING = "Connected: Universal Robots Dashboard Server"
+_ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` does not tell the e-Series
+
+
+def answer(machine: Machine, line: str, serial: str, *, remote: bool) -> str:
+    """The reply to one request."""
+    words = line.strip()
+    request = words.lower()
+    asked = _QUESTIONS.get(request)
+    if asked is not None:
+        return asked(machine, serial, remote)
+    if request in _ORDERS:
+        return _ORDERS[request](machine)
+    if request.startswith("load "):
+        # Nothing could run it: the mock runs ur_rtde's control script alone.
+        return f"File not found: {words[5:]}"
+    if request.startswith(("popup ", "addtolog ", "setuserrole ", "set operational mode ")):
+        machine.say(f"dashboard: {words}")
+        return {"p": "showing popup", "a": "Added log message"}.get(request[0], "Setting user role: none")
+    return f"could not understand: '{words}'"
+
+
+def _yes(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _state(machine: Machine) -> str:
+    state = {Runtime.STOPPED: "STOPPED", Runtime.PLAYING: "PLAYING"}.get(machine.runtime, "PAUSED")
+    return f"{state} <unnamed>"
+
+
+_QUESTIONS: dict[str, Callable[[Machine, str, bool], str]] = {
+    "polyscopeversion": lambda m, serial, remote: f"URSoftware {'.'.join(map(str, m.version))} (Jan 01 2022)",
+    "get serial number": lambda m, serial, remote: serial,
+    "get robot model": lambda m, serial, remote: _ROBOT[m.arm.kinematics.model],
+    "is in remote control": lambda m, serial, remote: _yes(remote),
+    "robotmode": lambda m, serial, remote: f"Robotmode: {m.mode.name}",
+    "safetystatus": lambda m, serial, remote: f"Safetystatus: {m.safety.name}",
+    "safetymode": lambda m, serial, remote: f"Safetymode: {m.safety.name}",
+    "programstate": lambda m, serial, remote: _state(m),
+    "running": lambda m, serial, remote: f"Program running: {_yes(m.program is not None)}",
+    "get loaded program": lambda m, serial, remote: "No program loaded",
+    "isprogramsaved": lambda m, serial, remote: "true <unnamed>",
+    "get operational mode": lambda m, serial, remote: "NONE",
+}
+
+
+def _power_on(machine: Machine) -> str:
+    machine.power_on()
+    return "Powering on"
+
+
+def _power_off(machine: Machine) -> str:
+    machine.power_off()
+    return "Powering off"
+
+
+def _release_brakes(machine: Machine) -> str:
+    machine.release_brakes()
+    return "Brake releasing"
+
+
+def _stop(machine: Machine) -> str:
+    machine.stop("dashboard stop")
+    return "Stopped"
+
+
+def _pause(machine: Machine) -> str:
+    if machine.program is None:
+        return "Failed to execute: pause"
+    machine.paused = True
+    return "Pausing program"
+
+
+def _play(machine: Machine) -> str:
+    if machine.program is None or not machine.operational:
+        return "Failed to execute: play"
+    machine.paused = False
+    return "Starting program"
+
+
+def _unlock(machine: Machine) -> str:
+    if machine.unlock():
+        return "Protective stop releasing"
+    return (
+        f"Cannot unlock protective stop until {machine.unlock_delay:g}s after occurrence. "
+        "Always inspect cause of protective stop before unlocking"
+    )
+
+
+def _restart_safety(machine: Machine) -> str:
+    machine.power_off()
+    if machine.safety is not Safety.ROBOT_EMERGENCY_STOP:
+        machine.safety = Safety.NORMAL
+    return "Restarting safety"
+
+
+def _close_popup(machine: Machine) -> str:
+    return "closing popup"
+
+
+def _close_safety_popup(machine: Machine) -> str:
+    return "closing safety popup"
+
+
+_ORDERS = {
+    "power on": _power_on,
+    "power off": _power_off,
+    "brake release": _release_brakes,
+    "stop": _stop,
+    "pause": _pause,
+    "play": _play,
+    "unlock protective stop": _unlock,
+    "restart safety": _restart_safety,
+    "close popup": _close_popup,
+    "close safety popup": _close_safety_popup,
+}

@@ -1,0 +1,188 @@
+"""Real-Time Data Exchange, protocol version 2 (port 30004): packages, recipes, the stream.
+
+A package is uint16 size (with the three bytes of the header), uint8 type, payload; all big endian.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from robot.mock.ur.machine.arm import PERIOD
+from robot.mock.ur.machine.machine import Machine
+from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS, Output, Value
+
+HEADER = struct.Struct(">HB")
+PROTOCOL, VERSION, MESSAGE, DATA = ord("V"), ord("v"), ord("M"), ord("U")
+OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE = ord("O"), ord("I"), ord("S"), ord("P")
+MAX_RECIPES = 255
+
+
+class BadPackage(ValueError):
+    """Bytes that are no package: the connection cannot be understood any more."""
+
+
+def package(kind: int, payload: bytes) -> bytes:
+    """A package on the wire."""
+    return HEADER.pack(len(payload) + HEADER.size, kind) + payload
+
+
+def packages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
+    """Takes all whole packages (type, payload) from the front of the buffer. Raises BadPackage."""
+    while len(buffer) >= HEADER.size:
+        size, kind = HEADER.unpack_from(buffer)
+        if size < HEADER.size:
+            raise BadPackage(f"a package of {size} bytes, less than its header")
+        if len(buffer) < size:
+            return
+        payload = bytes(buffer[HEADER.size : size])
+        del buffer[:size]
+        yield kind, payload
+
+
+@dataclass(frozen=True)
+class InputRecipe:
+    """Names and layout of one kind of input package."""
+
+    names: tuple[str, ...]
+    layout: struct.Struct
+    counts: tuple[int, ...]  # values of each name
+
+    def unpack(self, payload: bytes) -> dict[str, Value | tuple[Value, ...]]:
+        values: tuple[Value, ...] = self.layout.unpack(payload)
+        found: dict[str, Value | tuple[Value, ...]] = {}
+        at = 0
+        for name, count in zip(self.names, self.counts, strict=True):
+            found[name] = values[at] if count == 1 else values[at : at + count]
+            at += count
+        return found
+
+
+@dataclass
+class OutputRecipe:
+    """Names and layout of the stream."""
+
+    names: tuple[str, ...]
+    fields: tuple[Output, ...]
+    layout: struct.Struct
+    every: int  # control periods between two packages
+
+    def pack(self, machine: Machine, *, spoilt: bool) -> bytes:
+        """One data package. `spoilt`: what is measured is not a number."""
+        flat: list[Value] = []
+        for name, output in zip(self.names, self.fields, strict=True):
+            value = output.read(machine)
+            if spoilt and name.startswith("actual_") and FORMATS[output.type].endswith("d"):
+                value = [math.nan] * len(value) if isinstance(value, (list, tuple)) else math.nan
+            if isinstance(value, (list, tuple)):
+                flat.extend(value)
+            else:
+                flat.append(value)
+        return self.layout.pack(self.layout.size, DATA, 1, *flat)
+
+
+@dataclass
+class Session:
+    """What one client of the port has set up.
+
+    `taken` says which input names others hold; `write` takes the values of an input package.
+    """
+
+    machine: Callable[[], Machine]
+    taken: Callable[[Session], set[str]]
+    write: Callable[[dict[str, Value | tuple[Value, ...]]], None]
+    recipes: dict[int, InputRecipe] = field(default_factory=dict)
+    output: OutputRecipe | None = None
+    streaming: bool = False
+
+    @property
+    def claims(self) -> set[str]:
+        """Input names that this client holds."""
+        return {name for recipe in self.recipes.values() for name in recipe.names}
+
+    def handle(self, kind: int, payload: bytes) -> bytes | None:
+        """The reply to a package, if it has one."""
+        handler = _HANDLERS.get(kind)
+        if handler is None:
+            self.machine().say(f"RTDE: package of unknown type {kind} ignored")
+            return None
+        reply = handler(self, payload)
+        return None if reply is None else package(kind, reply)
+
+    def _protocol(self, payload: bytes) -> bytes:
+        return bytes([payload == b"\0\2"])
+
+    def _version(self, payload: bytes) -> bytes:
+        return struct.pack(">4I", *self.machine().version)
+
+    def _start(self, payload: bytes) -> bytes:
+        self.streaming = self.output is not None
+        return bytes([self.streaming or bool(self.recipes)])
+
+    def _pause(self, payload: bytes) -> bytes:
+        self.streaming = False
+        return b"\1"
+
+    def _ask_outputs(self, payload: bytes) -> bytes:
+        if len(payload) < 8:
+            self.machine().say("RTDE: output recipe without a frequency refused")
+            return b"\0"
+        (frequency,) = struct.unpack_from(">d", payload)
+        names = _names(payload[8:])
+        version = self.machine().version
+        fields = [output for name in names if (output := OUTPUTS.get(name)) and output.known(version)]
+        types = [OUTPUTS[name].type if OUTPUTS.get(name) in fields else "NOT_FOUND" for name in names]
+        if not names or len(fields) < len(names) or not 1.0 <= frequency <= 1.0 / PERIOD:
+            self.machine().say(f"RTDE: output recipe at {frequency:g} Hz refused: {','.join(types)}")
+            return b"\0" + ",".join(types).encode()
+        layout = struct.Struct(">HBB" + "".join(FORMATS[kind] for kind in types))
+        self.output = OutputRecipe(tuple(names), tuple(fields), layout, max(1, round(1.0 / (PERIOD * frequency))))
+        return b"\1" + ",".join(types).encode()
+
+    def _ask_inputs(self, payload: bytes) -> bytes:
+        names, taken = _names(payload), self.taken(self)
+        types = ["IN_USE" if name in taken else INPUTS.get(name, "NOT_FOUND") for name in names]
+        number = len(self.recipes) + 1
+        if not names or not all(kind in FORMATS for kind in types) or number > MAX_RECIPES:
+            self.machine().say(f"RTDE: input recipe refused: {','.join(types)[:200]}")
+            return b"\0" + ",".join(types).encode()
+        layout = struct.Struct(">" + "".join(FORMATS[kind] for kind in types))
+        counts = tuple(int(FORMATS[kind][:-1] or 1) for kind in types)
+        self.recipes[number] = InputRecipe(tuple(names), layout, counts)
+        return bytes([number]) + ",".join(types).encode()
+
+    def _data(self, payload: bytes) -> None:
+        recipe = self.recipes.get(payload[0]) if payload else None
+        if recipe is None:
+            self.machine().say(f"RTDE: data for a recipe that was never set up ignored: {payload[:1].hex() or 'none'}")
+        else:
+            # What a controller does with a wrong size is not known. Too much is read as far as the recipe goes (ur_rtde
+            # 1.6.5 sends command 44 so), too little is ignored (command 55).
+            given, size = len(payload) - 1, recipe.layout.size
+            if given != size:
+                done = "ignored" if given < size else "cut"
+                self.machine().say(f"RTDE: data package {done}: {given} bytes, recipe {payload[0]} has {size}")
+            if given >= size:
+                self.write(recipe.unpack(payload[1 : 1 + size]))
+
+    def _message(self, payload: bytes) -> None:
+        self.machine().say(f"RTDE: message of a client: {payload[:200]!r}")
+
+
+_HANDLERS: dict[int, Callable[[Session, bytes], bytes | None]] = {
+    PROTOCOL: Session._protocol,
+    VERSION: Session._version,
+    OUTPUT_RECIPE: Session._ask_outputs,
+    INPUT_RECIPE: Session._ask_inputs,
+    START: Session._start,
+    PAUSE: Session._pause,
+    DATA: Session._data,
+    MESSAGE: Session._message,
+}
+
+
+def _names(payload: bytes) -> list[str]:
+    """Names of a list with commas; a last comma is no name."""
+    return [name for name in payload.decode("ascii", errors="replace").split(",") if name]

@@ -1,0 +1,172 @@
+"""A rigid indenter pressed on one gel, slid and twisted: picture, height map, force and contact radius."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, binary_fill_holes
+from scipy.spatial.transform import Rotation
+
+from tacsim import pose as se3
+from tacsim.geometry.shapes import distance, extent
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.scene import Gel, Scene, Shape
+from tacsim.models.sensor import SensorModel
+from tacsim.optics.grid import image_grid
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import SurfaceSample, sample_surface
+from tacsim.physics.worlds.world import MoveStats, World, make_world
+
+# A surface point nearer to the indenter than this share of a gel element is in contact: the gel surface is a spline on
+# its elements, which follows the indenter no closer. Enlarges the radius of a ball's contact by about 4 %.
+TOUCHING = 0.01
+QUARTER = math.pi / 2  # a motion turns the shorter way round, so a twist is cut into pieces of at most this [rad]
+MOST_TWIST = math.radians(3600.0)
+MOST_SLIDE = 3.0  # widths of the gel: beyond, it is long out of touch
+BRIDGED = 0.2  # under a flat face the spline swings about it by as much; counts within a contact
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """What is done with the indenter, from touching the undeformed gel on."""
+
+    depth: float = 0.5e-3  # of its lowest point below the undeformed surface [m]
+    slide: tuple[float, float] = (0.0, 0.0)  # then sideways, world x, y [m]
+    twist: float = 0.0  # then about the vertical axis [rad]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pressed:
+    """The gel under the indenter at the end."""
+
+    image: NDArray[np.uint8]  # (H, W, 3) RGB
+    height: NDArray[np.float32]  # (H, W) into the gel, under each pixel [m]
+    contact: NDArray[np.bool_]  # (H, W) pixels where gel and indenter touch
+    wrench: FloatArray  # (6,) what the indenter does to the sensor, sensor axes [N, N m]
+    contact_radius: float  # of the circle with the area of contact [m]
+    moves: tuple[MoveStats, ...]
+
+
+def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
+    """Presses the scene's indenter, then slides and twists it.
+
+    Raises ValueError for a scene without indenter, a depth that is not within the gel, or a slide or twist beyond all
+    measure; SimulationDiverged.
+    """
+    if scene.indenter is None:
+        raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")
+    _require_sensible(scene.gel, motion)
+    world = make_world(scene)
+    targets = _targets(world.pose("indenter"), scene.indenter.geometry, motion)
+    moves = tuple(world.move({"indenter": target}) for target in targets)
+    surface = world.surface("lower")
+    seen = sample_surface(surface, image_grid(sensor.geometry))
+    contact = _contact(world, scene, seen, sensor)
+    area = float(contact.sum()) * sensor.geometry.pixel_pitch**2
+    return Pressed(
+        image=Renderer(sensor, scene.gel.size[:2])(surface),
+        height=seen.height,
+        contact=contact,
+        wrench=world.wrench("lower"),
+        contact_radius=math.sqrt(area / math.pi),
+        moves=moves,
+    )
+
+
+def _require_sensible(gel: Gel, motion: Press) -> None:
+    thickness, farthest, way = gel.size[2], MOST_SLIDE * max(gel.size[:2]), math.hypot(*motion.slide)
+    if not 0 < motion.depth < thickness:
+        raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
+    if not way <= farthest:
+        raise ValueError(f"slide is {way:.4g} m long; at most {MOST_SLIDE:g} widths of the gel, {farthest:.4g} m")
+    if not abs(motion.twist) <= MOST_TWIST:
+        most = math.degrees(MOST_TWIST)
+        raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
+
+
+def _targets(start: Pose, geometry: Shape, motion: Press) -> list[Pose]:
+    """Poses of the indenter, one after the other. Its frame's origin is the centre of its bounding box."""
+    down = np.array([start.position[0], start.position[1], float(extent(geometry)[2]) / 2 - motion.depth])
+    targets = [Pose(down, start.quaternion)]
+    if any(motion.slide):
+        targets.append(Pose(down + np.append(motion.slide, 0.0), start.quaternion))
+    pieces = math.ceil(abs(motion.twist) / QUARTER)
+    for piece in range(1, pieces + 1):
+        turned = Rotation.from_rotvec([0.0, 0.0, motion.twist * piece / pieces]) * se3.rotation(start)
+        targets.append(Pose(targets[-1].position, turned.as_quat()))
+    return targets
+
+
+def _contact(world: World, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
+    """(H, W) True where the surface seen by a pixel lies on the indenter."""
+    assert scene.indenter is not None
+    geometry = scene.indenter.geometry
+    grid = image_grid(sensor.geometry)
+    gel = np.concatenate([grid.points(), -seen.height[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
+    sensor_pose, indenter = world.pose("lower"), world.pose("indenter")
+    at = se3.transform(se3.relative(indenter, sensor_pose), gel)
+    near = (np.abs(at) <= extent(geometry) / 2 + BRIDGED * scene.element).all(axis=1) & seen.valid.ravel()
+    gaps = np.full(len(at), np.inf)
+    if near.any():
+        gaps[near] = distance(geometry, at[near])
+    gap = gaps.reshape(seen.valid.shape)
+    reach = max(1, round(scene.element / sensor.geometry.pixel_pitch))
+    joined = binary_closing(gap <= TOUCHING * scene.element, iterations=reach)
+    enclosed: NDArray[np.bool_] = binary_fill_holes(joined)
+    return enclosed & (gap <= BRIDGED * scene.element)
+
+
+def facts_of(scene: Scene, motion: Press, pressed: Pressed, sensor: SensorModel) -> dict[str, Any]:
+    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured."""
+    residual = max(move.residual for move in pressed.moves)
+    return {
+        "indenter": scene.indenter.model_dump(mode="json") if scene.indenter else None,
+        "gel": scene.gel.model_dump(mode="json"),
+        "preset": scene.preset,
+        "element_size": scene.element,
+        "depth": motion.depth,
+        "slide": list(motion.slide),
+        "twist": motion.twist,
+        "force": -float(pressed.wrench[2]),
+        "wrench": [float(value) for value in pressed.wrench],
+        "contact_radius": pressed.contact_radius,
+        "deepest": float(pressed.height.max()),
+        "pixel_pitch": sensor.geometry.pixel_pitch,
+        "settled": all(move.settled for move in pressed.moves),
+        "residual": residual if math.isfinite(residual) else None,
+        "substeps": sum(move.substeps for move in pressed.moves),
+    }
+
+
+def write(folder: Path, pressed: Pressed, config: dict[str, Any]) -> None:
+    """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png and press.json. Raises OSError."""
+    from matplotlib.image import imsave
+
+    imsave(folder / "rgb.png", pressed.image)
+    np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
+    _write_height_picture(folder / "height.png", pressed, config["pixel_pitch"])
+    (folder / "press.json").write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _write_height_picture(path: Path, pressed: Pressed, pitch: float) -> None:
+    """Height map in false colours with a scale, contact outlined, as PNG. Raises OSError."""
+    from tacsim.report.figure import canvas, plain, save
+
+    rows, columns = pressed.height.shape
+    half = (columns * pitch * 5e2, rows * pitch * 5e2)  # [mm]
+    figure = canvas(8.0, 7.0 * rows / columns + 0.6)
+    figure.set_layout_engine("constrained")
+    axes = plain(figure.add_subplot(), "height into the gel; contact outlined", "x [mm]", "y [mm]")
+    axes.grid(False)
+    extent_mm = (-half[0], half[0], half[1], -half[1])
+    shown = axes.imshow(pressed.height * 1e6, cmap="viridis", extent=extent_mm)
+    if pressed.contact.any() and not pressed.contact.all():
+        axes.contour(pressed.contact, levels=[0.5], colors="white", linewidths=1, extent=extent_mm, origin="upper")
+    figure.colorbar(shown, ax=axes, label="µm", shrink=0.9)
+    save(figure, path)

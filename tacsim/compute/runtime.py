@@ -1,0 +1,82 @@
+"""The only place that imports Taichi. It starts it once a process; all others do ``from tacsim.compute.runtime import
+ti``.
+
+A second ``ti.init`` in one process crashes it, and fork after a start hangs: hence one owner, and spawn for workers.
+Its compiler works on one kernel at a time for the whole process, and takes no care of threads: hence `launching`.
+"""
+
+import contextlib
+import io
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+
+os.environ.setdefault("TI_LOG_LEVEL", "error")
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+
+with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
+    warnings.simplefilter("ignore")
+    import taichi as ti
+
+DEVICES = ("cpu", "cuda", "vulkan", "metal")
+# Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.
+DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
+
+_running: int | None = None  # process
+_at_work = threading.RLock()  # held by the thread that starts Taichi, compiles or launches
+
+
+def start(cpu_only: str | None = None) -> str:
+    """Starts Taichi on DEVICE if it does not run yet; returns DEVICE.
+
+    cpu_only: what needs the CPU, in words, for the error that says so. Raises ValueError for an unknown device,
+    RuntimeError for one that is not there, or where the CPU is needed; and in a forked child, where kernels would hang.
+    """
+    global _running
+    _require_own_process()
+    if DEVICE not in DEVICES:
+        raise ValueError(f"TACSIM_DEVICE must be one of {', '.join(DEVICES)}, found '{DEVICE}'")
+    if cpu_only is not None and DEVICE != "cpu":
+        raise RuntimeError(f"{cpu_only} runs on the CPU only, but TACSIM_DEVICE is '{DEVICE}': unset it")
+    with _at_work:
+        if _running is None:
+            _initialise()
+            _running = os.getpid()
+    return DEVICE
+
+
+def _initialise() -> None:
+    if not available(DEVICE):
+        raise RuntimeError(
+            f"TACSIM_DEVICE is '{DEVICE}', but Taichi finds no such device or driver on this machine; unset it to "
+            f"compute on the CPU"
+        )
+    # ti.init prints "Starting on arch=..." whatever it is told; a command's output (JSON, say) must stay its own.
+    with contextlib.redirect_stdout(io.StringIO()):
+        # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
+        ti.init(
+            arch=getattr(ti, DEVICE), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
+            log_level=ti.ERROR, enable_fallback=False,
+        )  # fmt: skip
+    ti.sync()  # completes the start, which only this thread may do; kernels may then be compiled in any
+
+
+@contextlib.contextmanager
+def launching() -> Iterator[None]:
+    """Round every launch of kernels, and what prepares and reads it: threads take turns, which costs them nothing, for
+    a launch holds the interpreter anyway. Raises RuntimeError in a forked child, where it would never return."""
+    _require_own_process()
+    with _at_work:
+        yield
+
+
+def _require_own_process() -> None:
+    """Before any lock: in a forked child it may be held by a thread that is not there."""
+    if _running not in (None, os.getpid()):
+        raise RuntimeError("Taichi does not survive a fork: start worker processes with the 'spawn' method")
+
+
+def available(device: str) -> bool:
+    """Whether Taichi can start on this one of DEVICES here."""
+    return bool(ti.lang.misc.is_arch_supported(getattr(ti, device)))

@@ -1,0 +1,114 @@
+"""Constant load on any rig: an arm goes where it is told, but along the z of its sensor, where a force is held.
+
+An arm that takes poses holds a force by moving until it feels it (position-based force control: Villani and De
+Schutter, Force Control, in Springer Handbook of Robotics, 2nd ed., 2016, ch. 9). Each control period the force tells
+the next correction, by a stiffness that is learned from what the corrections before did. It needs poses and wrenches
+alone, so it is the same for simulated, mock and real arms, and every command still passes their limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from tacsim import pose as se3
+from tacsim.interface import Action, ArmState, FloatArray, Pose
+from tacsim.limits import LimitExceeded
+from tacsim.models.rig import RepositionConfig, TaskConfig
+
+TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at its load rests
+PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
+# The stiffness changes at most by these factors a period: forces are noisy; less towards soft, whose steps are longer
+HARDER, SOFTER = 2.0, 1.25
+SMALLEST = 1e-6  # a shorter way tells no stiffness [m]
+REACH = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
+
+
+@dataclass
+class _Axis:
+    """What is known of one arm's z: where it began, what it felt last, and where it was last sent."""
+
+    began: FloatArray  # (3,) [m]
+    before: tuple[FloatArray, float]  # (3,) position [m] and force [N] of the period before
+    sent: Pose
+    stiffness: float | None = None  # [N/m]
+
+
+class Admittance:
+    """Turns the actions of a policy so that arms hold `loads` along the z of their sensors.
+
+    Call it once a control period with the action and what the arms said last; tell it by `sent` what they were really
+    sent. Everything of an action but the way along z is kept; an arm that the policy holds still follows its load.
+    """
+
+    def __init__(self, loads: Mapping[str, float], longest: float) -> None:
+        """loads: normal force by arm name, positive when pressed [N]; longest: correction of one period [m].
+
+        Raises ValueError for what is not positive.
+        """
+        for name, value in {**loads, "the longest correction": longest}.items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"constant load: {name} must be a positive number, got {value!r}")
+        self.loads, self._longest = dict(loads), longest
+        self._axes: dict[str, _Axis] = {}
+
+    def reset(self) -> None:
+        """A new episode: nothing is known of its contact."""
+        self._axes = {}
+
+    def __call__(self, action: Action, arms: Mapping[str, ArmState]) -> Action:
+        """`action` with each loaded arm's way along z replaced. Raises LimitExceeded when a load is out of reach, or
+        when what is felt is no number."""
+        return Action(
+            {**action.tool, **{name: self._target(name, action.tool.get(name), arms[name]) for name in self.loads}}
+        )
+
+    def sent(self, poses: Mapping[str, Pose | None]) -> None:
+        """What the arms were really sent, after their limits; None: nothing was executed."""
+        for name, axis in self._axes.items():
+            axis.sent = poses.get(name) or axis.sent
+
+    def _target(self, name: str, asked: Pose | None, arm: ArmState) -> Pose:
+        force = -float(arm.wrench[2])
+        if not math.isfinite(force):
+            raise LimitExceeded(f"arm '{name}' holds a load of {self.loads[name]:g} N, but what it feels is {force}")
+        here = arm.pose.position
+        axis = self._axes.setdefault(name, _Axis(here, (here, force), arm.pose))
+        normal = se3.rotation(arm.pose).as_matrix()[:, 2]
+        self._learn(axis, float(normal @ (here - axis.before[0])), force)
+        axis.before = here, force
+        asked = axis.sent if asked is None else asked
+        normal = se3.rotation(asked).as_matrix()[:, 2]
+        step = self._step(axis, self.loads[name], force)
+        if abs(travel := float(normal @ (axis.sent.position - axis.began)) + step) > REACH:
+            raise LimitExceeded(
+                f"arm '{name}' does not reach its load of {self.loads[name]:g} N: it feels {force:.3g} N after "
+                f"{1e3 * travel:+.3g} mm along its sensor's z (limit {1e3 * REACH:g} mm); is anything there to press?"
+            )
+        along = normal @ (axis.sent.position - asked.position) + step
+        return Pose(asked.position + along * normal, asked.quaternion)
+
+    def _learn(self, axis: _Axis, way: float, force: float) -> None:
+        """The stiffness from the last `way` along z [m] and the force at its end [N]; a force that fell on the way in
+        came from elsewhere (the body slid, tipped or yielded) and teaches nothing."""
+        change = force - axis.before[1]
+        if abs(way) < SMALLEST or not change / way > 0:
+            return
+        found = change / way
+        known = axis.stiffness
+        axis.stiffness = found if known is None else min(max(found, known / SOFTER), known * HARDER)
+
+    def _step(self, axis: _Axis, load: float, force: float) -> float:
+        """The next correction, positive towards the object [m]."""
+        error = load - force
+        if abs(error) <= TOLERANCE * load:
+            return 0.0
+        if axis.stiffness is None:
+            return math.copysign(PROBE * self._longest, error)
+        return max(-self._longest, min(self._longest, error / axis.stiffness))
+
+
+def held_loads(task: TaskConfig | None) -> Admittance | None:
+    """What holds the loads of a rig's task; None if it asks for none."""
+    return Admittance(task.loads, task.max_step) if isinstance(task, RepositionConfig) and task.loads else None

@@ -1,0 +1,95 @@
+"""Guards of the gels: what the sensors show, against the limits of the arms that carry them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacsim.interface import SensorSpec, TactileObservation
+from tacsim.limits import LimitExceeded, exceeds
+from tacsim.models.hardware import ArmLimits
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """What an arm is told of the tactile sensors."""
+
+    seen: float  # when the oldest picture of the rig was exposed, on its clock [s]
+    depth: float = math.nan  # how deep the arm's own gels are pressed; NaN: they cannot tell [m]
+    shear: float = math.nan  # how far their surface is dragged; NaN: they cannot tell [m]
+
+
+def touch_of(touch: TactileObservation) -> tuple[float, float]:
+    """Depth and shear [m] that one sensor shows; NaN where it cannot tell."""
+    depth = shear = math.nan
+    if touch.height is not None:
+        depth = float(touch.height.max(where=touch.valid, initial=0.0))
+    if touch.flow is not None:
+        dragged = np.linalg.norm(touch.flow, axis=-1)
+        shear = float(np.nanmax(dragged)) if np.isfinite(dragged).any() else math.nan
+    return depth, shear
+
+
+class GelWatch:
+    """Looks at every observation: tells each arm what its gels show, and raises LimitExceeded beyond its limits.
+
+    Args:
+        sensors: what each sensor of the rig delivers.
+        limits: of the arms that have any, by arm name.
+        tell: for arms that watch by themselves too (robot.arm.ur); by arm name.
+        error: raised when a limit is exceeded.
+
+    Raises ValueError for a limit that cannot be watched, because no sensor of its arm delivers height or flow.
+    """
+
+    def __init__(
+        self,
+        sensors: Mapping[str, SensorSpec],
+        limits: Mapping[str, ArmLimits],
+        tell: Mapping[str, Callable[[Touch], None]],
+        error: type[LimitExceeded] = LimitExceeded,
+    ) -> None:
+        self._carried = {name: spec.arm for name, spec in sensors.items() if spec.arm is not None}
+        self._limits, self._tell, self._error = dict(limits), dict(tell), error
+        for name, arm in self._carried.items():
+            own = limits.get(arm)
+            if own is None:
+                continue
+            spec = sensors[name]
+            for what, limit, there in (("depth", own.depth, spec.height), ("shear", own.shear, spec.flow)):
+                if limit is not None and not there:
+                    raise ValueError(
+                        f"arms.{arm}.limits.{what}: sensor '{name}' cannot tell it (no calibration, or no markers); "
+                        "leave it out, or calibrate the sensor"
+                    )
+
+    def __call__(self, tactile: Mapping[str, TactileObservation]) -> None:
+        """`tactile`: by sensor name. Every arm is told before anything is raised."""
+        seen = min((touch.time for touch in tactile.values()), default=math.nan)
+        shown = {name: touch_of(tactile[name]) for name in self._carried if name in tactile}
+        for arm, tell in self._tell.items():
+            own = [shown[name] for name, carrier in self._carried.items() if carrier == arm and name in shown]
+            depth, shear = _worst(depth for depth, _ in own), _worst(shear for _, shear in own)
+            tell(Touch(seen, depth, shear))
+        for name, found in shown.items():
+            arm = self._carried[name]
+            limits = self._limits.get(arm)
+            if limits is None:
+                continue
+            for what, value, limit in zip(("depth", "shear"), found, (limits.depth, limits.shear), strict=True):
+                if exceeds(value, limit):
+                    assert limit is not None
+                    shown_as = "cannot be seen" if math.isnan(value) else f"{1e3 * value:.3g} mm"
+                    raise self._error(
+                        f"gel of sensor '{name}': {what} {shown_as}, limits.{what} of arm '{arm}' is "
+                        f"{1e3 * limit:.3g} mm; the arms are stopped. Move them apart, then begin a new episode"
+                    )
+
+
+def _worst(values: Iterable[float]) -> float:
+    """The greatest; NaN if there is none, or if any is: what cannot be seen is not safe."""
+    found = list(values)
+    return math.nan if not found or any(map(math.isnan, found)) else max(found)

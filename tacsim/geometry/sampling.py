@@ -1,0 +1,64 @@
+"""Where the particles of a body lie: on a lattice, or at random as blue noise. The shape's own frame, metres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from tacsim.geometry.shapes import FloatArray, distance, extent, nearest_surface, no_particle, particles
+from tacsim.models.scene import Body, Shape
+
+ITERATIONS = 20  # of mutual repulsion
+REACH = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
+STEP = 0.25  # share of the missing distance by which each of two moves
+SKIN = 0.05  # no particle nearer to the surface than this [spacings]
+
+
+def body_points(body: Body, spacing: float) -> FloatArray:
+    """Particles (n, 3) [m] of a body, all inside it, about `spacing` [m] apart; each stands for volume / n.
+
+    Raises what :func:`tacsim.geometry.shapes.particles` raises.
+    """
+    lattice = particles(body.geometry, spacing)
+    return lattice if body.sampling == "lattice" else scattered(body.geometry, spacing, body.seed)
+
+
+def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
+    """Blue noise: one particle at random in each cell of a lattice, then pushed apart. Same seed, same particles.
+
+    Independent random particles leave holes and clumps, in which stress and so the print are rough. Repulsion between
+    particles closer than 1.1 spacings, and from their mirror images behind the surface, evens them out (as in de Goes
+    et al. 2012, Blue noise through optimal transport, but by pair forces) and leaves no direction preferred.
+    """
+    random = np.random.default_rng(seed)
+    size = extent(geometry)
+    layers = np.maximum(np.rint(size / spacing).astype(int), 1)
+    cells = np.stack(np.meshgrid(*(np.arange(n) for n in layers), indexing="ij"), axis=-1).reshape(-1, 3)
+    points = ((cells + random.random(cells.shape)) / layers - 0.5) * size
+    surface = nearest_surface(geometry, spacing)
+    points = points[surface(points)[0] < 0]
+    for _ in range(ITERATIONS):
+        depth, normals = surface(points)
+        depth = -depth
+        points = points + _repulsion(points, REACH * spacing)
+        points -= (STEP * np.maximum(REACH * spacing - 2 * depth, 0.0))[:, None] * normals
+        depth, normals = surface(points)
+        points -= np.maximum(depth + SKIN * spacing, 0.0)[:, None] * normals
+    inside: NDArray[np.bool_] = distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
+    if not inside.any():
+        raise no_particle(geometry, spacing)
+    return np.asarray(points[inside])
+
+
+def _repulsion(points: FloatArray, reach: float) -> FloatArray:
+    """Step of each particle (n, 3) away from those within `reach`."""
+    pairs = KDTree(points).query_pairs(reach, output_type="ndarray")
+    apart = points[pairs[:, 0]] - points[pairs[:, 1]]
+    length = np.linalg.norm(apart, axis=1)
+    push = (STEP * (reach - length) / np.maximum(length, 1e-12 * reach))[:, None] * apart
+    step = [
+        np.bincount(pairs[:, 0], push[:, axis], len(points)) - np.bincount(pairs[:, 1], push[:, axis], len(points))
+        for axis in range(3)
+    ]
+    return np.stack(step, axis=1)

@@ -1,0 +1,289 @@
+"""Box, sphere, cylinder and STL mesh as geometry: body particles, and signed distance for rigid indenters.
+
+Everything here is in the shape's own frame: axes as in the scene, origin at the centre of the bounding box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tacsim.geometry.mesh import (
+    away_from_surface,
+    fingerprint,
+    load_mesh,
+    make_surface,
+    signed_distance,
+    signed_distance_on_grid,
+)
+from tacsim.models.scene import Box, Cylinder, Mesh, Shape, Sphere
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+FloatArray = NDArray[np.float64]
+
+MAX_PARTICLES = 5_000_000
+MAX_NODES = 20_000_000
+MAX_MISFIT = 0.1  # how far the lattice of particles may miss the size or the volume of a shape, relative
+LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
+BAND = 2  # grid spacings round a mesh in which the distance is exact
+REMEMBERED = 8  # distance grids of meshes in one process, the latest used; most have 1 to 10 MB
+
+
+def extent(geometry: Shape) -> FloatArray:
+    """Size of the bounding box (3,) [m]. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+    match geometry:
+        case Box():
+            return np.array(geometry.size, dtype=np.float64)
+        case Sphere():
+            return np.full(3, 2 * geometry.radius)
+        case Cylinder():
+            return np.array([2 * geometry.radius, 2 * geometry.radius, geometry.height])
+        case Mesh():
+            return np.array(_mesh_extent(geometry, fingerprint(geometry.path)))
+
+
+def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike) -> FloatArray:
+    """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those.
+
+    A face or edge within LEVEL of square to the direction is square to it, for rounding must not choose a corner.
+    """
+    along = np.asarray(direction, dtype=np.float64)
+    along = np.where(np.abs(along) > LEVEL * np.linalg.norm(along), along, 0.0)
+    match geometry:
+        case Box():
+            return np.asarray(np.sign(along) * np.array(geometry.size) / 2)
+        case Sphere():
+            return np.asarray(geometry.radius * along / np.linalg.norm(along))
+        case Cylinder():
+            rim = geometry.radius * along[:2] / max(float(np.linalg.norm(along[:2])), 1e-12)
+            return np.append(rim, np.sign(along[2]) * geometry.height / 2)
+
+
+def volume(geometry: Shape) -> float:
+    """Enclosed volume [m^3]. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+    match geometry:
+        case Box():
+            return float(np.prod(geometry.size))
+        case Sphere():
+            return float(4.0 / 3.0 * np.pi * geometry.radius**3)
+        case Cylinder():
+            return float(np.pi * geometry.radius**2 * geometry.height)
+        case Mesh():
+            return float(centred(geometry).volume)
+
+
+def particles(geometry: Shape, spacing: float) -> FloatArray:
+    """Body particles (n, 3) [m] on a cubic lattice of `spacing` [m]; each stands for spacing^3 of material.
+
+    Along each axis the lattice has the whole number of layers nearest to the shape's size and is centred; the first
+    layer lies half a spacing inside the face. For particles without a lattice see :mod:`tacsim.geometry.sampling`.
+
+    Raises ValueError when the lattice misses the shape's size (or a mesh's volume) by more than 10 %, holds no
+    particle, or more than 5,000,000; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    """
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise ValueError(f"particle spacing must be a positive length [m], got {spacing}")
+    size = extent(geometry)
+    estimate, lattice = volume(geometry) / spacing**3, np.prod(size / spacing)
+    if estimate > MAX_PARTICLES or lattice > MAX_NODES:
+        raise ValueError(
+            f"{_name(geometry)} would need {estimate:,.0f} particles (on a lattice of {lattice:,.0f}) at a "
+            f"spacing of {_mm(spacing)}; the limit is {MAX_PARTICLES:,}: use a larger spacing or a smaller shape"
+        )
+    layers = np.rint(size / spacing).astype(int)
+    _check_layers(geometry, size, spacing, layers)
+    axes = tuple((np.arange(n) - (n - 1) / 2) * spacing for n in layers)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    if isinstance(geometry, Box):
+        return nodes
+    if isinstance(geometry, Cylinder):  # layers along z fit already; the disc decides
+        inside = np.hypot(nodes[:, 0], nodes[:, 1]) <= geometry.radius
+    elif isinstance(geometry, Mesh):
+        surface = make_surface(centred(geometry))
+        inside = signed_distance_on_grid(surface, (axes[0], axes[1], axes[2]), 2 * spacing).ravel() <= 0
+    else:
+        inside = distance(geometry, nodes) <= 0
+    found: FloatArray = nodes[inside]
+    if len(found) == 0:
+        raise no_particle(geometry, spacing)
+    misfit = len(found) / estimate - 1
+    if isinstance(geometry, Mesh) and abs(misfit) > MAX_MISFIT:
+        raise ValueError(
+            f"{_name(geometry)}: particles at a spacing of {_mm(spacing)} miss its volume by {misfit:+.0%} (limit "
+            f"{MAX_MISFIT:.0%}); parts are thinner than the spacing: use a smaller one"
+        )
+    return found
+
+
+def no_particle(geometry: Shape, spacing: float) -> ValueError:
+    return ValueError(f"{_name(geometry)} holds no particle at a spacing of {_mm(spacing)}; use a smaller spacing")
+
+
+def _check_layers(geometry: Shape, size: FloatArray, spacing: float, layers: NDArray[np.int_]) -> None:
+    if (layers == 0).any():
+        axis = int(np.argmin(size))
+        raise ValueError(
+            f"{_name(geometry)} is only {_mm(size[axis])} along {'xyz'[axis]}: no particle fits at a spacing of "
+            f"{_mm(spacing)}; use a spacing of at most {_mm(size[axis])}"
+        )
+    misfit = layers * spacing / size - 1
+    axis = int(np.argmax(np.abs(misfit)))
+    if abs(misfit[axis]) > MAX_MISFIT + 1e-9:
+        raise ValueError(
+            f"{_name(geometry)} measures {_mm(size[axis])} along {'xyz'[axis]}, but {layers[axis]} layers of particles "
+            f"{_mm(spacing)} apart make {_mm(layers[axis] * spacing)} ({misfit[axis]:+.0%}, limit {MAX_MISFIT:.0%}); "
+            f"use a spacing of {_mm(size[axis] / layers[axis])}, or a size that is a multiple of the spacing"
+        )
+
+
+def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
+    """Signed distance (n,) [m] of `points` (n, 3) [m] from the surface: exact, Euclidean, negative inside.
+
+    Raises ValueError on another shape or non-finite points; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    """
+    at = np.asarray(points, dtype=np.float64)
+    if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
+        raise ValueError(f"points must be finite with shape (n, 3) [m], got shape {at.shape}")
+    match geometry:
+        case Sphere():
+            return np.asarray(np.linalg.norm(at, axis=1) - geometry.radius, dtype=np.float64)
+        case Box():
+            return _outside_and_inside(np.abs(at) - np.array(geometry.size) / 2)
+        case Cylinder():
+            radial = np.hypot(at[:, 0], at[:, 1]) - geometry.radius
+            return _outside_and_inside(np.stack([radial, np.abs(at[:, 2]) - geometry.height / 2], axis=1))
+        case Mesh():
+            return signed_distance(make_surface(centred(geometry)), at)
+
+
+def outward_normals(geometry: Shape, points: ArrayLike) -> FloatArray:
+    """Unit gradient (n, 3) [-] of the signed distance at `points` (n, 3) [m]: away from the nearest surface, inside.
+
+    Where several parts of the surface are equally near it is their mean direction; zero where those cancel (a ball's
+    centre). Raises what :func:`distance` raises.
+    """
+    at = np.asarray(points, dtype=np.float64)
+    if isinstance(geometry, Mesh):
+        return away_from_surface(make_surface(centred(geometry)), at)
+    step = 1e-6 * float(extent(geometry).max())
+    sides = [distance(geometry, at + d) - distance(geometry, at - d) for d in step * np.eye(3)]
+    gradient = np.stack(sides, axis=1) / (2 * step)
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    return np.where(length > 1e-3, gradient / np.maximum(length, 1e-3), 0.0)
+
+
+def nearest_surface(geometry: Shape, spacing: float) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """Function of points (n, 3) [m] for many calls: signed distance (n,) [m] and its gradient (n, 3) [-].
+
+    Exact for the closed forms; a mesh is asked once, at the nodes of a grid of `spacing` [m].
+    """
+    if isinstance(geometry, Mesh):
+        grid = distance_grid(geometry, spacing)
+        return lambda points: sample(grid, points)
+    return lambda points: (distance(geometry, points), outward_normals(geometry, points))
+
+
+def _outside_and_inside(beyond: FloatArray) -> FloatArray:
+    """Distance from a convex product of intervals, from how far each coordinate (n, k) lies beyond its own."""
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+    return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DistanceGrid:
+    """Signed distance at the nodes of a regular grid; trilinear in between, see :func:`sample`."""
+
+    values: NDArray[np.float32]  # (nx, ny, nz) [m], negative inside
+    origin: FloatArray  # (3,) position of node (0, 0, 0) [m]
+    spacing: float  # [m]
+
+
+def distance_grid(geometry: Mesh, spacing: float) -> DistanceGrid:
+    """Signed distance on a grid of `spacing` [m] that covers a mesh's bounding box and BAND spacings round it.
+
+    Node values are exact (float32) within BAND spacings of the surface; further away the sign is right and the value
+    never too small, see :func:`tacsim.geometry.mesh.signed_distance_on_grid`. Interpolation adds up to 3/8 spacing^2 /
+    R at a surface of radius R, and a fraction of the spacing at sharp edges. Of a mesh that touches here and there see
+    :mod:`tacsim.geometry.tiles`.
+
+    It takes a second or more, so the process remembers the latest: asked again for the same spacing and the same bytes
+    of the same file, it gives the same object, whose arrays are read-only.
+
+    Raises ValueError on a bad spacing, or more than 20,000,000 nodes; and what :func:`tacsim.geometry.mesh.load_mesh`
+    raises.
+    """
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise ValueError(f"grid spacing must be a positive length [m], got {spacing}")
+    return _mesh_grid(geometry, fingerprint(geometry.path), spacing)
+
+
+def sample(grid: DistanceGrid, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Trilinear distance (n,) [m] and its gradient (n, 3) [-] at `points` (n, 3) [m]: the reference for kernels.
+
+    Outside the grid nothing is known: distance +inf, gradient 0.
+    """
+    at: FloatArray = (np.asarray(points, dtype=np.float64) - grid.origin) / grid.spacing
+    last = np.array(grid.values.shape) - 1
+    known: NDArray[np.bool_] = np.all((at >= 0) & (at <= last), axis=1)
+    cell = np.clip(np.floor(np.where(known[:, None], at, 0.0)).astype(int), 0, last - 1)
+    upper = np.where(known[:, None], at, 0.0) - cell  # weight of the upper node along each axis
+    value = np.zeros(len(at))
+    gradient = np.zeros((len(at), 3))
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, upper, 1.0 - upper)
+        node = grid.values[tuple((cell + corner).T)].astype(np.float64)
+        value += node * weight.prod(axis=1)
+        for axis in range(3):
+            others = np.delete(weight, axis, axis=1).prod(axis=1)
+            gradient[:, axis] += (node if corner[axis] else -node) * others / grid.spacing
+    return np.where(known, value, np.inf), np.where(known[:, None], gradient, 0.0)
+
+
+def centred(geometry: Mesh, expected: str | None = None) -> Trimesh:
+    """A mesh [m] in the shape's own frame; `expected`: fingerprint of its file, by which what is made is remembered.
+
+    Raises what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    """
+    mesh = load_mesh(geometry.path, geometry.scale, expected)
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    return mesh
+
+
+@lru_cache(maxsize=64)
+def _mesh_extent(geometry: Mesh, content: str) -> tuple[float, ...]:
+    """Size of the bounding box (3,) [m]. content: fingerprint of the file."""
+    return tuple(float(side) for side in centred(geometry, content).extents)
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _mesh_grid(geometry: Mesh, content: str, spacing: float) -> DistanceGrid:
+    """Read-only, for it is shared. content: see above."""
+    mesh = centred(geometry, content)
+    half = np.asarray(mesh.extents, np.float64) / 2 + BAND * spacing
+    nodes = np.ceil(2 * half / spacing - 1e-9) + 1
+    if nodes.prod() > MAX_NODES:
+        raise ValueError(
+            f"a distance grid of {_name(geometry)} at {_mm(spacing)} would have {nodes.prod():,.0f} nodes, the limit "
+            f"is {MAX_NODES:,}; use a larger spacing"
+        )
+    x, y, z = (spacing * np.arange(n) - edge for n, edge in zip(nodes, half, strict=True))
+    values = signed_distance_on_grid(make_surface(mesh), (x, y, z), BAND * spacing).astype(np.float32)
+    origin = -half
+    for array in (values, origin):
+        array.setflags(write=False)
+    return DistanceGrid(values, origin, spacing)
+
+
+def _name(geometry: Shape) -> str:
+    return f"mesh {geometry.path}" if isinstance(geometry, Mesh) else geometry.shape
+
+
+def _mm(length: float) -> str:
+    return f"{length * 1e3:.4g} mm"

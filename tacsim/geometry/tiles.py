@@ -1,0 +1,87 @@
+"""Signed distance from a mesh on a grid that is laid tile by tile, where it is asked for; the mesh's own frame, metres.
+
+A whole mesh may need a hundred million nodes, and what touches of it is seen only as it moves. What a tile holds does
+not depend on when, or beside which others, it is laid.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.geometry.mesh import FloatArray, fingerprint, make_surface, signed_distance_on_grid
+from tacsim.geometry.shapes import BAND, MAX_NODES, REMEMBERED, centred
+from tacsim.models.scene import Mesh
+
+Index = NDArray[np.int64]
+
+TILE = 32  # nodes along an edge
+KEPT = 2_000  # tiles in one process, of all meshes, the latest used: 260 MB; one grid has 610 at most
+PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
+PIECES = (4_000, 100_000)  # at least, about at most
+
+# By file, content, spacing and number, so that a tile keeps no mesh in memory; the oldest first. Worlds of several
+# threads come here one after the other (`tacsim.compute.runtime.launching`).
+_kept: dict[tuple[Mesh, str, float, tuple[int, ...]], NDArray[np.float32]] = {}
+
+
+class TiledDistance:
+    """Nodes lie at origin + spacing * (i, j, k), i, j, k from 0 on, and reach BAND spacings beyond the mesh's box."""
+
+    def __init__(self, geometry: Mesh, content: str, spacing: float) -> None:
+        """content: fingerprint of the file. Raises what :func:`tacsim.geometry.mesh.load_mesh` raises."""
+        mesh = centred(geometry, content)
+        self.name = geometry.path
+        self.spacing = spacing
+        self.vertices: FloatArray = np.asarray(mesh.vertices, np.float64)  # (n, 3)
+        self.half: FloatArray = np.asarray(mesh.extents, np.float64) / 2  # of the bounding box (3,)
+        self.origin: FloatArray = -self.half - BAND * spacing
+        fewest, most = PIECES
+        self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE * spacing) ** 2, fewest, most)))
+        self._last = np.ceil((self.half - self.origin) / spacing + BAND).astype(np.int64) // TILE
+        self._key = geometry, content, spacing
+
+    def around(self, low: FloatArray, high: FloatArray) -> tuple[Index, Index]:
+        """The first tile (3,) and the one after the last, along each axis, that points between two corners lie in."""
+        first, last = (np.floor((at - self.origin) / (self.spacing * TILE)).astype(np.int64) for at in (low, high))
+        return np.clip(first, 0, self._last), np.clip(last, 0, self._last) + 1
+
+    def values(self, first: Index, end: Index) -> NDArray[np.float32]:
+        """Distances [m] at the nodes of tiles `first` (3,) to before `end`. Exact within BAND spacings of the surface,
+        else as :func:`tacsim.geometry.mesh.signed_distance_on_grid` says. Raises ValueError for too many nodes."""
+        counts = (end - first) * TILE
+        if np.prod(counts.astype(float)) > MAX_NODES:
+            raise ValueError(
+                f"mesh {self.name}: a grid of {' x '.join(map(str, counts))} nodes {self.spacing * 1e3:.4g} mm apart "
+                f"would be needed where it can touch; the limit is {MAX_NODES:,}"
+            )
+        found = np.empty(counts, np.float32)
+        for tile in np.ndindex(*(end - first)):
+            x, y, z = (slice(n * TILE, (n + 1) * TILE) for n in tile)
+            found[x, y, z] = self._tile(tuple(int(n) for n in first + tile))
+        return found
+
+    def _tile(self, index: tuple[int, ...]) -> NDArray[np.float32]:
+        key = (*self._key, index)
+        tile = _kept.pop(key, None)
+        if tile is None:
+            x, y, z = (
+                start + self.spacing * (n * TILE + np.arange(TILE)) for start, n in zip(self.origin, index, strict=True)
+            )
+            tile = signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing).astype(np.float32)
+        _kept[key] = tile
+        if len(_kept) > KEPT:
+            del _kept[next(iter(_kept))]
+        return tile
+
+
+def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:
+    """The same for the same bytes of the same file, so nothing is computed twice in one process."""
+    return _remembered(geometry, fingerprint(geometry.path), spacing)
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _remembered(geometry: Mesh, content: str, spacing: float) -> TiledDistance:
+    return TiledDistance(geometry, content, spacing)

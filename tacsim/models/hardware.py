@@ -1,0 +1,221 @@
+"""Facts of hardware, real or mock: UR arms and their limits, cameras. Plain data; the drivers live in `robot`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from tacsim import pose as se3
+from tacsim.interface import Pose
+from tacsim.limits import Region, region
+from tacsim.models.quantity import Acceleration, Angle, Config, Force, Length, Speed, Time
+from tacsim.models.sensor import SensorModel
+
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+Vector = tuple[Length, Length, Length]
+Corner = tuple[float, float]
+
+SLOWEST_WATCHDOG = 10.0  # of a real arm [Hz]
+
+Model = Literal["ur3e", "ur5e", "ur10e"]
+
+
+class Placement(Config):
+    """A rigid transform in a file: where a frame stands, and how it is turned, seen from another."""
+
+    position: Vector = (0.0, 0.0, 0.0)  # [m]
+    rotation: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)  # rotation vector: axis times angle [rad], as UR writes it
+
+    @property
+    def pose(self) -> Pose:
+        return se3.from_rotation_vector(self.position, self.rotation)
+
+
+class Workspace(Config):
+    """A box along the world axes. The origin of the sensor (the middle of its gel) must stay inside."""
+
+    lower: Vector  # corner of the least x, y, z [m]
+    upper: Vector  # the opposite corner [m]
+
+    @model_validator(mode="after")
+    def _has_an_inside(self) -> Self:
+        for axis, low, high in zip("xyz", self.lower, self.upper, strict=True):
+            if not low < high:
+                raise ValueError(f"no inside: {axis} runs from {low:g} to {high:g} m; lower must be below upper")
+        return self
+
+
+class Plane(Config):
+    """A wall: the origin of the sensor must stay on the side to which the normal points. World axes."""
+
+    point: Vector  # any point of the wall [m]
+    normal: tuple[float, float, float]  # of any length
+
+    @model_validator(mode="after")
+    def _has_a_normal(self) -> Self:
+        if float(np.linalg.norm(self.normal)) < 1e-9:
+            raise ValueError("normal must not be zero")
+        return self
+
+
+class ArmLimits(Config):
+    """What an arm may do. They guard the work, not people: they are no safety function.
+
+    The workspace has no default; nor are there defaults that would suit any cell. `speed` and the rest speak of the
+    sensor's origin, forces of what the object does to the sensor.
+    """
+
+    workspace: Workspace
+    planes: tuple[Plane, ...] = Field(default=(), max_length=16)
+    speed: Annotated[Speed, Field(gt=0, le=1.0)] = 50e-3  # [m/s]
+    turn_rate: Annotated[float, Field(gt=0, le=3.0)] = 0.5  # [rad/s]
+    acceleration: Annotated[Acceleration, Field(gt=0, le=10.0)] = 0.5  # [m/s^2]
+    turn_acceleration: Annotated[float, Field(gt=0, le=50.0)] = 5.0  # [rad/s^2]
+    joint_speed: Annotated[float, Field(gt=0, le=3.14)] = 1.0  # of any joint; bounds the step of each period [rad/s]
+    force: Annotated[Force, Field(gt=0, le=250.0)] = 30.0  # |force| beyond it stops the arm [N]
+    torque: Annotated[float, Field(gt=0, le=50.0)] = 3.0  # |torque| about the sensor's origin [N m]
+    depth: Annotated[Length, Field(gt=0)] | None = None  # how deep the gel may be pressed; None: not watched [m]
+    shear: Annotated[Length, Field(gt=0)] | None = None  # how far its surface may be dragged; None: not watched [m]
+
+    @property
+    def region(self) -> Region:
+        """Where the sensor's origin may be: the workspace, cut by the planes."""
+        return region(self.workspace.lower, self.workspace.upper, [(wall.point, wall.normal) for wall in self.planes])
+
+
+class Payload(Config):
+    """What hangs on the flange, for the controller's gravity compensation."""
+
+    mass: Annotated[float, Field(ge=0, le=20)] = 0.0  # [kg]
+    centre: Vector = (0.0, 0.0, 0.0)  # centre of gravity, flange axes [m]
+
+
+class MockArmConfig(Config):
+    """A mock controller on loopback is started for this arm and stopped with the rig."""
+
+    joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
+    # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
+    # they share a busy machine with whatever else the mock rig needs.
+    realtime: bool = False
+
+
+class UrArmConfig(Config):
+    """A Universal Robots arm through RTDE. With `mock` the same driver talks to a mock controller on loopback."""
+
+    driver: Literal["ur"]
+    host: Annotated[str, Field(min_length=1, max_length=253)]
+    model: Model = "ur5e"
+    world_from_base: Placement
+    flange_from_tool: Placement = Placement()  # the tool centre point (TCP) that the controller is given
+    tool_from_sensor: Placement = Placement()
+    payload: Payload = Payload()
+    limits: ArmLimits
+    start: Placement | None = None  # world_from_sensor, clear of everything; None: where the scene of a mock rig says
+    link_timeout: Annotated[Time, Field(ge=0.01, le=2.0)] = 50e-3  # no package for so long: the link is lost [s]
+    action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # no action for so long: the arm holds [s]
+    # The newest observation is older: the arm holds, whatever is asked of it [s].
+    observation_timeout: Annotated[Time, Field(ge=0.02, le=600.0)] = 1.0
+    watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
+    lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
+    gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
+    latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]
+    mock: MockArmConfig | None = None
+
+    @model_validator(mode="after")
+    def _real_arms_are_watched(self) -> Self:
+        if self.mock is None and self.watchdog < SLOWEST_WATCHDOG:
+            raise ValueError(
+                f"watchdog {self.watchdog:g} Hz: a real arm would go on for {1 / self.watchdog:.2g} s after its driver "
+                f"died; at least {SLOWEST_WATCHDOG:g} Hz (only a mock may be slower)"
+            )
+        return self
+
+
+class MockCameraConfig(Config):
+    """A mock camera on loopback is started for this sensor; the simulated gel feeds it."""
+
+    fps: Annotated[float, Field(gt=0, le=240)] = 30.0
+    quality: Annotated[int, Field(ge=50, le=100)] = 95  # of JPEG
+
+
+class CameraSensorConfig(Config):
+    """A tactile sensor seen by a camera: UVC, MJPEG over HTTP, a video or a folder of images as a stand-in."""
+
+    driver: Literal["camera"]
+    # http://... (MJPEG), a device by its serial path (/dev/v4l/by-id/...), a video file, or a folder of images.
+    source: Annotated[str, Field(min_length=1, max_length=4096)]
+    arm: Name | None = None
+    # What the picture shows, one of three: `model` (its geometry; of a mock also what is rendered), gel `corners`, or
+    # `calibration` (path of a bundle that `tacsim calibrate sensor` wrote; only it gives a real sensor's height).
+    model: SensorModel | None = None
+    corners: tuple[Corner, Corner, Corner, Corner] | None = None  # top left, top right, bottom right, bottom left [px]
+    size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
+    calibration: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    width: Annotated[int, Field(ge=16, le=8192)] = 640  # of the frames that are expected; others are refused [px]
+    height: Annotated[int, Field(ge=16, le=8192)] = 480
+    fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # asked of the camera; of a folder: how fast it is played
+    exposure: float | None = None  # fixed, in the driver's own unit, and read back; None: left as it is
+    white_balance: Annotated[float, Field(gt=0)] | None = None  # colour temperature, fixed and read back [K]
+    stamped: bool = False  # frames carry the strip with number and clock that tacsim's mock camera burns in
+    max_age: Annotated[Time, Field(gt=0, le=60.0)] = 0.2  # an older frame is refused [s]
+    latency: Annotated[Time, Field(ge=0, le=2.0)] = 0.0  # from exposure to arrival [s]
+    mock: MockCameraConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_geometry(self) -> Self:
+        if sum(each is not None for each in (self.model, self.corners, self.calibration)) > 1:
+            raise ValueError("give one of model, corners, calibration: each says where the gel lies in the picture")
+        if self.mock is not None and self.model is None:
+            raise ValueError("a mock camera needs a model: it says what is rendered")
+        return self
+
+
+class KeepOut(Config):
+    """The sensors of two arms stay apart: a sphere between them that neither may enter."""
+
+    arms: tuple[Name, Name]
+    distance: Annotated[Length, Field(gt=0)]  # least distance of the two sensors' origins [m]
+
+    @model_validator(mode="after")
+    def _two_arms(self) -> Self:
+        if self.arms[0] == self.arms[1]:
+            raise ValueError(f"needs two different arms, got '{self.arms[0]}' twice")
+        return self
+
+
+class HardwareStart(Config):
+    """How an episode begins on hardware: retreat to `start`, fresh references, a person confirms, slow approach."""
+
+    approach_speed: Annotated[Speed, Field(gt=0, le=20e-3)] = 2e-3  # [m/s]
+    approach_step: Annotated[Length, Field(gt=0, le=1e-3)] = 20e-6  # between two looks at what is felt [m]
+    approach_way: Annotated[Length, Field(gt=0, le=0.1)] = 10e-3  # no contact after so far: NoTouch [m]
+    touch_signal: Annotated[float, Field(gt=0)] | None = None  # contact signal that counts as touch; None: by force
+
+
+def loosened(before: UrArmConfig, after: UrArmConfig) -> list[str]:
+    """What guards the arm less in `after` than in `before`, as "key: from -> to"."""
+    found = []
+    for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed", "force", "torque"):
+        old, new = getattr(before.limits, key), getattr(after.limits, key)
+        if new > old:
+            found.append(f"limits.{key}: {old:g} -> {new:g}")
+    for key in ("depth", "shear"):
+        old, new = getattr(before.limits, key), getattr(after.limits, key)
+        if old is not None and (new is None or new > old):
+            found.append(f"limits.{key}: {old:g} -> {'not watched' if new is None else f'{new:g}'}")
+    boxes = before.limits.workspace, after.limits.workspace
+    if any(new < old for old, new in zip(boxes[0].lower, boxes[1].lower, strict=True)) or any(
+        new > old for old, new in zip(boxes[0].upper, boxes[1].upper, strict=True)
+    ):
+        found.append("limits.workspace: reaches farther")
+    if not set(before.limits.planes) <= set(after.limits.planes):
+        found.append("limits.planes: one is gone")
+    for key in ("link_timeout", "action_timeout", "observation_timeout"):
+        old, new = getattr(before, key), getattr(after, key)
+        if new > old:
+            found.append(f"{key}: {old:g} -> {new:g}")
+    if after.watchdog < before.watchdog:
+        found.append(f"watchdog: {before.watchdog:g} -> {after.watchdog:g}")
+    return found

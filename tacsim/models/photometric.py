@@ -1,0 +1,131 @@
+"""Surface slope -> colour by a polynomial that was calibrated on a real sensor: what a Phong light cannot say.
+
+With the unit normal's parts nx = -gx / k, ny = -gy / k, nz = 1 / k, k = sqrt(1 + gx^2 + gy^2), and u, v = the place in
+the image, each from -1/2 to 1/2 across it, the relative change of colour (I - I0) / mean(I0) in each channel is
+
+    sum over position terms 1, u, v, u^2, u v, v^2 (as many as `position` asks for) of
+    sum over normal terms nx, ny, 1 - nz, nx^2, nx ny, ny^2, nx^3, ... (up to `degree`) of weight * product.
+
+No term is constant: the flat gel shows I0. Degree 1 at position 0 is the most that directional diffuse lights can do.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from tacsim.models.quantity import Config
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+Weight = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class PhotometricModel(Config):
+    """The forward model of one sensor's light."""
+
+    degree: Annotated[int, Field(ge=1, le=5)]  # of the polynomial in nx, ny
+    position: Annotated[int, Field(ge=0, le=2)]  # degree of the polynomial in u, v
+    # Of R, G, B, one row a term; terms of one position stand together.
+    weights: tuple[tuple[Weight, Weight, Weight], ...]
+    steepest: Annotated[float, Field(gt=0, le=10)]  # slope up to which it was calibrated; steeper ones are clipped [-]
+    blur: Annotated[float, Field(ge=0, le=10)] = 0.0  # standard deviation of the camera's blur [px]
+
+    @model_validator(mode="after")
+    def _one_weight_a_term(self) -> Self:
+        wanted = term_count(self.degree, self.position)
+        if len(self.weights) != wanted:
+            raise ValueError(
+                f"weights has {len(self.weights)} rows; degree {self.degree} at position {self.position} has {wanted}"
+            )
+        return self
+
+
+def term_count(degree: int, position: int) -> int:
+    """Number of terms, that is of weights a channel."""
+    return len(_powers(degree)) * len(_places(position))
+
+
+def normal_terms(gradient: NDArray[np.floating], degree: int) -> NDArray[np.floating]:
+    """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights."""
+    gx, gy = gradient[..., 0], gradient[..., 1]
+    terms = np.empty((term_count(degree, 0), *gx.shape), dtype=gradient.dtype)
+    nz = 1.0 / np.sqrt(1.0 + gx * gx + gy * gy)
+    terms[0], terms[1], terms[2] = gx * -nz, gy * -nz, 1.0 - nz
+    last, here = [0, 1], 3
+    for _ in range(degree - 1):  # nx^a ny^b of one order higher: each by nx, and the last by ny
+        for term, factor in [*((term, 0) for term in last), (last[-1], 1)]:
+            np.multiply(terms[term], terms[factor], out=terms[here, ...])
+            here += 1
+        last = list(range(here - len(last) - 1, here))
+    return terms
+
+
+def position_terms(u: NDArray[np.floating], v: NDArray[np.floating], position: int) -> list[NDArray[np.floating]]:
+    """The terms of the place in the image for u, v (...,) in -1/2..1/2."""
+    products = [np.ones_like(u)]  # each by u, and the last by v, from one order to the next
+    last = products
+    for _ in range(position):
+        last = [*(term * u for term in last), last[-1] * v]
+        products = products + last
+    return products
+
+
+def place_in_image(columns: int, rows: int) -> tuple[Float64, Float64]:
+    """u (columns,) and v (rows,) of the pixels of an image."""
+    return (np.arange(columns) + 0.5) / columns - 0.5, (np.arange(rows) + 0.5) / rows - 0.5
+
+
+def places_in_image(columns: int, rows: int) -> tuple[Float32, Float32]:
+    """u and v (rows, columns) of the pixels of an image."""
+    u, v = np.meshgrid(*place_in_image(columns, rows))
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def clipped(gradient: Float32, steepest: float) -> tuple[Float32, int]:
+    """Slopes (..., 2) no steeper than `steepest`, of unchanged direction, and how many had been. In memory the slopes
+    by x and those by y lie apart."""
+    planes = np.ascontiguousarray(np.moveaxis(gradient, -1, 0))
+    square = planes[0] * planes[0] + planes[1] * planes[1]
+    beyond = square > np.float32(steepest * steepest)
+    count = int(np.count_nonzero(beyond))
+    if count:
+        planes = np.where(beyond, planes * (np.float32(steepest) / np.sqrt(np.maximum(square, 1e-30))), planes)
+    return np.moveaxis(planes, 0, -1), count
+
+
+class PhotometricLight:
+    """A model made ready for use: its weights as arrays."""
+
+    def __init__(self, model: PhotometricModel, mean: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:
+        """mean: the untouched image's mean colour, by which changes are multiplied; 1: they stay relative."""
+        self._model = model
+        self._terms = term_count(model.degree, 0)
+        weights = (np.array(model.weights) * mean).astype(np.float32).reshape(-1, self._terms, 3)
+        self._weights = np.ascontiguousarray(weights.transpose(0, 2, 1)).reshape(-1, self._terms)  # place and channel
+
+    def change(self, gradient: Float32, u: Float32, v: Float32) -> tuple[Float32, int]:
+        """(..., 3) change of colour under slopes (..., 2) at places u, v (...) in -1/2..1/2, before blur, and
+        how many of these slopes were clipped to the calibrated range."""
+        import cv2
+
+        slopes, beyond = clipped(gradient, self._model.steepest)
+        places = np.stack(position_terms(u.ravel(), v.ravel(), self._model.position))
+        # Most of the work is one product of matrices, which BLAS does at the speed of the processor.
+        at_places = self._weights @ normal_terms(slopes, self._model.degree).reshape(self._terms, -1)
+        change = np.einsum("pcn,pn->cn", at_places.reshape(len(places), 3, -1), places)
+        return np.asarray(cv2.merge(list(change)), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
+
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Powers of nx, ny of the terms; (0, 0) stands for 1 - nz."""
+    higher = [(order - b, b) for order in range(2, degree + 1) for b in range(order + 1)]
+    return [(1, 0), (0, 1), (0, 0), *higher]
+
+
+def _places(position: int) -> list[tuple[int, int]]:
+    return [(order - b, b) for order in range(position + 1) for b in range(order + 1)]

@@ -1,0 +1,168 @@
+"""What a rig file may say: clock, scene, task, arms, sensors. No global type: each driver is chosen by itself."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from tacsim.models.hardware import ArmLimits, CameraSensorConfig, HardwareStart, KeepOut, Name, UrArmConfig
+from tacsim.models.quantity import Config, Force, Length, Speed, Time
+from tacsim.models.scene import Scene
+from tacsim.models.sensor import CanonicalGrid, SensorModel
+
+
+class SimArmConfig(Config):
+    """A sensor carrier of the simulation: goes exactly where it is told, within the reach of one control period."""
+
+    driver: Literal["sim"]
+    speed: Annotated[Speed, Field(gt=0)] = 20e-3  # longest way of a control period / period [m/s]
+    turn_rate: Annotated[float, Field(gt=0)] = 0.5  # the same for rotation [rad/s]
+    # Those of the real arm, for a policy that shall meet them in simulation too: workspace, planes, speed, turn_rate,
+    # force, torque, depth, shear. (Accelerations and joints are not simulated; the state is looked at once a period.)
+    limits: ArmLimits | None = None
+
+
+class ReplayArmConfig(Config):
+    """Arm states of a recording: an episode (.mcap), or a CSV file with a row a frame."""
+
+    driver: Literal["replay"]
+    source: str | None = None  # None: nothing was recorded of this arm, the rig is opened without it
+    force_column: str = "force_N"  # normal force, positive when pressed [N]
+    width_column: str | None = "gripper_width_m"  # opening of a parallel gripper [m]
+
+
+class SimSensorConfig(Config):
+    driver: Literal["sim"]
+    arm: Name
+    model: SensorModel = SensorModel()
+
+
+class ReplaySensorConfig(Config):
+    """Recorded frames: an episode (.mcap), a folder of images, or a video."""
+
+    driver: Literal["replay"]
+    source: str | None = None
+    arm: Name | None = None
+    fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # of a folder of images
+    # Gel corners in the image (u, v) [px]: top left, top right, bottom right, bottom left; None: the whole image.
+    corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
+    size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
+    reference: str | None = None  # picture without contact; None: the first frame
+    calibration: str | None = None  # bundle of `tacsim calibrate sensor`, instead of corners: height is found by it
+
+
+ArmConfig = Annotated[SimArmConfig | UrArmConfig | ReplayArmConfig, Field(discriminator="driver")]
+SensorConfig = Annotated[SimSensorConfig | CameraSensorConfig | ReplaySensorConfig, Field(discriminator="driver")]
+
+
+class SqueezeConfig(Config):
+    """Squeeze the body to a height: distance = |height - goal|; actions move both sensors along world z."""
+
+    kind: Literal["squeeze"]
+    scene: Scene = Scene()
+    goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3  # largest motion of one sensor in a control step [m]
+    touch_force: Annotated[Force, Field(gt=0)] = 0.05  # reset approaches until this [N]
+    placement: Annotated[Length, Field(ge=0)] = 0.0  # reset starts at most this far beside the body, by the seed [m]
+    success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
+    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3  # reward = -distance / reward_scale
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
+
+
+class RepositionConfig(Config):
+    """Move the body in the plane: distance = |position - goal|_2; actions move the upper sensor in world x, y."""
+
+    kind: Literal["reposition"]
+    scene: Scene = Scene()
+    goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
+    # Normal forces that arms hold along the z of their sensors (tacsim.control.admittance), by arm; an arm without one
+    # holds its height. [N]
+    loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
+    touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
+    placement: Annotated[Length, Field(ge=0)] = 0.0
+    success: Annotated[Length, Field(gt=0)] = 0.1e-3
+    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40
+
+
+TaskConfig = Annotated[SqueezeConfig | RepositionConfig, Field(discriminator="kind")]
+
+
+SimMotion = Literal["settled", "flowing", "dynamic"]
+
+
+class RigConfig(Config):
+    """One rig file."""
+
+    name: str
+    clock: Literal["sim", "wall", "replay"]
+    period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
+    task: TaskConfig | None = None
+    scene: Scene | None = None  # overrides the task's scene
+    arms: dict[Name, ArmConfig] = {}
+    sensors: dict[Name, SensorConfig] = Field(min_length=1)
+    canonical: CanonicalGrid = CanonicalGrid()
+    motion: SimMotion = "settled"  # simulated: what a control period is; the reset is settled in any case
+    # Mock rigs: a control period ends when the arms rest and the twin has drawn the picture for just that pose.
+    lock_step: bool = True
+    # Mock rigs: what arms feel and cameras see is simulated; or it is a ball's contact in closed form, in real time but
+    # without a body, for tests of timing.
+    contact: Literal["simulated", "hertz"] = "simulated"
+    keep_out: tuple[KeepOut, ...] = Field(default=(), max_length=16)
+    start: HardwareStart = HardwareStart()  # of rigs that go by the wall clock
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for name, sensor in self.sensors.items():
+            if sensor.arm is not None and sensor.arm not in self.arms:
+                raise PydanticCustomError(
+                    "no_such_arm",
+                    "no arm '{arm}'; allowed: {arms}",
+                    # `at`: the entry to blame, as pydantic writes locations (tacsim.config shows its line)
+                    {
+                        "arm": sensor.arm,
+                        "arms": ", ".join(self.arms) or "(none)",
+                        "at": ("sensors", name, sensor.driver, "arm"),
+                    },
+                )
+        for index, apart in enumerate(self.keep_out):
+            for name in apart.arms:
+                if name not in self.arms:
+                    raise PydanticCustomError(
+                        "no_such_arm",
+                        "no arm '{arm}'; allowed: {arms}",
+                        {"arm": name, "arms": ", ".join(self.arms) or "(none)", "at": ("keep_out", index, "arms")},
+                    )
+        if isinstance(self.task, RepositionConfig):
+            for name, load in self.task.loads.items():
+                self._check_load(name, load)
+        return self
+
+    def _check_load(self, name: str, load: float) -> None:
+        """A load of the task is held by an arm of the rig, which must not stop at it."""
+        at = ("task", "reposition", "loads", name)
+        arm = self.arms.get(name)
+        if arm is None:
+            arms = ", ".join(self.arms) or "(none)"
+            raise PydanticCustomError(
+                "no_such_arm", "no arm '{arm}'; allowed: {arms}", {"arm": name, "arms": arms, "at": at}
+            )
+        limits = None if isinstance(arm, ReplayArmConfig) else arm.limits
+        if limits is not None and not load < limits.force:
+            raise PydanticCustomError(
+                "load_beyond_limit",
+                "arm '{arm}' stops at limits.force, {force} N; give a load below it",
+                {"arm": name, "force": f"{limits.force:g}", "at": at},
+            )
+
+    def kept_out(self, arm: str) -> dict[str, float]:
+        """Least distances [m] of `arm` to other arms, by their names."""
+        found: dict[str, float] = {}
+        for apart in self.keep_out:
+            if arm in apart.arms:
+                other = apart.arms[1 - apart.arms.index(arm)]
+                found[other] = max(apart.distance, found.get(other, 0.0))
+        return found

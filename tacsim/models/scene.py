@@ -1,0 +1,248 @@
+"""Facts of a simulated scene: gels, body, indenter, friction, accuracy; and numbers derived from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from tacsim.models.quantity import Acceleration, Angle, Config, Density, Length, Pressure
+
+Edge = Annotated[Length, Field(ge=1e-5, le=10.0)]  # of a body or an indenter [m]
+Modulus = Annotated[Pressure, Field(ge=1.0, le=1e12)]  # from a foam of liquid to beyond diamond [Pa]
+MassDensity = Annotated[Density, Field(ge=1.0, le=1e5)]  # from an aerogel to beyond osmium [kg/m^3]
+Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
+Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
+PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
+
+# particle spacing and gel element size [m] of each preset
+PRESETS = {"draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3)}
+# Peak Mach number of motions between states of rest: what a tolerance asks for and what the elastic strain at yield
+# allows, within bounds (docs/decisions/0002).
+MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST_MACH, FASTEST_MACH = 3.0, 1.5, 0.001, 0.03
+MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
+
+
+class GelMaterial(Config):
+    """Elastic gel (neo-Hookean)."""
+
+    youngs_modulus: Modulus = 0.145e6
+    poisson_ratio: PoissonRatio = 0.48
+    density: MassDensity = 1000.0  # of dynamic motions only; a guess near silicone's
+    source: str = ""
+
+
+class BodyMaterial(Config):
+    """Elastoplastic body: Hencky elasticity, von Mises yield, linear isotropic hardening.
+
+    Give the yield as a stress or as the seed's strain k; with neither the body is elastic, and can't harden.
+    """
+
+    youngs_modulus: Modulus = 0.5e6
+    poisson_ratio: PoissonRatio = 0.45
+    yield_stress: Annotated[Pressure, Field(gt=0)] | None = None
+    yield_norm: Literal["uniaxial", "frobenius"] = "uniaxial"
+    yield_strain: Annotated[float, Field(gt=0, lt=1)] | None = None  # k = sigma_y / (2 mu), Frobenius norm
+    # H: growth of the uniaxial yield stress by equivalent plastic strain [Pa]
+    hardening_modulus: Annotated[Pressure, Field(ge=0, le=1e12)] = 0.0
+    # Weight and dynamic motions; inertia is scaled elsewhere. Plasticine: a guess within the 1.5 to 2 g/cm^3 told.
+    density: MassDensity = 1700.0
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _one_yield(self) -> Self:
+        if self.yield_stress is not None and self.yield_strain is not None:
+            raise ValueError("give yield_stress or yield_strain, not both")
+        if self.hardening_modulus > 0 and self.yield_stress is None and self.yield_strain is None:
+            raise ValueError(
+                f"hardening_modulus {self.hardening_modulus:g} Pa without a yield: an elastic body does not harden; "
+                f"give yield_stress or yield_strain, or leave out hardening_modulus"
+            )
+        return self
+
+    @property
+    def elastic_limit(self) -> float:
+        """Largest Frobenius norm of the deviatoric Hencky strain, k [-]; infinite for an elastic body.
+
+        The return mapping bounds |dev tau|_F = 2 mu k; in uniaxial stress |dev tau|_F = sqrt(2/3) sigma.
+        """
+        if self.yield_strain is not None:
+            return self.yield_strain
+        if self.yield_stress is None:
+            return math.inf
+        mu, _ = lame(self)
+        frobenius = self.yield_stress * (math.sqrt(2.0 / 3.0) if self.yield_norm == "uniaxial" else 1.0)
+        return frobenius / (2.0 * mu)
+
+    @property
+    def hardening(self) -> float:
+        """Growth of `elastic_limit` by equivalent plastic strain p [-]: 2 mu k = sqrt(2/3) (sigma_y + H p)."""
+        mu, _ = lame(self)
+        return math.sqrt(2.0 / 3.0) * self.hardening_modulus / (2.0 * mu)
+
+
+def lame(material: GelMaterial | BodyMaterial) -> tuple[float, float]:
+    """Lamé constants (mu, lambda) [Pa]."""
+    modulus, nu = material.youngs_modulus, material.poisson_ratio
+    return modulus / (2 * (1 + nu)), modulus * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+class Gel(Config):
+    """One elastic gel pad, bonded to its backing; a rigid housing surrounds it, `housing` below its surface."""
+
+    size: Size3 = (20e-3, 20e-3, 4e-3)  # x, y, thickness [m]
+    material: GelMaterial = GelMaterial()
+    housing: Annotated[Length, Field(ge=0)] | None = 0.3e-3  # None: no housing
+
+
+class Box(Config):
+    shape: Literal["box"] = "box"
+    size: tuple[Edge, Edge, Edge] = (10e-3, 10e-3, 10e-3)  # [m]
+
+
+class Sphere(Config):
+    shape: Literal["sphere"] = "sphere"
+    radius: Edge = 5e-3  # [m]
+
+
+class Cylinder(Config):
+    """Upright cylinder: axis along z."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    radius: Edge = 5e-3  # [m]
+    height: Edge = 10e-3  # [m]
+
+
+class Mesh(Config):
+    """Closed triangle mesh (STL, in millimetres unless `scale` says otherwise)."""
+
+    shape: Literal["stl"] = "stl"
+    path: str
+    scale: Annotated[float, Field(gt=0)] = 1e-3  # [m per file unit]
+
+
+Shape = Annotated[Box | Sphere | Cylinder | Mesh, Field(discriminator="shape")]
+
+
+class Body(Config):
+    """The plasticine between the sensors."""
+
+    geometry: Shape = Box()
+    material: BodyMaterial = BodyMaterial()
+    sampling: Literal["lattice", "random"] = "lattice"  # how particles fill it; random: blue noise, no direction
+    seed: Annotated[int, Field(ge=0)] = 0  # of random sampling
+
+
+class Indenter(Config):
+    """A rigid body pressed on one gel; no particles are needed for it."""
+
+    geometry: Shape = Sphere(radius=4e-3)
+    friction: Annotated[float, Field(ge=0, le=5)] = 0.6
+    yaw: Angle = 0.0
+
+
+class Settling(Config):
+    """The quasi-static controller: how exact a state of rest is wanted, and how long it may take."""
+
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance and change of force per check, relative
+    mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # peak speed / wave speed; None: see Scene.peak_mach
+    max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
+    flow_mach: Annotated[float, Field(gt=0, le=0.3)] = 0.01  # speed of motions that flow into one another / wave speed
+
+
+class Scene(Config):
+    """What is simulated. Either a `body` between two gels, or a rigid `indenter` on the lower gel alone."""
+
+    name: str = "scene"
+    physics: Literal["hybrid", "seed"] = "hybrid"
+    preset: Literal["draft", "standard"] = "draft"
+    particle_spacing: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
+    element_size: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
+    gel: Gel = Gel()
+    body: Body | None = Body()
+    indenter: Indenter | None = None
+    friction: dict[Literal["lower", "upper"], Annotated[float, Field(ge=0, le=5)]] = {"lower": 0.6, "upper": 0.6}
+    gravity: tuple[Along, Along, Along] = (0.0, 0.0, 0.0)  # world axes [m/s^2]; acts on the body
+    settling: Settling = Settling()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.body is None) == (self.indenter is None):
+            raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
+        if self.physics == "seed" and self.indenter is not None:
+            raise ValueError("physics 'seed' has no rigid indenter; use physics 'hybrid'")
+        if self.physics == "seed" and self.body is not None and self.body.material.hardening_modulus > 0:
+            raise ValueError(
+                "physics 'seed' has no hardening; use physics 'hybrid', or leave out the material's hardening_modulus"
+            )
+        if any(self.gravity) and (self.physics == "seed" or self.body is None):
+            what = "physics 'seed' has no gravity" if self.physics == "seed" else "gravity has no body to act on"
+            raise ValueError(f"{what}; use physics 'hybrid' with a body, or set gravity to [0, 0, 0]")
+        missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
+        if missing:
+            raise ValueError(f"friction of the surface '{missing[0]}' is missing; give both lower and upper")
+        return self
+
+    @model_validator(mode="after")
+    def _resolvable(self) -> Self:
+        """Each gel gets at least two layers of elements, and no more cells than a machine has memory for."""
+        name, edge = ("particle_spacing", self.spacing) if self.physics == "seed" else ("element_size", self.element)
+        edge = min(edge, self.gel.size[2] / 2)  # a thin gel is resolved finer than its preset
+        cells = math.prod(side / edge for side in self.gel.size)
+        if cells > MAX_CELLS:
+            raise ValueError(
+                f"a gel of {' x '.join(f'{side:g}' for side in self.gel.size)} m has {cells:.3g} cells at "
+                f"{name} {edge:g} m, the limit is {MAX_CELLS:,}; choose a larger {name} or a smaller gel"
+            )
+        if self.element_size is not None and self.element_size > self.gel.size[2] / 2 * (1 + 1e-9):
+            raise ValueError(
+                f"element_size {self.element_size:g} m is too coarse for a gel {self.gel.size[2]:g} m thick: it needs "
+                f"two layers of elements; choose at most {self.gel.size[2] / 2:g} m"
+            )
+        return self
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        return ("lower", "upper") if self.indenter is None else ("lower",)
+
+    @property
+    def peak_mach(self) -> float:
+        """Peak speed of a motion between states of rest, over the wave speed; short ways go slower (physics.path).
+
+        A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
+        tolerance, and with the body's elastic strain at yield: its density is scaled with its stiffness, and so is what
+        a motion costs in stress. Elastic scenes come to the same rest from any speed.
+        """
+        settling = self.settling
+        if settling.mach is not None:
+            return settling.mach
+        limit = math.inf if self.body is None else self.body.material.elastic_limit
+        if not math.isfinite(limit):
+            return FASTEST_MACH
+        return min(max(min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRAIN * limit), SLOWEST_MACH), FASTEST_MACH)
+
+    @property
+    def spacing(self) -> float:
+        """Particle spacing h_p [m]; the grid spacing is twice as large."""
+        return PRESETS[self.preset][0] if self.particle_spacing is None else self.particle_spacing
+
+    @property
+    def element(self) -> float:
+        """Edge of a gel element h_g [m]."""
+        return PRESETS[self.preset][1] if self.element_size is None else self.element_size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GelSurface:
+    """Displacement of a gel's top surface at the nodes of its own lattice, in the sensor frame.
+
+    Between nodes the surface is the C1 quadratic B-spline with these control values; contact and renderer use the same.
+    """
+
+    displacement: NDArray[np.float32]  # (nx, ny, 3) [m]; x grows with the first index, y with the second
+    spacing: float  # [m]
+    origin: tuple[float, float]  # x, y of node (0, 0) at rest, sensor frame [m]

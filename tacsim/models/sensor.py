@@ -1,0 +1,152 @@
+"""Facts of one tactile sensor: the one geometry of its image, its light, its markers, its texture and noise."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from tacsim.models.photometric import PhotometricModel
+from tacsim.models.quantity import Config, Length
+
+Channel = Annotated[float, Field(ge=0, le=4)]
+Rgb = tuple[Channel, Channel, Channel]
+Deviation = Annotated[float, Field(ge=0, le=32)]
+Correlation = Annotated[float, Field(ge=-1, le=1)]
+Neighbour = Annotated[float, Field(ge=-0.95, le=0.95)]
+
+
+def _colour_or_picture(value: Any) -> str:
+    return "picture" if isinstance(value, str) else "colour"
+
+
+Background = Annotated[
+    Annotated[Rgb, Tag("colour")] | Annotated[str, Tag("picture")], Discriminator(_colour_or_picture)
+]
+
+
+class SensorGeometry(Config):
+    """Where the pixels of the (rectified) image lie on the gel: ``x = (u - u0) * pixel_pitch``, likewise y.
+
+    Pixel centres are integers; (u0, v0) defaults to the image centre, so the sensor axis is in the middle.
+
+    A `camera_distance` H makes the camera a pinhole on the sensor axis, so far behind the untouched gel: a dot on a
+    surface pressed in by h appears at ``x H / (H - h)``. Without one it looks along parallel rays, x stays x. Only
+    dots are drawn so; the colour of the gel is always that of parallel rays.
+    """
+
+    width: Annotated[int, Field(ge=16, le=4096)] = 320
+    height: Annotated[int, Field(ge=16, le=4096)] = 240
+    pixel_pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.0625e-3  # [m]
+    centre: tuple[float, float] | None = None  # (u0, v0) [px]
+    camera_distance: Annotated[Length, Field(ge=2e-3, le=10.0)] | None = None  # [m]; None: parallel rays
+
+    @property
+    def principal(self) -> tuple[float, float]:
+        """(u0, v0): the pixel on the sensor axis."""
+        return ((self.width - 1) / 2.0, (self.height - 1) / 2.0) if self.centre is None else self.centre
+
+
+class Light(Config):
+    """One directional light. Like the camera it stands behind the gel, on the -z side (z points out of the gel)."""
+
+    direction: tuple[float, float, float]  # from the surface towards the light, sensor axes, any length
+    colour: Rgb
+    diffuse: Channel = 1.0
+    specular: Channel = 0.35
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> Self:
+        if sum(c * c for c in self.direction) < 1e-12:
+            raise ValueError("direction must not be zero")
+        if self.direction[2] > 0:
+            raise ValueError(f"direction z is {self.direction[2]:g}: lights stand behind the gel, where z is negative")
+        return self
+
+
+# Three lights a third of a turn apart, 24 degrees above the gel's plane: red from the right, green from the lower left,
+# blue from the upper left of the image.
+THREE_LIGHTS = (
+    Light(direction=(1.0, 0.0, -0.45), colour=(1.0, 0.10, 0.08)),
+    Light(direction=(-0.5, 0.87, -0.45), colour=(0.08, 1.0, 0.12)),
+    Light(direction=(-0.5, -0.87, -0.45), colour=(0.10, 0.12, 1.0)),
+)
+
+
+class Lighting(Config):
+    """Phong illumination: diffuse and specular parts summed over lights (Gomes et al. 2021, as the seed uses).
+
+    With a background the picture is background + shade(n) - shade(flat gel); without one it is ambient + shade(n).
+    """
+
+    lights: tuple[Light, ...] = Field(default=THREE_LIGHTS, max_length=64)
+    ambient: Channel = 0.0  # grey level of unlit gel; only without a background
+    shininess: Annotated[float, Field(ge=1, le=1000)] = 10.0
+    background: Background | None = (0.42, 0.44, 0.46)  # colour of the untouched gel, or the path of a picture
+
+    @model_validator(mode="after")
+    def _one_base(self) -> Self:
+        if self.ambient > 0 and self.background is not None:
+            raise ValueError("ambient has no effect beside a background; set background to null, or ambient to 0")
+        return self
+
+
+class Markers(Config):
+    """A lattice of dots printed on the gel surface."""
+
+    rows: Annotated[int, Field(ge=1, le=100)] = 9
+    columns: Annotated[int, Field(ge=1, le=100)] = 11
+    pitch: Annotated[Length, Field(gt=0)] = 1.5e-3  # [m]
+    radius: Annotated[Length, Field(gt=0)] = 0.25e-3  # [m]
+
+
+class CameraNoise(Config):
+    """Noise of the pictures that a camera delivers, rounding to whole grey levels included."""
+
+    deviation: tuple[Deviation, Deviation, Deviation]  # of R, G, B [grey levels]
+    colours: tuple[Correlation, Correlation, Correlation] = (0.0, 0.0, 0.0)  # of R with G, R with B, G with B
+    neighbours: tuple[Neighbour, Neighbour] = (0.0, 0.0)  # correlation of pixels side by side along x, along y
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _correlations_are_possible(self) -> Self:
+        if np.linalg.eigvalsh(self.colour_matrix())[0] < -1e-6:
+            raise ValueError(f"colours {self.colours}: no three colours can be correlated so")
+        return self
+
+    def colour_matrix(self) -> NDArray[np.float64]:
+        """(3, 3) correlations of R, G, B."""
+        red_green, red_blue, green_blue = self.colours
+        return np.array([[1.0, red_green, red_blue], [red_green, 1.0, green_blue], [red_blue, green_blue, 1.0]])
+
+
+class SensorModel(Config):
+    """Everything that makes a gel surface into a picture."""
+
+    name: str = "ideal"
+    geometry: SensorGeometry = SensorGeometry()
+    lighting: Lighting = Lighting()
+    # Calibrated on a real sensor: takes the place of the lights; the background stays that of `lighting`.
+    photometric: PhotometricModel | None = None
+    markers: Markers | None = None
+    texture: Annotated[Length, Field(ge=0)] = 2e-6  # standard deviation of the gel's surface texture [m]
+    texture_seed: Annotated[int, Field(ge=0)] = 0
+    noise: CameraNoise | None = None  # of each picture that a sensor delivers; None: a camera without noise
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _calibrated_change_has_a_base(self) -> Self:
+        if self.photometric is not None and self.lighting.background is None:
+            raise ValueError("photometric tells changes of colour, so it needs lighting.background: the untouched gel")
+        return self
+
+
+class CanonicalGrid(Config):
+    """The grid that every sensor's observation lies on, centred on the gel. Part of a policy's specification."""
+
+    rows: Annotated[int, Field(ge=8, le=1024)] = 64
+    columns: Annotated[int, Field(ge=8, le=1024)] = 64
+    pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.25e-3  # [m]
+    image_scale: Annotated[int, Field(ge=1, le=8)] = 2  # image pixels per grid cell, each way

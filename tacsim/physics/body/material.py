@@ -1,0 +1,282 @@
+"""Material laws inside kernels: neo-Hookean gel; Hencky elasticity with von Mises return mapping for the plasticine.
+
+Symmetric 3x3 matrices are stored as 6 numbers (xx, yy, zz, xy, xz, yz). Polynomials of one symmetric matrix commute
+and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenvalues, no branch near equal ones.
+The same laws in float64 NumPy: tacsim/physics/oracle/laws.py.
+"""
+
+from tacsim.compute.runtime import ti
+
+vec3 = ti.types.vector(3, ti.f32)
+vec6 = ti.types.vector(6, ti.f32)
+mat3 = ti.types.matrix(3, 3, ti.f32)
+
+ROOT = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the flow
+ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
+NEAR_LOG1P, NEAR_LOG, NEAR_EXP = 0.4, 0.5, 0.2  # arguments up to which the series below are exact enough
+
+
+@ti.func
+def full(s):
+    return mat3([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
+
+
+@ti.func
+def product(a, b):
+    """a b of two commuting symmetric matrices."""
+    return vec6(
+        a[0] * b[0] + a[3] * b[3] + a[4] * b[4],
+        a[3] * b[3] + a[1] * b[1] + a[5] * b[5],
+        a[4] * b[4] + a[5] * b[5] + a[2] * b[2],
+        a[0] * b[3] + a[3] * b[1] + a[4] * b[5],
+        a[0] * b[4] + a[3] * b[5] + a[4] * b[2],
+        a[3] * b[4] + a[1] * b[5] + a[5] * b[2],
+    )
+
+
+@ti.func
+def plus_identity(s, c):
+    """s + c I."""
+    return vec6(s[0] + c, s[1] + c, s[2] + c, s[3], s[4], s[5])
+
+
+@ti.func
+def minors(s):
+    """Sum of the principal 2x2 minors (second invariant)."""
+    return s[0] * s[1] - s[3] * s[3] + s[0] * s[2] - s[4] * s[4] + s[1] * s[2] - s[5] * s[5]
+
+
+@ti.func
+def determinant(s):
+    return s[0] * (s[1] * s[2] - s[5] * s[5]) - s[3] * (s[3] * s[2] - s[5] * s[4]) + s[4] * (s[3] * s[5] - s[1] * s[4])
+
+
+@ti.func
+def inverse(s):
+    c0 = s[1] * s[2] - s[5] * s[5]
+    c3 = s[4] * s[5] - s[3] * s[2]
+    c4 = s[3] * s[5] - s[4] * s[1]
+    r = 1.0 / (s[0] * c0 + s[3] * c3 + s[4] * c4)
+    return r * vec6(c0, s[0] * s[2] - s[4] * s[4], s[0] * s[1] - s[3] * s[3], c3, c4, s[3] * s[4] - s[0] * s[5])
+
+
+@ti.func
+def square(s):
+    return s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + 2.0 * (s[3] * s[3] + s[4] * s[4] + s[5] * s[5])
+
+
+@ti.func
+def frobenius(s):
+    return ti.sqrt(square(s))
+
+
+@ti.func
+def log1p_series(z):
+    """ln(1 + x) = 2 artanh(z) with z = x / (2 + x), by its series: accurate in f32 for |x| up to 0.4, however small.
+
+    By pairs of terms (Estrin), not one after the other: lanes wait for each operation before the next.
+    """
+    q = z * z
+    q2 = q * q
+    return 2.0 * z * ((1.0 + q / 3.0) + q2 * (0.2 + q / 7.0) + q2 * q2 * (1.0 / 9.0 + q / 11.0))
+
+
+@ti.func
+def log1p(x):
+    """ln(1 + x), accurate in f32 for small x."""
+    y = 0.0
+    if ti.abs(x) < NEAR_LOG1P:
+        y = log1p_series(x / (2.0 + x))
+    else:
+        y = ti.log(1.0 + x)
+    return y
+
+
+@ti.func
+def lanes_log1p(x):
+    """The same for lanes, without a branch: far from 0 by the fourth root."""
+    t = ti.sqrt(ti.sqrt(1.0 + x)) - 1.0
+    far = ti.abs(x) > NEAR_LOG1P
+    return ti.select(far, 4.0, 1.0) * log1p_series(ti.select(far, t / (2.0 + t), x / (2.0 + x)))
+
+
+@ti.func
+def log_pade(a):
+    """log(I + a) by the [3/3] Padé approximant; relative error below 1.4e-5 for |a| up to 0.5.
+
+    The quotient N(a) / D(a) of two cubics is itself a quadratic c0 + c1 a + c2 a^2, since a^3 = I1 a^2 - I2 a + I3
+    (Cayley-Hamilton): three scalar equations in place of two matrix products and an inverse.
+    """
+    a2 = product(a, a)
+    i1, i2, i3 = a[0] + a[1] + a[2], minors(a), determinant(a)
+    n = vec3(11.0 * i3, 60.0 - 11.0 * i2, 60.0 + 11.0 * i1)  # 60 a + 60 a^2 + 11 a^3 by powers 0, 1, 2
+    d0 = vec3(60.0 + 3.0 * i3, 90.0 - 3.0 * i2, 36.0 + 3.0 * i1)  # 60 + 90 a + 36 a^2 + 3 a^3
+    d1 = vec3(d0[2] * i3, d0[0] - d0[2] * i2, d0[1] + d0[2] * i1)  # the same times a
+    d2 = vec3(d1[2] * i3, d1[0] - d1[2] * i2, d1[1] + d1[2] * i1)  # times a^2
+    r0, r1, r2 = d1.cross(d2), d2.cross(d0), d0.cross(d1)  # Cramer's rule for c0 d0 + c1 d1 + c2 d2 = n
+    scale = 1.0 / d0.dot(r0)
+    return plus_identity((scale * n.dot(r1)) * a + (scale * n.dot(r2)) * a2, scale * n.dot(r0))
+
+
+@ti.func
+def square_root(a):
+    """r with (I + r)^2 = I + a, by the Denman-Beavers iteration (quadratic; a > -I)."""
+    y = plus_identity(a, 1.0)
+    z = vec6(1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    for _ in range(8):
+        y, z = 0.5 * (y + inverse(z)), 0.5 * (z + inverse(y))
+    return plus_identity(y, -1.0)
+
+
+@ti.func
+def logarithm(a):
+    """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
+    scale = 1.0
+    root = a
+    if frobenius(a) > NEAR_LOG:
+        for _ in range(3):
+            if frobenius(root) > NEAR_LOG:
+                root = square_root(root)
+                scale *= 2.0
+    return scale * log_pade(root)
+
+
+@ti.func
+def exponential_series(x):
+    """exp(x) - I for tr x = 0 by its Taylor series to 4th order, error below |x|^5 / 120."""
+    i2, i3 = minors(x), determinant(x)  # x^3 = -i2 x + i3, since tr x = 0
+    return plus_identity((1.0 - i2 / 6.0 + i3 / 24.0) * x + (0.5 - i2 / 24.0) * product(x, x), i3 / 6.0)
+
+
+@ti.func
+def exponential_minus_identity(x, norm):
+    """exp(x) - I for tr x = 0; norm: |x|.
+
+    Large strain (stiff yield, or long hardening) is halved first: exp(x) = exp(x / 2^n)^(2^n), n <= 4.
+    """
+    halvings = 0
+    small = norm
+    for _ in range(4):
+        if small > NEAR_EXP:
+            small *= 0.5
+            halvings += 1
+    y = exponential_series((small / norm) * x)
+    for _ in range(halvings):
+        y = 2.0 * y + product(y, y)
+    return y
+
+
+@ti.func
+def volume_preserving(e, shrink):
+    """b_e / J^(2/3) - I, from shrink = J^(-2/3)."""
+    return plus_identity(e * shrink, shrink - 1.0)
+
+
+@ti.func
+def after_flow(growth, shrink):
+    """e of growth + I, of which only the part that preserves volume counts, at the volume J = shrink^(-3/2)."""
+    excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
+    volume = (1.0 - excess / 3.0) / shrink
+    return plus_identity(growth * volume, volume - 1.0)
+
+
+@ti.func
+def third_root(z):
+    """t with (1 - t) / (1 + t) = (1 + x)^(-1/3) for |x| up to 0.4, where z = x / (2 + x): tanh(artanh(z) / 3) by its
+    series."""
+    q = z * z
+    q2 = q * q
+    low, high = 1.0 / 3.0 + 8.0 / 81.0 * q, 40.0 / 729.0 + 728.0 / 19683.0 * q
+    return z * (low + q2 * high + q2 * q2 * (43768.0 / 1594323.0))
+
+
+@ti.func
+def strain_near(e):
+    """log J, dev(eps) and J^(2/3) of b_e = I + e, for elastic strain up to some 0.2, without a branch: lanes can do it
+    side by side.
+
+    Returns also 1 where the strain is larger (and all else is wrong), else 0.
+    """
+    x = e[0] + e[1] + e[2] + minors(e) + determinant(e)  # det(I + e) - 1
+    z = x / (2.0 + x)
+    t = third_root(z)
+    shape = volume_preserving(e, (1.0 - t) / (1.0 + t))
+    strain = 0.5 * log_pade(shape)
+    strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
+    far = ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0) | ti.select(square(shape) > NEAR_LOG**2, 1, 0)
+    return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), far
+
+
+@ti.func
+def stress_near(e, mu, bulk):
+    """Kirchhoff stress of a body that never yields, as by `hencky_return`; and 1 beyond `strain_near`, else 0."""
+    log_j, strain, _, far = strain_near(e)
+    return plus_identity(2.0 * mu * strain, bulk * log_j), far
+
+
+@ti.func
+def return_near(e, flow, mu, bulk, limit, hardening):
+    """`hencky_return` for elastic strain up to some 0.2, without a branch: see `strain_near`.
+
+    Returns also 1 where the strain is larger (and all else is wrong), else 0.
+    """
+    log_j, strain, grow, far = strain_near(e)
+    strain2, i2, i3 = product(strain, strain), minors(strain), determinant(strain)
+    norm = ti.sqrt(strain2[0] + strain2[1] + strain2[2])
+    now, give = limit + hardening * flow, 1.0 / (1.0 + ROOT * hardening)
+    f = 1.0 - give * ti.max(0.0, 1.0 - now / ti.max(norm, 1e-12))  # of the strain is left
+    # exp(2 f strain) - I by `exponential_series`, of invariants 4 f^2 i2 and 8 f^3 i3
+    j2, j3 = 4.0 * f * f * i2, 8.0 * f * f * f * i3
+    first, second = 2.0 * f * (1.0 - j2 / 6.0 + j3 / 24.0), 4.0 * f * f * (0.5 - j2 / 24.0)
+    growth = plus_identity(first * strain + second * strain2, j3 / 6.0)
+    excess = j2 * j3 / 24.0 + (3.0 * j3 * j3 - 2.0 * j2 * j2 * j2) / 144.0  # det - 1 of the cut series
+    volume = (1.0 - excess / 3.0) * grow
+    returned = plus_identity(growth * volume, volume - 1.0)
+    yields = norm > now
+    elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
+    far = far | ti.select(2.0 * f * norm > NEAR_EXP, 1, 0)
+    return (
+        elastic, flow + ROOT * give * ti.max(0.0, norm - now), plus_identity(2.0 * mu * f * strain, bulk * log_j), far
+    )  # fmt: skip
+
+
+@ti.func
+def return_far(e, flow, mu, bulk, limit, hardening):
+    """`hencky_return` for any strain."""
+    log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
+    shrink = ti.exp(-2.0 / 3.0 * log_j)
+    strain = 0.5 * logarithm(volume_preserving(e, shrink))
+    strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
+    norm = frobenius(strain)
+    elastic = e
+    now = limit + hardening * flow
+    new_flow = flow
+    if norm > now:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
+        gamma = (norm - now) / (1.0 + ROOT * hardening)
+        new_flow = flow + ROOT * gamma
+        strain *= (norm - gamma) / norm
+        elastic = after_flow(exponential_minus_identity(2.0 * strain, 2.0 * (norm - gamma)), shrink)
+    return elastic, new_flow, plus_identity(2.0 * mu * strain, bulk * log_j)
+
+
+@ti.func
+def hencky_return(e, flow, mu, bulk, limit, hardening):
+    """Hencky elasticity with von Mises return mapping (seed paper, eq. 1 and 2), on e = b_e - I.
+
+    e: trial elastic left Cauchy-Green strain minus identity; flow: equivalent plastic strain so far; limit: k =
+    sigma_y / (2 mu), Frobenius norm, which grows by hardening * flow (linear isotropic hardening, Simo & Hughes 1998,
+    box 3.1). Returns the elastic e after the return, the new flow, and the Kirchhoff stress
+    tau = 2 mu dev(eps) + K ln(J) I.
+    """
+    elastic, new_flow, tau, far = return_near(e, flow, mu, bulk, limit, hardening)
+    if far != 0:
+        elastic, new_flow, tau = return_far(e, flow, mu, bulk, limit, hardening)
+    return elastic, new_flow, tau
+
+
+@ti.func
+def convect(e, d):
+    """e of f b f^T, with f = I + d and b = I + e, without forming I (keeps small strains exact in f32)."""
+    m = d + d @ full(e)
+    t = m + m.transpose() + m @ d.transpose()
+    return e + vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])

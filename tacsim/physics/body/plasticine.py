@@ -1,0 +1,198 @@
+"""Elastoplastic body: what its particles know, and the grid round them. Its kernels: tacsim/physics/body/transfers.py.
+
+Elastic state e = b_e - I per particle. Inside: mm, N, MPa; density scaled so that the P-wave speed is 1.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacsim.models.scene import BodyMaterial, lame
+from tacsim.physics.body.material import ELASTIC
+from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MOST, NODES, aligned_zeros, padded
+from tacsim.physics.exec.layout import (
+    AFFINE,
+    BODY_BULK,
+    BODY_CELL,
+    BODY_HARDENING,
+    BODY_LIMIT,
+    BODY_MASS,
+    BODY_MU,
+    BODY_VOLUME,
+    CAPACITY,
+    FLOW,
+    GRID,
+    KNOWN,
+    ORIGIN,
+    PARTICLES,
+    PLACE,
+    PLANE,
+    SLAB,
+    STRAIN,
+    STRIDE,
+    VELOCITY,
+)
+from tacsim.physics.gel.gel import MM, MPA
+
+BORDER = 8  # [cells] that a grid is longer than its particles and their margin reach, at most
+
+
+@dataclass(frozen=True)
+class BodyParams:
+    """The body's material and resolution in kernel units."""
+
+    spacing: float  # particle spacing h_p [mm]
+    mu: float  # [MPa]
+    bulk: float  # [MPa]
+    limit: float  # k = sigma_y / (2 mu) [-]
+    volume: float  # of one particle [mm^3]; about h_p^3
+    hardening: float = 0.0  # growth of the limit by equivalent plastic strain [-]
+
+    @property
+    def density(self) -> float:
+        return self.bulk + 4.0 / 3.0 * self.mu
+
+    @property
+    def cell(self) -> float:
+        """Grid spacing dx: 8 particles a cell."""
+        return 2 * self.spacing
+
+    @property
+    def particle_mass(self) -> float:
+        return self.density * self.volume
+
+    def params(self) -> dict[int, float]:
+        """Entries of the array `facts` (tacsim.physics.exec.layout)."""
+        return {
+            BODY_CELL: self.cell, BODY_MU: self.mu, BODY_BULK: self.bulk, BODY_LIMIT: self.limit,
+            BODY_HARDENING: self.hardening, BODY_MASS: self.particle_mass, BODY_VOLUME: self.volume,
+        }  # fmt: skip
+
+
+def body_params(material: BodyMaterial, spacing: float, volume: float | None = None) -> BodyParams:
+    """`spacing` [m]; `volume` of one particle [m^3], without it spacing^3."""
+    mu, lam = lame(material)
+    limit = material.elastic_limit
+    return BodyParams(
+        spacing * MM, mu * MPA, (lam + 2 * mu / 3) * MPA, limit if math.isfinite(limit) else ELASTIC,
+        (spacing**3 if volume is None else volume) * MM**3, material.hardening,
+    )  # fmt: skip
+
+
+class BodyState:
+    """Particles of all environments and the grid they move on, kept as kernels like them: whole lanes, whole lines.
+
+    known: (E, KNOWN, W) one number of all particles a row (tacsim.physics.exec.layout), zeros behind the last particle;
+    masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part; velocities:
+    (E, strips, 4 NODES). Lines of the grid have an even number of nodes where NODES is 2.
+    """
+
+    def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
+        """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes no particle knows a surface."""
+        self.counts = [len(p) for p in points]
+        self.known = aligned_zeros(len(points), KNOWN, spread(max(self.counts)))
+        for index, p in enumerate(points):
+            self.x(index)[...] = p
+            if planes is not None:
+                self.plane(index)[...] = planes[index]
+        self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
+        self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
+
+    def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
+        return self.known[environment, first : first + count, : self.counts[environment]]
+
+    def x(self, environment: int = 0) -> np.ndarray:
+        """Positions [mm], (n, 3), a view."""
+        return self._rows(environment, PLACE, 3).T
+
+    def plane(self, environment: int = 0) -> np.ndarray:
+        """Tangent planes [1/mm], (n, 3), a view."""
+        return self._rows(environment, PLANE, 3).T
+
+    def v(self, environment: int = 0) -> np.ndarray:
+        """Velocities, (n, 3), a view."""
+        return self._rows(environment, VELOCITY, 3).T
+
+    def c(self, environment: int = 0) -> np.ndarray:
+        """Affine velocities, (n, 3, 3), a view."""
+        columns: np.ndarray = self.known[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
+        return columns[..., : self.counts[environment]].T
+
+    def e(self, environment: int = 0) -> np.ndarray:
+        """Elastic strains b_e - I, (n, 6), a view."""
+        return self._rows(environment, STRAIN, 6).T
+
+    def flow(self, environment: int = 0) -> np.ndarray:
+        """Equivalent plastic strains, (n,), a view."""
+        return self._rows(environment, FLOW, 1).reshape(-1)
+
+    @property
+    def most(self) -> int:
+        """Grid nodes that each environment may have: its share of what kernels can count, in all copies."""
+        return MOST // (4 * COPIES * len(self.known))
+
+    def fit(self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray) -> None:
+        """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
+
+        margin [mm]: what they may move during the launch. Writes origin, node counts and the parts' slabs of node
+        planes into `facts` and `counts` (tacsim.physics.exec.layout).
+
+        The memory of all environments grows if this one needs more; what stands in it lasts no longer than a substep.
+        Raises MemoryError, with that memory as it was, where there is none.
+        """
+        x = self.x(environment)
+        origin, shape = fit_grid(x, cell, margin)
+        params[environment, ORIGIN : ORIGIN + 3] = origin
+        counts[environment, GRID : GRID + 3] = shape
+        counts[environment, PARTICLES] = len(x)
+        for part in range(COPIES):
+            own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x)), 0]
+            low, high = 0, 0
+            if own.size:
+                low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
+                high = min(math.ceil((float(own.max()) + margin - float(origin[0])) / cell) + 3, shape[0])
+            counts[environment, SLAB + 2 * part : SLAB + 2 * part + 2] = low, high
+        # three planes for what particles off the grid would add
+        strips = (shape[0] + 3) * shape[1] * shape[2] // NODES
+        if self.masses.shape[2] < strips:
+            # a body that spreads asks for more again and again
+            room = max(strips, min(strips * 5 // 4, self.most // NODES))
+            masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
+            self.masses, self.velocities = masses, aligned_zeros(len(masses), room, 4 * NODES)
+        counts[:, STRIDE], counts[:, CAPACITY] = self.known.shape[2], self.masses.shape[2]
+
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """What every kernel with a body takes, in this order."""
+        return self.known.reshape(-1), self.masses.reshape(-1, 4 * NODES), self.velocities.reshape(-1, 4 * NODES)
+
+
+def spread(particles: int) -> int:
+    """Room for so many particles in a row: whole cache lines and odd many, so that rows do not compete for places in
+    the cache, which holds few lines whose addresses differ by a power of two."""
+    return (-(-particles // CACHE_LINE) | 1) * CACHE_LINE
+
+
+def first_particle(part: int, particles: int) -> int:
+    """Where a part of the particles begins: at a block of lanes (tacsim.physics.body.transfers.block_range)."""
+    return min(padded(particles) // LANES * part // COPIES * LANES, particles)
+
+
+def bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates (3,) of points (n, 3). By columns: NumPy is ten times slower along such a row."""
+    columns = [x[:, d] for d in range(x.shape[1])]
+    return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
+
+
+def centre_of(x: np.ndarray) -> np.ndarray:
+    """Mean (3,) of points (n, 3) in float64; by columns, as `bounds`."""
+    return np.array([x[:, d].mean(dtype=np.float64) for d in range(x.shape[1])])
+
+
+def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """Origin and node counts of a grid round the particles (n, 3) [mm]; whole strips along z."""
+    least, most = bounds(x)
+    low = np.floor((least - margin) / cell) * cell
+    counts = np.ceil((most + margin - low) / cell).astype(int) + 3
+    return low.astype(np.float32), (int(counts[0]), int(counts[1]), -(-int(counts[2]) // NODES) * NODES)

@@ -1,0 +1,212 @@
+"""Contact: particles against the deformed gel surface and its housing; friction with memory.
+
+The gel surface is the C1 quadratic B-spline over its top nodes; the renderer draws the same surface. The normal force
+is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992), so that nothing overlaps at
+rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 1979): without it, friction creeps and
+holds nothing.
+"""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.exec.lanes import ON_DEVICE, add_four, note_more, note_most, slot_of, vec2, vec3, vec4
+from tacsim.physics.exec.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
+from tacsim.physics.gel.gel import skin_at
+
+Kept = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
+
+CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
+TANGENT_STIFFNESS = 0.5  # k_t / k_n
+MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
+SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
+
+
+@ti.func
+def spline(a):
+    """First node of the 3-node stencil round lattice coordinate a, weights, and their derivatives by a."""
+    first = int(ti.floor(a + 0.5)) - 1
+    t = a - first
+    w = vec3(0.5 * (1.5 - t) ** 2, 0.75 - (t - 1.0) ** 2, 0.5 * (t - 0.5) ** 2)
+    d = vec3(t - 1.5, -2.0 * (t - 1.0), t - 0.5)
+    return first, w, d
+
+
+@ti.func
+def skin_sum(skin: ti.template(), row, i, j, wx, wy, ny):
+    """Sum over the 3 x 3 nodes of a stencil from (i, j) on, weighted by wx and wy; row: the quantity's first.
+
+    A loop over the four numbers of a node, of which a CPU makes vectors; all four nodes' first numbers at once would be
+    a gather.
+    """
+    if ti.static(ON_DEVICE):
+        total = vec4(0.0)
+        for p, q in ti.static(ti.ndrange(3, 3)):
+            at = skin_at(row + i + p + 1, j + q + 1, ny)
+            total += (wx[p] * wy[q]) * vec4([skin[at + c] for c in range(4)])
+        return total
+    else:
+        sums = ti.Matrix.zero(ti.f32, 4, 1)
+        for c in range(4):
+            total = 0.0
+            for p, q in ti.static(ti.ndrange(3, 3)):
+                total += (wx[p] * wy[q]) * skin[skin_at(row + i + p + 1, j + q + 1, ny) + c]
+            sums[c, 0] = total
+        return vec4([sums[c, 0] for c in range(4)])
+
+
+@ti.func
+def skin_sums(skin: ti.template(), row, i, j, wx, wy, dx, dy, ny):
+    """The same sum, with the weights' derivatives by x, and by y."""
+    if ti.static(ON_DEVICE):
+        return (
+            skin_sum(skin, row, i, j, wx, wy, ny),
+            skin_sum(skin, row, i, j, dx, wy, ny),
+            skin_sum(skin, row, i, j, wx, dy, ny),
+        )
+    else:
+        sums = ti.Matrix.zero(ti.f32, 3, 4)
+        for c in range(4):
+            value, by_x, by_y = 0.0, 0.0, 0.0
+            for p in ti.static(range(3)):
+                first, second, third = [skin[skin_at(row + i + p + 1, j + q + 1, ny) + c] for q in range(3)]
+                line = wy[0] * first + wy[1] * second + wy[2] * third
+                value += wx[p] * line
+                by_x += dx[p] * line
+                by_y += wx[p] * (dy[0] * first + dy[1] * second + dy[2] * third)
+            sums[0, c], sums[1, c], sums[2, c] = value, by_x, by_y
+        return (
+            vec4([sums[0, c] for c in range(4)]),
+            vec4([sums[1, c] for c in range(4)]),
+            vec4([sums[2, c] for c in range(4)]),
+        )
+
+
+@ti.func
+def newton_step(t1, t2, miss):
+    """Way in lattice coordinates to where the surface lies under a point; miss: how far it is away in them, unmoved.
+
+    t1, t2: tangents of the surface. One that is folded has no inverse: then the step is that of an unmoved surface.
+    """
+    det = t1[0] * t2[1] - t1[1] * t2[0]
+    step = miss
+    if det > SMALLEST_AREA:
+        step = vec2(t2[1] * miss[0] - t2[0] * miss[1], t1[0] * miss[1] - t1[1] * miss[0]) / det
+    return step
+
+
+@ti.func
+def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
+    """Coulomb with stick memory. Returns the tangential force on the particle and the new elastic slip."""
+    slip -= slip.dot(n) * n
+    slip += dt * vt
+    ft = -k_t * slip - c_t * vt
+    size, limit = ft.norm(), mu * fn
+    if size > limit:
+        ft *= limit / size
+        length = slip.norm()
+        if k_t * length > limit:
+            slip *= limit / (k_t * length)
+    return ft, slip
+
+
+@ti.func
+def surface_node(i, j, nx, ny):
+    """Index of the surface node (i, j) in a layer's row, repeated beyond the rim."""
+    return ti.max(0, ti.min(i, nx)) * (ny + 1) + ti.max(0, ti.min(j, ny))
+
+
+@ti.func
+def support_radius(plane, spacing):
+    """Distance of a particle from the body's surface: 1 / |plane|; half a spacing where it knows none (plane = 0).
+
+    plane: the nearest surface's tangent plane, outward normal over distance [1/mm], see body_surface.py.
+    """
+    size = plane.norm()
+    radius = 0.5 * spacing
+    if size > 0.0:
+        radius = ti.min(1.0 / size, spacing)  # a plane torn further away is no longer this particle's to speak for
+    return radius
+
+
+@ti.func
+def contact_ceiling(skin: ti.template(), row, nx, ny):
+    """Height of the highest surface node [mm], at least 0: the spline stays below it, and what is above touches not."""
+    highest = 0.0
+    for i in range(1, nx + 2):
+        for j in range(1, ny + 2):
+            height = skin[skin_at(row + i, j, ny) + 2]
+            highest = ti.select(height > highest, height, highest)
+    return highest
+
+
+@ti.func
+def particle_contact(
+    env, part, g, x, v, memory, radius, skin: ti.template(), row, touch: ti.template(), pushed, params: ti.template(),
+    layers, nx, ny, partial: ti.template(),
+):  # fmt: skip
+    """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
+
+    x, v: position, and velocity relative to the moving sensor. memory: elastic slip, and the multiplier as the overlap
+    whose penalty it equals [mm]. Returns touching, whether the housing, force, new memory.
+    """
+    h, k_n, dt = params[env, GEL_SPACING], params[env, STIFFNESS], params[env, STEP]
+    mu, housing = params[env, FRICTION + g], params[env, HOUSING]
+    deepest = params[env, BODY_CELL]  # two particle spacings: the largest overlap answered in full
+    touching, housed = False, False
+    force = vec3(0.0)
+    slip = vec3(memory[0], memory[1], memory[2])
+    taken = memory[3]
+    moved = vec2(0.0)
+    overlap = 0.0
+    reach = 2.2 * 0.5 * h
+    c_n = CONTACT_DAMPING * k_n * dt
+    if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
+        start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved
+        last = start - vec2(memory[4], memory[5]) / h
+        a = vec2(ti.max(0.0, ti.min(last[0], nx)), ti.max(0.0, ti.min(last[1], ny)))
+        i, wx, dx = spline(a[0])
+        j, wy, dy = spline(a[1])
+        us, t1, t2 = skin_sums(skin, row, i, j, wx, wy, dx / h, dy / h, ny)
+        t1[0] += 1.0
+        t2[1] += 1.0
+        step = newton_step(t1, t2, start - a - vec2(us[0], us[1]) / h)
+        a += step
+        moved = h * (start - a)
+        inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
+        if inside:
+            depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
+            if depth + taken > 0.0:
+                vs = skin_sum(skin, row + nx + 3, i, j, wx, wy, ny)
+                n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
+                gap = depth * n[2]  # overlap; negative where they have parted
+                if gap > deepest:  # an overlap found late must not explode; counted
+                    gap = deepest
+                    note_more(partial, env, slot_of(part), CAPPED, 1.0)
+                vr = v - vec3(vs[0], vs[1], vs[2])
+                vn = vr.dot(n)
+                fn = ti.max(k_n * (gap + taken) - c_n * vn, 0.0)
+                taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
+                ft, slip = friction(slip, n, vr - vn * n, fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
+                force = fn * n + ft
+                touching = True
+                overlap = gap
+                back = vec4(force[0], force[1], force[2], 0.0)
+                for p, q in ti.static(ti.ndrange(3, 3)):
+                    node = surface_node(i + p, j + q, nx, ny)
+                    add_four(touch, pushed + 4 * node, -(wx[p] * wy[q]) * back)
+        elif housing >= 0.0:
+            gap = radius - housing - x[2]
+            if gap + taken > 0.0:
+                if gap > deepest:
+                    gap = deepest
+                    note_more(partial, env, slot_of(part), CAPPED, 1.0)
+                n = vec3(0.0, 0.0, 1.0)
+                fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)
+                taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
+                ft, slip = friction(slip, n, vec3(v[0], v[1], 0.0), fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
+                force = fn * n + ft
+                touching, housed = True, True
+                overlap = gap
+    kept = Kept([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
+    if touching:
+        kept = Kept([slip[0], slip[1], slip[2], taken, moved[0], moved[1]])
+        note_most(partial, env, slot_of(part), OVERLAP, overlap)
+    return touching, housed, force, kept

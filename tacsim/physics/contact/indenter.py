@@ -1,0 +1,208 @@
+"""A rigid indenter on the gel surface: signed distance, and contact by area-weighted quadrature on the surface.
+
+Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penalty plus a multiplier that remembers
+(augmented Lagrangian, Simo & Laursen 1992), so that at rest nothing overlaps; friction remembers its elastic slip.
+Everything is in the sensor frame [mm, MPa].
+"""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.contact.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, skin_sum, spline, surface_node
+from tacsim.physics.exec.lanes import ON_DEVICE, add_four, copy_of, note_most, note_sum, part_range, slot_of, vec3, vec4
+from tacsim.physics.exec.layout import (
+    FORCE,
+    FRICTION,
+    GEL_SPACING,
+    KIND,
+    OVERLAP,
+    SHAPE,
+    SHAPE_FIRST,
+    SHAPE_NODES,
+    SHAPE_ORIGIN,
+    SHAPE_SPACING,
+    STEP,
+    STIFFNESS,
+)
+from tacsim.physics.gel.gel import skin_at, skin_row, touch_start
+
+Slip = ti.types.ndarray(dtype=vec3, ndim=3)
+Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
+Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
+
+SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
+POINTS = 3  # quadrature points along one edge of a surface cell
+FAR = 1e9
+FAR_CELL = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
+MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
+
+
+@ti.func
+def corner_distance(d, sign):
+    """Distance and gradient of the region where all of d <= 0; sign: direction of each axis."""
+    outside = ti.max(d, 0.0)
+    length = outside.norm()
+    n = vec3(0.0)
+    phi = length
+    if length > 0.0:
+        n = outside / length
+    else:
+        phi = ti.max(d[0], d[1], d[2])
+        if d[0] == phi:
+            n = vec3(1.0, 0.0, 0.0)
+        elif d[1] == phi:
+            n = vec3(0.0, 1.0, 0.0)
+        else:
+            n = vec3(0.0, 0.0, 1.0)
+    return phi, n * sign
+
+
+@ti.func
+def direction(y):
+    s = vec3(1.0)
+    for d in ti.static(range(3)):
+        if y[d] < 0.0:
+            s[d] = -1.0
+    return s
+
+
+@ti.func
+def box_distance(size, y):
+    """Distance and outward normal of a box of half extents `size`."""
+    return corner_distance(ti.abs(y) - size, direction(y))
+
+
+@ti.func
+def signed_distance(env, kind, size, y, values: ti.template(), first, nodes, origin, spacing):
+    """Distance from the indenter's surface (negative inside) and its outward normal, at y in the indenter's frame.
+
+    size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; of a mesh half extents of
+    its bounding box. first, nodes, origin, spacing: of this environment's distance grid, of which `values` has `nodes`
+    from number `first` on along each axis; the world keeps at hand what can touch (`PressState.cover`).
+    """
+    phi, n = FAR, vec3(0.0, 0.0, 1.0)
+    if kind == SPHERE:
+        r = y.norm()
+        phi = r - size[0]
+        n = y / ti.max(r, 1e-12)
+    elif kind == BOX:
+        phi, n = box_distance(size, y)
+    elif kind == CYLINDER:
+        r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
+        phi, radial = corner_distance(vec3(r - size[0], -FAR, ti.abs(y[2]) - size[2]), vec3(1.0))
+        n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])
+    else:
+        at = (y - origin) / spacing
+        whole = ti.floor(at)
+        cell, w = whole.cast(ti.i32) - first, at - whole
+        known = True
+        for d in ti.static(range(3)):
+            known = known and cell[d] >= 0 and cell[d] < nodes[d] - 1
+        if known:
+            phi = 0.0
+            n = vec3(0.0)
+            for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
+                wx, wy, wz = (w[0] if a else 1.0 - w[0]), (w[1] if b else 1.0 - w[1]), (w[2] if c else 1.0 - w[2])
+                value = values[env, cell[0] + a, cell[1] + b, cell[2] + c]
+                phi += value * wx * wy * wz
+                n += value * vec3((2 * a - 1) * wy * wz, (2 * b - 1) * wx * wz, (2 * c - 1) * wx * wy)
+            n = n / ti.max(n.norm(), 1e-12)
+    return phi, n
+
+
+@ti.func
+def indent(
+    env, part, it, drive: ti.template(), skin: ti.template(), touch: ti.template(), slip: ti.template(),
+    pressure: ti.template(), values: ti.template(), params: ti.template(), counts: ti.template(),
+    partial: ti.template(), nx, ny,
+):  # fmt: skip
+    """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
+
+    drive: pose and velocity of the indenter in the sensor frame; slip, pressure: memory of each quadrature point.
+    """
+    h, k_n, mu, dt = params[env, GEL_SPACING], params[env, STIFFNESS], params[env, FRICTION], params[env, STEP]
+    kind, size = counts[env, KIND], vec3(params[env, SHAPE], params[env, SHAPE + 1], params[env, SHAPE + 2])
+    grid_origin = vec3(params[env, SHAPE_ORIGIN], params[env, SHAPE_ORIGIN + 1], params[env, SHAPE_ORIGIN + 2])
+    grid_spacing = params[env, SHAPE_SPACING]
+    nodes = ti.Vector([counts[env, SHAPE_NODES], counts[env, SHAPE_NODES + 1], counts[env, SHAPE_NODES + 2]])
+    first_node = ti.Vector([counts[env, SHAPE_FIRST], counts[env, SHAPE_FIRST + 1], counts[env, SHAPE_FIRST + 2]])
+    rows = [vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(6)]
+    rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
+    area = h * h / (POINTS * POINTS)
+    c_n = CONTACT_DAMPING * k_n * dt
+    back = rotate.transpose()
+    total, moment = vec3(0.0), vec3(0.0)
+    deepest = 0.0
+    row, pushed = skin_row(env, 1, 0, nx), touch_start(env, copy_of(part), 1, 0, nx, ny)
+    first_cell, last_cell, low, high = 0, 0, 0, ny
+    if ti.static(ON_DEVICE):
+        first_cell, low = part // ny, part % ny
+        last_cell, high = first_cell + 1, low + 1
+    else:
+        first_cell, last_cell = part_range(nx, part)
+    for cell_i in range(first_cell, last_cell):
+        for cell_j in range(low, high):
+            # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh,
+            # whose distances are true only near it, that of its bounding box. A distance grows no faster than the way,
+            # and no point of the cell is farther from its middle than two elements.
+            middle = vec3(0.0)
+            for p, q in ti.static(ti.ndrange(2, 2)):
+                node = skin_at(row + cell_i + p + 1, cell_j + q + 1, ny)
+                middle += 0.25 * vec3(skin[node], skin[node + 1], skin[node + 2])
+            at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
+            at += middle
+            far = 0.0
+            if kind == GRID:
+                far, _ = box_distance(size, back @ (at - centre))
+            else:
+                far, _ = signed_distance(
+                    env, kind, size, back @ (at - centre), values, first_node, nodes, grid_origin, grid_spacing
+                )
+            if far > FAR_CELL * h:
+                # Nothing passes this margin in one substep, so what is beyond has forgotten.
+                if far < (FAR_CELL + 1) * h:
+                    for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
+                        slip[env, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
+                        pressure[env, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
+            else:
+                for point in range(POINTS * POINTS):
+                    i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
+                    a, b = (i + 0.5) / POINTS, (j + 0.5) / POINTS
+                    first_i, wx, _dx = spline(a)
+                    first_j, wy, _dy = spline(b)
+                    us = skin_sum(skin, row, first_i, first_j, wx, wy, ny)
+                    vs = skin_sum(skin, row + nx + 3, first_i, first_j, wx, wy, ny)
+                    x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
+                    phi, n_local = signed_distance(
+                        env, kind, size, back @ (x - centre), values, first_node, nodes, grid_origin, grid_spacing
+                    )
+                    touching = False
+                    if phi < 0.5 * h:
+                        n = rotate @ n_local  # out of the indenter: pushes the gel
+                        moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
+                        closing = moving.dot(n)
+                        normal = pressure[env, i, j] - k_n * phi + c_n * closing
+                        if normal > 0.0:
+                            touching = True
+                            ft, memory = friction(
+                                slip[env, i, j], n, moving - closing * n, normal, TANGENT_STIFFNESS * k_n, c_n, mu, dt
+                            )
+                            slip[env, i, j] = memory
+                            pressure[env, i, j] = ti.max(pressure[env, i, j] - MULTIPLIER_RATE * k_n * phi, 0.0)
+                            force = area * (normal * n - ft)
+                            total += force
+                            moment += x.cross(force)
+                            deepest = ti.max(deepest, -phi)
+                            push = vec4(force[0], force[1], force[2], 0.0)
+                            for p, q in ti.static(ti.ndrange(3, 3)):
+                                node = surface_node(first_i + p, first_j + q, nx, ny)
+                                add_four(touch, pushed + 4 * node, (wx[p] * wy[q]) * push)
+                    if not touching:
+                        slip[env, i, j] = vec3(0.0)
+                        pressure[env, i, j] = 0.0
+    slot = slot_of(part)
+    if ti.static(ON_DEVICE):
+        note_most(partial, env, slot, OVERLAP, deepest)
+    else:
+        partial[env, part, OVERLAP] = deepest
+    for d in ti.static(range(3)):
+        note_sum(partial, env, slot, FORCE + d, total[d])
+        note_sum(partial, env, slot, FORCE + 3 + d, moment[d])

@@ -1,0 +1,201 @@
+"""Eight of everything at once: how kernels are laid out so that the CPU works on whole vectors.
+
+Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
+side by side, starting from stores to neighbouring addresses that it has seen before. Hence arrays keep one number of
+eight neighbours (particles, elements, nodes; `real`) side by side, and `keep_or` stores in the way that is recognised.
+
+Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
+a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
+
+On a device (a GPU) the same functions run with one lane, and a part is a single thing, a particle or a node with a
+thread of its own; there is one copy, and what is scattered is added atomically. The switch is ON_DEVICE, known when a
+kernel is compiled.
+"""
+
+import math
+
+import numpy as np
+
+from tacsim.compute.runtime import DEVICE, ti
+
+ON_DEVICE = DEVICE != "cpu"
+LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
+PARTS = 4  # of an environment's work on the CPU; of its sums everywhere
+CACHE_LINE = 16  # floats
+MOST = 2**30  # numbers in an array that kernels take
+COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
+
+NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
+
+vec2 = ti.types.vector(2, ti.f32)
+vec3 = ti.types.vector(3, ti.f32)
+vec4 = ti.types.vector(4, ti.f32)
+real = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
+strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
+
+Params = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, facts)
+Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, counts)
+Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, numbers)
+
+
+def padded(n: int) -> int:
+    """n rounded up to whole lanes."""
+    return -(-n // LANES) * LANES
+
+
+def aligned_zeros(*shape: int) -> np.ndarray:
+    """float32 zeros that begin at a cache line, so that no vector register's worth of them lies across two.
+
+    Raises MemoryError for more than kernels can count (see `small`): 4 GB.
+    """
+    count = math.prod(shape)
+    if count > MOST:
+        raise MemoryError(
+            f"an array of {count:,} numbers, kernels count to {MOST:,}: use a coarser preset, or fewer worlds a batch"
+        )
+    memory = np.zeros(count + CACHE_LINE, np.float32)
+    start = -memory.ctypes.data // 4 % CACHE_LINE
+    return memory[start : start + count].reshape(shape)
+
+
+@ti.func
+def keep_or(never, old, new):
+    """new; `old` in words only (never is 0, which the compiler can't know): a value stored over the one just read."""
+    if ti.static(ON_DEVICE):
+        return new
+    else:
+        return ti.bit_cast(ti.bit_cast(new, ti.i32) | (ti.bit_cast(old, ti.i32) & never), ti.f32)
+
+
+@ti.func
+def opaque(never, index):
+    """index. The compiler takes a sum of several indices apart, and lanes behind it are no neighbours any more."""
+    return index | never
+
+
+@ti.func
+def small(index, width: ti.template()):
+    """index, of things of `width` numbers. That it is neither negative nor large lets the compiler see which numbers
+    behind it are neighbours."""
+    if ti.static(ON_DEVICE):
+        return index
+    else:
+        return index & (MOST // width - 1)
+
+
+@ti.func
+def lanes_at(array: ti.template(), at):
+    """LANES neighbours, from any place on."""
+    start = small(at, 1)
+    return real([array[start + lane] for lane in range(LANES)])
+
+
+@ti.func
+def put_lanes(array: ti.template(), at, values, never):
+    start = small(at, 1)
+    kept = real([keep_or(never, array[start + lane], values[lane]) for lane in range(LANES)])
+    for lane in ti.static(range(LANES)):
+        array[start + lane] = kept[lane]
+
+
+@ti.func
+def least_lane(rows: ti.template(), row: ti.template()):
+    """Smallest number of a row of lanes."""
+    least = rows[row, 0]
+    for lane in ti.static(range(1, LANES)):
+        least = ti.min(least, rows[row, lane])
+    return least
+
+
+@ti.func
+def first_of(count, part, parts):
+    """Where share `part` of `count` things begins; it ends where the next begins."""
+    return count * part // parts
+
+
+@ti.func
+def part_range(count, part):
+    """First of `count` things that a part does, and the one after its last; on a device a part is one thing."""
+    if ti.static(ON_DEVICE):
+        return part, part + 1
+    else:
+        return first_of(count, part, PARTS), first_of(count, part + 1, PARTS)
+
+
+@ti.func
+def slot_of(part):
+    """Where in `partial` a part notes its sums."""
+    if ti.static(ON_DEVICE):
+        return part % PARTS
+    else:
+        return part
+
+
+@ti.func
+def copy_of(part):
+    """Which copy a part scatters into."""
+    if ti.static(ON_DEVICE):
+        return 0
+    else:
+        return part
+
+
+@ti.func
+def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
+    """Adds to one entry of what a part scatters into."""
+    if ti.static(ON_DEVICE):
+        ti.atomic_add(array[at], value)
+    else:
+        array[at] = array[at] + value
+
+
+@ti.func
+def add_four(array: ti.template(), at, value):
+    """Adds to four neighbours of what a part scatters into."""
+    for c in ti.static(range(4)):
+        if ti.static(ON_DEVICE):
+            ti.atomic_add(array[at + c], value[c])
+        else:
+            array[at + c] = array[at + c] + value[c]
+
+
+# What a part notes in `partial`. On the CPU a slot has one writer. On a device it has many, so a sum starts from a zero
+# that the launch's kernel has put there, and what changes nothing is not written, since that would only stand in line.
+
+
+@ti.func
+def note_sum(partial: ti.template(), env, slot, number, value):
+    """The part's whole sum of one substep."""
+    if ti.static(ON_DEVICE):
+        if value != 0.0:  # true of what is not a number
+            ti.atomic_add(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] = value
+
+
+@ti.func
+def note_more(partial: ti.template(), env, slot, number, value):
+    """What is added over a launch."""
+    if ti.static(ON_DEVICE):
+        if value != 0.0:
+            ti.atomic_add(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] += value
+
+
+@ti.func
+def note_least(partial: ti.template(), env, slot, number, value):
+    if ti.static(ON_DEVICE):
+        if value < partial[env, slot, number]:
+            ti.atomic_min(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] = ti.min(partial[env, slot, number], value)
+
+
+@ti.func
+def note_most(partial: ti.template(), env, slot, number, value):
+    if ti.static(ON_DEVICE):
+        if value > partial[env, slot, number]:
+            ti.atomic_max(partial[env, slot, number], value)
+    else:
+        partial[env, slot, number] = ti.max(partial[env, slot, number], value)

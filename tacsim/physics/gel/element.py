@@ -1,0 +1,83 @@
+"""The gel's element: a trilinear hexahedron with one-point quadrature and hourglass stiffness (Flanagan & Belytschko
+1981), neo-Hookean. LANES neighbours at once, laid out as in tacsim/physics/body/transfers.py."""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.body.material import lanes_log1p
+from tacsim.physics.exec.lanes import LANES, lanes_at, opaque, put_lanes, real, vec3
+from tacsim.physics.exec.layout import GEL_LAMBDA, GEL_MU, GEL_SPACING
+
+HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
+SMALLEST_STRETCH = 0.05  # J below this counts as inverted
+
+# Rows of an element block's own array: displacements of eight corners, axis by axis, then the forces on them;
+WHOLE = 24  # 1 if the element is inside the gel, else 0
+SMALLEST = 25  # det F so far
+ROWS = 26
+
+
+@ti.func
+def fill(rows: ti.template(), row, values):
+    """One number of all lanes."""
+    for lane in ti.static(range(LANES)):
+        rows[row, lane] = values[lane]
+
+
+@ti.func
+def element_block(
+    env, u, axis, layer, to, row, block, nodes: ti.template(), across_j, across_i, corners: ti.template(),
+    lattice: ti.template(), params: ti.template(), rows: ti.template(), never,
+):  # fmt: skip
+    """Forces of LANES elements on their corners; notes the smallest det F of each lane in row SMALLEST.
+
+    u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
+    where the forces go, `row` the way to the next corner or axis; across_j, across_i: the way to the next node.
+    """
+    h, mu, lam = params[env, GEL_SPACING], params[env, GEL_MU], params[env, GEL_LAMBDA]
+    quarter = 0.25 / h
+    for d in range(3):  # not unrolled here: kernels of more statements compile for much longer
+        for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
+            at = u + d * axis + k * layer + j * across_j + i * across_i
+            fill(rows, 8 * d + 4 * i + 2 * j + k, lanes_at(nodes, at))
+    fill(rows, WHOLE, lattice[opaque(never, block)])
+    for lane in range(LANES):
+        whole = rows[WHOLE, lane]
+        area, stiffness = (0.25 * h * h) * whole, (HOURGLASS * 2.0 * mu * h / 8.0) * whole
+        # columns of F; hourglass forces of the modes s_x s_y, s_y s_z, s_x s_z, s_x s_y s_z
+        fx, fy, fz = vec3(1.0, 0.0, 0.0), vec3(0.0, 1.0, 0.0), vec3(0.0, 0.0, 1.0)
+        hxy, hyz, hxz, hxyz = vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0)
+        for d in ti.static(range(3)):
+            a, b, c, e = rows[8 * d, lane], rows[8 * d + 1, lane], rows[8 * d + 2, lane], rows[8 * d + 3, lane]
+            p, q, r, s = rows[8 * d + 4, lane], rows[8 * d + 5, lane], rows[8 * d + 6, lane], rows[8 * d + 7, lane]
+            # sums and differences along z, then y, then x
+            az, cz, pz, rz = b + a, e + c, q + p, s + r
+            aw, cw, pw, rw = b - a, e - c, q - p, s - r
+            left, right, left_y, right_y = cz + az, rz + pz, cz - az, rz - pz
+            left_z, right_z, left_yz, right_yz = cw + aw, rw + pw, cw - aw, rw - pw
+            fx[d] += quarter * (right - left)
+            fy[d] += quarter * (left_y + right_y)
+            fz[d] += quarter * (left_z + right_z)
+            hxy[d] = stiffness * (right_y - left_y)
+            hyz[d] = stiffness * (left_yz + right_yz)
+            hxz[d] = stiffness * (right_z - left_z)
+            hxyz[d] = stiffness * (right_yz - left_yz)
+        x, y, z = fy.cross(fz), fz.cross(fx), fx.cross(fy)  # columns of the cofactor matrix
+        jacobian = fx.dot(x)
+        safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
+        # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
+        pressure = (lam * lanes_log1p(safe - 1.0) - mu) / safe
+        rows[SMALLEST, lane] = ti.min(rows[SMALLEST, lane], ti.select(whole > 0.0, jacobian, 1.0))
+        for d in ti.static(range(3)):
+            px = area * (mu * fx[d] + pressure * x[d])
+            py = area * (mu * fy[d] + pressure * y[d])
+            pz = area * (mu * fz[d] + pressure * z[d])
+            # on corner (s_x, s_y, s_z) = -(s_x p_x + s_y p_y + s_z p_z + s_x s_y h_1 + ...), by halves: first y and z
+            near, far = pz - hyz[d], pz + hyz[d]  # s_y = -1, 1
+            left, right = px - hxy[d], px + hxy[d]
+            skew_left, skew_right = hxz[d] - hxyz[d], hxz[d] + hxyz[d]
+            yz = [py + near, py - near, far - py, -far - py]  # 00, 01, 10, 11
+            odd = [left - skew_left, left + skew_left, right - skew_right, right + skew_right]
+            for k in ti.static(range(4)):
+                rows[3 * k + d, lane] = yz[k] + odd[k]
+                rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
+    for r in range(24):
+        put_lanes(corners, to + r * row, real([rows[r, lane] for lane in range(LANES)]), never)

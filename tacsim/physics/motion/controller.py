@@ -1,0 +1,229 @@
+"""The quasi-static controller: ramped motion of driven frames, then a hold until the measured residual is small.
+
+Materials are rate-independent, so only the path counts (tacsim.physics.motion.path says which); the hold waits for what
+still moves at its end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.models.scene import Settling
+from tacsim.physics.failure.health import Place, SimulationDiverged, State
+from tacsim.physics.motion.path import MM, Path
+from tacsim.physics.worlds.world import MoveStats
+
+PIECE = 20  # substeps of one launch on the way
+LOOKS = 2  # earlier looks that a look is compared with: one alone may meet the same phase of what rings
+FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
+
+
+def force_floor(modulus: float, thickness: float) -> float:
+    """The smallest force [N] that residuals are relative to, of a gel with Young's modulus [MPa] and thickness [mm]."""
+    return FLOOR * modulus * thickness**2
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """By which numbers a launch was advanced."""
+
+    step: float = 0.0  # time step [mm, wave speed 1]
+    damping: float = 0.0  # of the gel: its rate times the wave's time through it [-]
+    courant: float = 0.0  # see tacsim.physics.failure.health.Health
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
+
+    moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
+    load: external force on the body besides contact, world axes; None is none.
+    torque: of all contact on a free body about its centre, world axes, over half the gel's width [N].
+    """
+
+    contact: NDArray[np.float64]  # (gels, 3)
+    backing: NDArray[np.float64]  # (gels, 3)
+    floor: float  # [N] residuals are relative to at least this
+    overlap: float  # [mm]
+    guard_hits: int
+    moment: NDArray[np.float64] | None = None  # (gels, 3)
+    load: NDArray[np.float64] | None = None  # (3,) of the body from elsewhere: its weight
+    torque: NDArray[np.float64] | None = None  # (3,)
+    scheme: Scheme = Scheme()
+    gel_overlap: float = 0.0  # of the gels with one another [mm]
+
+
+def residual(now: Reading, before: Reading, balanced: bool) -> float:
+    """Largest imbalance of forces or moments, or their change since `before`, relative to the largest force [-].
+
+    `balanced`: the contact forces on all gels must add up to the body's load, zero without weight (a free body), and
+    turn it nowhere.
+    """
+    scale = max(float(np.abs(now.contact).max()), now.floor)
+    parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
+    if now.moment is not None and before.moment is not None:  # a twist settles later than the forces
+        parts.append(np.abs(now.moment - before.moment).max())
+    if balanced:
+        load = 0.0 if now.load is None else now.load
+        parts.append(np.abs(now.contact.sum(axis=0) - load).max())
+        if now.torque is not None:
+            parts.append(np.abs(now.torque).max())
+    return float(max(parts)) / scale
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What a motion wants next: substeps first..last of a path, then a Reading."""
+
+    path: Path
+    first: int
+    last: int
+
+    @property
+    def held(self) -> bool:
+        """Nothing is driven any more."""
+        return self.path.substeps == 0
+
+    @property
+    def flowing(self) -> bool:
+        """Of a motion that flows into the next."""
+        return self.path.rates is not None
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A launch that one environment is ready for: its grid is laid and its numbers are set."""
+
+    launch: Launch
+    drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel
+    where: Place
+    good: State  # the environment's arrays before it
+
+
+class Kernels(Protocol):
+    """The arrays of some environments, and the kernel that advances them."""
+
+    def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
+        """One launch: every environment named goes along its own drive, however long; all others rest."""
+        ...
+
+
+class Environment(Protocol):
+    """A world as one environment of such arrays."""
+
+    def prepare(self, launch: Launch) -> Prepared:
+        """Sets everything of this environment for the launch. Raises SimulationDiverged if it cannot be done."""
+        ...
+
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        ...
+
+
+# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the Reading at its end, or
+# thrown the SimulationDiverged that the launch ended in. So whoever advances many worlds in one launch of kernels holds
+# one motion for each, all at their own phases; `run` is that for a single world.
+Motion = Generator[Launch, Reading, MoveStats]
+
+
+def run(motion: Motion, advance: Callable[[Path, int, int], Reading]) -> MoveStats:
+    """Runs one world's motion to its end. A motion cut short (an interruption, say) is closed, so it rolls back."""
+    try:
+        wanted = next(motion)
+        while True:
+            try:
+                reading = advance(wanted.path, wanted.first, wanted.last)
+            except SimulationDiverged as failure:
+                wanted = motion.throw(failure)
+            else:
+                wanted = motion.send(reading)
+    except StopIteration as end:
+        stats: MoveStats = end.value
+        return stats
+    finally:
+        motion.close()
+
+
+def advance_all(
+    kernels: Kernels, environments: Sequence[Environment], wanted: Mapping[int, Launch]
+) -> dict[int, Reading | SimulationDiverged]:
+    """One launch of kernels for all environments that want one; what each came to, a failure in its own place only."""
+    results: dict[int, Reading | SimulationDiverged] = {}
+    ready: dict[int, Prepared] = {}
+    for index, launch in wanted.items():
+        try:
+            ready[index] = environments[index].prepare(launch)
+        except SimulationDiverged as failure:
+            results[index] = failure
+    if ready:
+        kernels.advance({index: prepared.drive for index, prepared in ready.items()})
+    for index, prepared in ready.items():
+        try:
+            results[index] = environments[index].outcome(prepared)
+        except SimulationDiverged as failure:
+            results[index] = failure
+    return results
+
+
+def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
+    seen = yield from _driven(path)
+    rest = replace(path, start=path.end, substeps=0, rates=None)
+    held, worst = 0, math.inf
+    while held < settling.max_substeps:
+        count = min(path.look, settling.max_substeps - held)
+        seen.append((yield Launch(rest, 0, count)))
+        held += count
+        if len(seen) > LOOKS:
+            worst = max(residual(seen[-1], earlier, balanced) for earlier in seen[-1 - LOOKS : -1])
+            if worst <= settling.tolerance:
+                break
+    return _stats(seen, path.substeps, held, worst, settling)
+
+
+def move_in_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path` and holds nowhere; the residual says how far from rest the scene is at the end."""
+    seen = yield from _driven(path)
+    worst = residual(seen[-1], seen[-2], balanced) if len(seen) > 1 else math.inf
+    return _stats(seen, path.substeps, 0, worst, settling)
+
+
+def move_on(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+    """Goes along `path`, whose end is no rest; the residual is the imbalance of forces there."""
+    if not path.substeps:
+        return (yield from move_and_settle(path, settling, balanced=balanced))
+    seen = yield from _driven(path)
+    stats = _stats(seen, path.substeps, 0, residual(seen[-1], seen[-1], balanced), settling)
+    return replace(stats, settled=False)
+
+
+def come_to_rest(path: Path, motion: Motion) -> Motion:
+    """Goes along `path`, then does `motion`."""
+    yield from _driven(path)
+    stats = yield from motion
+    return replace(stats, substeps=path.substeps + stats.substeps)
+
+
+def _driven(path: Path) -> Generator[Launch, Reading, list[Reading]]:
+    seen: list[Reading] = []
+    for first in range(0, path.substeps, PIECE):
+        seen.append((yield Launch(path, first, min(first + PIECE, path.substeps))))
+    return seen
+
+
+def _stats(seen: Sequence[Reading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
+    overlap = seen[-1].overlap / MM if seen else 0.0
+    hits = sum(reading.guard_hits for reading in seen)
+    last = seen[-1].scheme if seen else Scheme()
+    return MoveStats(
+        substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
+        time_step=last.step / MM, damping=last.damping,
+        courant=max((reading.scheme.courant for reading in seen), default=0.0),
+        gel_overlap=seen[-1].gel_overlap / MM if seen else 0.0,
+    )  # fmt: skip

@@ -1,0 +1,80 @@
+"""How a scene answers to forces: as fast as can be (scaled densities, damped), or as it truly would (in real time).
+
+Quasi-static motions only want the state of rest, so each material gets the density at which its pressure wave travels
+at speed 1, and is damped. A motion of given duration is dynamic: densities are the materials' own, nothing is damped
+but by plastic flow, friction and the contact's dashpots. Kernel units stay mm and MPa; the gel's pressure wave keeps
+speed 1, so a kernel time of 1 mm is the time that this wave truly needs for 1 mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from tacsim.interface import Pose
+from tacsim.physics.gel.gel import MM, MPA, GelParams
+from tacsim.physics.motion.controller import Launch
+from tacsim.physics.motion.path import MOST, PEAK, ROUNDING, Path, longest_way
+from tacsim.physics.worlds.world import is_number
+
+FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """The entries of the array `facts` (tacsim.physics.exec.layout) by which a scene answers to forces, and its
+    time."""
+
+    params: Mapping[int, float]
+    step: float  # nominal substep [mm]
+    second: float = math.nan  # kernel time of one second [mm]; quasi-static motions have no real time
+    held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven any more
+    flowing: Mapping[int, float] = field(default_factory=dict)  # and those of motions that flow into one another
+
+    def entries(self, launch: Launch | None = None) -> dict[int, float]:
+        """The entries for a launch; None: while something is driven."""
+        if launch is None:
+            return dict(self.params)
+        return {**self.params, **(self.held if launch.held else self.flowing if launch.flowing else {})}
+
+    @property
+    def true(self) -> bool:
+        return math.isfinite(self.second)
+
+
+def kernel_second(gel: GelParams, density: float) -> float:
+    """Kernel time of one second [mm]: how far the pressure wave of a gel of `density` [kg/m^3] truly travels."""
+    return math.sqrt(gel.density / MPA / density) * MM
+
+
+def kernel_density(density: float, second: float) -> float:
+    """`density` [kg/m^3] in kernel units [MPa], where a second lasts `second` [mm]: rho c^2."""
+    return density * (second / MM) ** 2 * MPA
+
+
+def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
+    """The path of a dynamic motion; `lever` [mm]: see `longest_way`.
+
+    Raises ValueError for a duration [s] that is not positive, that has far too many substeps or nothing of one, or in
+    which the fastest frame would race the gel's own waves; TypeError for what is no number.
+    """
+    if not is_number(duration):
+        raise TypeError(f"duration must be a number [s], or None for a quasi-static motion; found {duration!r}")
+    if not (math.isfinite(duration) and duration > 0):
+        raise ValueError(f"duration is {duration:g} s: give a positive time, or None for a quasi-static motion")
+    substep = inertia.step / inertia.second
+    if not ROUNDING <= duration / substep <= MOST:
+        raise ValueError(
+            f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (the materials say so) it must lie between "
+            f"{ROUNDING * substep:.3g} and {MOST * substep:.3g} s: is it in seconds? if so, make several motions of it"
+        )
+    kernel_time, wave = duration * inertia.second, inertia.second / MM
+    peak = PEAK * longest_way(start, end, lever) / kernel_time
+    if peak > FASTEST_DRIVE:
+        raise ValueError(
+            f"within {duration:.3g} s a frame would reach {peak * wave:.3g} m/s; the limit is {FASTEST_DRIVE:g} of the "
+            f"gel's wave speed, {FASTEST_DRIVE * wave:.3g} m/s: give at least {duration * peak / FASTEST_DRIVE:.3g} s"
+        )
+    substeps = math.ceil(kernel_time / inertia.step)
+    return Path(start, end, substeps, kernel_time / substeps)

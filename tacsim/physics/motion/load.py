@@ -1,0 +1,152 @@
+"""Motion at a constant normal load: a sensor follows its target but along its own z axis, where its force is held.
+
+The way is cut into pieces, each a settled motion; after each the sensor moves along its z until the force is right, by
+the secant of the last two settled states (the first steps are short, for the stiffness is not known yet).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import Pose
+from tacsim.models.scene import Scene
+from tacsim.physics.motion.controller import Launch, Motion, Reading, move_and_settle
+from tacsim.physics.motion.path import Path
+from tacsim.physics.worlds.world import MoveStats, is_number
+
+# All as shares of the gel's thickness
+PIECE = 0.06  # longest way between two corrections
+STEP = 0.025  # longest correction
+TRAVEL = 0.6  # furthest from the target along z; beyond, the load counts as out of reach
+LEAST = 1e-3  # load that the tolerance is relative to at least, as a share of E thickness^2
+CORRECTIONS = 60  # after one piece
+
+
+class LoadNotReached(RuntimeError):
+    """A load that a sensor's travel along its z axis does not bring about. The world is as it was before the motion."""
+
+
+class Loadable(Protocol):
+    """What a motion at constant load needs of a world."""
+
+    scene: Scene
+
+    @property
+    def sensors(self) -> tuple[str, ...]: ...
+    def wrench(self, name: str) -> NDArray[np.float64]: ...
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path: ...
+
+
+def require_loads(loads: Mapping[str, float], sensors: Sequence[str]) -> None:
+    """Raises KeyError for what is no sensor, ValueError for a load that is negative or not finite, and TypeError."""
+    if not isinstance(loads, Mapping):
+        raise TypeError(f"loads are forces [N] by the names of sensors ({', '.join(sensors)}), found {loads!r}")
+    for name, load in loads.items():
+        if name not in sensors:
+            raise KeyError(f"no sensor '{name}' to hold a load; this world has {', '.join(sensors)}")
+        if not is_number(load):
+            raise TypeError(f"load of '{name}' must be a number [N], found {load!r}")
+        if not (math.isfinite(load) and load >= 0.0):
+            raise ValueError(f"load of '{name}' is {load:g} N; give 0 or more (positive = pressed)")
+
+
+@dataclass
+class _Axis:
+    """One sensor's z: the load wanted [N], travel from the target along z [m], and the settled state before."""
+
+    wanted: float
+    tolerance: float  # [N]
+    travel: float = 0.0
+    before: tuple[float, float] | None = None  # travel, force
+
+    def step(self, force: float, longest: float) -> float:
+        """The next correction [m]; positive = press."""
+        error = self.wanted - force
+        step = math.copysign(longest, error)
+        if self.before is not None and self.travel != self.before[0]:
+            stiffness = (force - self.before[1]) / (self.travel - self.before[0])
+            if stiffness > 0.0:
+                step = max(-longest, min(longest, error / stiffness))
+        if self.wanted == 0.0:  # a force fades towards nothing ever more slowly: go on until they part
+            step = min(step, -longest / 4)
+        self.before = self.travel, force
+        self.travel += step
+        return step
+
+
+def keep_loads(
+    world: Loadable, start: Mapping[str, Pose], end: dict[str, Pose], loads: Mapping[str, float], refine: int, *,
+    balanced: bool,
+) -> Motion:  # fmt: skip
+    """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion came to.
+
+    Before they touch, sensors go straight to their targets. Raises LoadNotReached.
+    """
+    scene, targets = world.scene, dict(end)
+    thickness = scene.gel.size[2]
+    least = LEAST * scene.gel.material.youngs_modulus * thickness**2
+    axes = {name: _Axis(load, scene.settling.tolerance * max(load, least)) for name, load in loads.items()}
+    done: list[MoveStats] = []
+
+    def force(name: str) -> float:
+        return 0.0 - float(world.wrench(name)[2])  # never -0
+
+    def go(share: float) -> Generator[Launch, Reading, None]:
+        poses = {name: _between(start[name], target, share) for name, target in targets.items()}
+        for name, axis in axes.items():
+            z = Rotation.from_quat(poses[name].quaternion).as_matrix()[:, 2]
+            poses[name] = Pose(poses[name].position + axis.travel * z, poses[name].quaternion)
+        path = replace(world.plan(list(end.values()), list(poses.values())), refine=refine)
+        done.append((yield from move_and_settle(path, scene.settling, balanced=balanced)))
+        end.update(poses)
+
+    def correct(share: float) -> Generator[Launch, Reading, float]:
+        for _ in range(CORRECTIONS):
+            errors = {name: axis.wanted - force(name) for name, axis in axes.items()}
+            wrong = [name for name, axis in axes.items() if not abs(errors[name]) <= axis.tolerance]
+            if not wrong:
+                return max(abs(error) for error in errors.values())
+            for name in wrong:
+                axes[name].step(force(name), STEP * thickness)
+            beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness]
+            if beyond:
+                wrong = beyond
+                break
+            yield from go(share)
+        name = wrong[0]
+        raise LoadNotReached(
+            f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
+            f"{1e3 * axes[name].travel:+.3g} mm along its z axis from its target (limit {1e3 * TRAVEL * thickness:.3g} "
+            f"mm); bring its target nearer to contact, or ask for another load"
+        )
+
+    world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a way that is far too long
+    end.update(start)
+    way = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
+    pieces = max(1, math.ceil(way / (PIECE * thickness)))
+    off = 0.0
+    for piece in range(1, pieces + 1):
+        touching = all(force(name) > 0.0 for name in loads)
+        if piece > 1 and touching:
+            yield from correct((piece - 1) / pieces)
+        yield from go(piece / pieces)
+    off = yield from correct(1.0)
+    last = done[-1]
+    return replace(
+        last, substeps=sum(s.substeps for s in done), hold=sum(s.hold for s in done),
+        guard_hits=sum(s.guard_hits for s in done), load_error=off, courant=max(s.courant for s in done),
+    )  # fmt: skip
+
+
+def _between(a: Pose, b: Pose, share: float) -> Pose:
+    turn_from = Rotation.from_quat(a.quaternion)
+    vector = (Rotation.from_quat(b.quaternion) * turn_from.inv()).as_rotvec()
+    turned = Rotation.from_rotvec(share * vector) * turn_from
+    return Pose(a.position + share * (b.position - a.position), turned.as_quat())

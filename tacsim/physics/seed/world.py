@@ -1,0 +1,340 @@
+"""The seed paper's scheme: gels and plasticine as particles on one shared MLS-MPM grid.
+
+Faithful in what it simulates; around it stands the same quasi-static controller as for the hybrid world. What belongs
+to the scheme itself: bodies stick to each other (no friction coefficient), begin to push across an air gap of about
+1.5 grid cells, and a gel has no housing. Sensors may move along and turn about world z, and may not tilt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tacsim.compute.runtime import launching, start
+from tacsim.geometry.sampling import body_points
+from tacsim.interface import Pose, Truth
+from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
+from tacsim.physics.exec.layout import NUMBERS
+from tacsim.physics.failure.health import Health, Place, SimulationDiverged, copies, judged, require_room, retried
+from tacsim.physics.motion.controller import Motion, Reading, Scheme, move_and_settle, run
+from tacsim.physics.motion.load import keep_loads, require_loads
+from tacsim.physics.motion.path import MM, Path, merged, plan
+from tacsim.physics.worlds.not_copyable import SingleWorld
+from tacsim.physics.worlds.world import MoveStats, Order, put_back, taken
+
+Float32 = NDArray[np.float32]
+
+CELL = 2  # grid spacing / particle spacing: 8 particles a cell
+COURANT = 0.5  # dt / (grid spacing / wave speed); unstable from 1.0
+REACH = 1.5  # [cells] gap at which contact through the grid begins
+GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
+BODY_DAMPING = 0.8  # likewise, rate against the driven motion, along z: near critical for the bounce between the gels
+SWAY_DAMPING = 0.12  # likewise across z, where the gels are softer
+LOOK = 20  # substeps of the hold between two looks at the forces
+GENTLE = 60  # substeps of the shortest motion: a start in fewer is a blow, which leaves false plastic strain
+SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
+FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
+MARGIN = 3  # [cells] of grid round the particles
+TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
+HALF_TURN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of the upper sensor at yaw 0
+
+MPA = 1e-6  # Pa -> MPa
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where a gel's particles rest in its sensor's frame: (nx, ny, nz) of them, z downwards from the surface [mm]."""
+
+    count: tuple[int, int, int]
+    spacing: float
+    layer: float  # spacing along z, so that the layers fill the thickness
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        nx, ny, nz = self.count
+        x, y = (np.arange(nx) - (nx - 1) / 2) * self.spacing, (np.arange(ny) - (ny - 1) / 2) * self.spacing
+        z = -(np.arange(nz) + 0.5) * self.layer
+        return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def gel_lattice(gel: Gel, spacing: float) -> Lattice:
+    """The lattice nearest to the gel's size; laterally it may miss it by half a spacing, its thickness is exact."""
+    nx, ny, nz = (max(round(length / spacing), 1) for length in gel.size)
+    return Lattice((nx, ny, nz), spacing * MM, gel.size[2] * MM / nz)
+
+
+def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
+    """Kernel constants of a material for particles of `volume` [mm^3]; density lambda + 2 mu makes the wave speed 1."""
+    from tacsim.physics.body.material import ELASTIC
+    from tacsim.physics.seed.kernels import Solid
+
+    mu, lam = (modulus * MPA for modulus in lame(material))
+    limit = min(material.elastic_limit, ELASTIC) if isinstance(material, BodyMaterial) else ELASTIC
+    mass = (lam + 2 * mu) * volume
+    return Solid(mass=mass, volume=volume, mu=mu, lam=lam, limit=limit)  # type: ignore[call-arg]  # a Taichi dataclass
+
+
+class SeedWorld(SingleWorld):
+    """World of a scene with a body, by the seed's scheme.
+
+    Raises ValueError without a body, or for one that hardens; RuntimeError on a device (TACSIM_DEVICE).
+    """
+
+    sensors = ("lower", "upper")
+
+    def __init__(self, scene: Scene) -> None:
+        if scene.body is None:
+            raise ValueError("physics 'seed' simulates a body between two gels; this scene has none (use 'hybrid')")
+        if scene.body.material.hardening_modulus > 0:
+            raise ValueError("physics 'seed' has no hardening (use 'hybrid', or leave out hardening_modulus)")
+        if any(scene.gravity):
+            raise ValueError("physics 'seed' has no gravity (use 'hybrid', or set gravity to [0, 0, 0])")
+        start(cpu_only="physics 'seed'")
+        self.scene = scene
+        self._mach = scene.peak_mach
+        h = scene.spacing * MM
+        self._dx, self._dt = CELL * h, COURANT * CELL * h
+        self._lattice = gel_lattice(scene.gel, scene.spacing)
+        self._gel = solid(scene.gel.material, h * h * self._lattice.layer)
+        self._body = solid(scene.body.material, h**3)
+        # force that rounding in F can pretend: one particle's area at the gel's modulus
+        self._floor = scene.gel.material.youngs_modulus * MPA * h * h
+        self._initialise(body_points(scene.body, scene.spacing) * MM)
+
+    def _initialise(self, body: NDArray[np.float64]) -> None:
+        """Stage 1 of the scheme: undeformed particles at rest, a clear gap between body and gels."""
+        h, gap = self._lattice.spacing, REACH * self._dx
+        body = body + [0.0, 0.0, gap + h / 2 - body[:, 2].min()]
+        self._poses = {
+            "lower": Pose(),
+            "upper": Pose(np.array([0.0, 0.0, (body[:, 2].max() + h / 2 + gap) / MM]), HALF_TURN),
+        }
+        rest = self._lattice.points
+        gels = [_rotation(p).apply(rest) + p.position * MM for p in self._poses.values()]
+        self._gels = len(rest)
+        self._x = np.concatenate([*gels, body])  # float64, see kernels
+        n = len(self._x)
+        self._v = np.zeros((n, 3), np.float32)
+        self._c = np.zeros((n, 3, 3), np.float32)
+        self._f = np.tile(np.eye(3, dtype=np.float32), (n, 1, 1))
+        self._stress = np.zeros((n, 3, 3), np.float32)
+        self._aside = np.zeros(n, np.int32)  # 1 = left the grid, takes no part
+        self._motion = np.array([0, 0, 0, body[:, 2].min(), body[:, 2].max()], np.float32)  # see kernels
+        self._momentum, self._gain = np.zeros((2, 3), np.float32), np.zeros((2, 3), np.float32)
+        self._backing = np.zeros((2, 6), np.float32)
+        room = (self._poses["upper"].position[2] + 2 * self.scene.gel.size[2]) * MM / self._dx
+        # cells of the grid between the backings; and their height / dx, the least since they last were renewed
+        self._layers = np.array([round(room), room / round(room)], np.float32)
+        self._grid = np.zeros((1, 1, 1, 4), np.float32)
+
+    # ------------------------------------------------------------------ state
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {
+            "position": self._x, "velocity": self._v, "velocity_gradient": self._c, "deformation_gradient": self._f,
+            "stress": self._stress, "aside": self._aside, "body_motion": self._motion,
+            "gel_momentum": self._momentum, "gel_gain": self._gain, "backing": self._backing, "layers": self._layers,
+        }  # fmt: skip
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        return taken(self.arrays(), self._poses)
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See World."""
+        self._poses = put_back(self.arrays(), self.sensors, state)
+
+    def wrench(self, name: str) -> NDArray[np.float64]:
+        """(6,) what the gel does to its backing: what the object does to the gel, once the gel is at rest."""
+        reaction = self._backing[self._sensor(name)].astype(np.float64)
+        to_sensor = _rotation(self._poses[name]).inv()
+        return np.concatenate([to_sensor.apply(reaction[:3]), to_sensor.apply(reaction[3:]) / MM])
+
+    def surface(self, name: str) -> GelSurface:
+        """Displacement of the top layer of particles, half a layer below the rest surface."""
+        nx, ny, _ = self._lattice.count
+        moved = (self._in_sensor(name) - self._lattice.points).reshape(nx, ny, -1, 3)[:, :, 0] / MM
+        h = self.scene.spacing
+        return GelSurface(moved.astype(np.float32), h, (-(nx - 1) / 2 * h, -(ny - 1) / 2 * h))
+
+    def _in_sensor(self, name: str) -> NDArray[np.float64]:
+        """Particles of a gel in its sensor's frame [mm]."""
+        first, pose = self._sensor(name) * self._gels, self._poses[name]
+        x: NDArray[np.float64] = self._x[first : first + self._gels] - pose.position * MM
+        return x @ _rotation(pose).as_matrix()
+
+    def truth(self) -> Truth:
+        """Of the body's particles in play; those set aside are left out."""
+        x = self._body_points()
+        height = (float(np.ptp(x[:, 2])) + self._lattice.spacing) / MM
+        return Truth(height, x.mean(axis=0) / MM, (x / MM).astype(np.float32), dict(self._poses))
+
+    def _body_points(self) -> NDArray[np.float64]:
+        body = slice(2 * self._gels, None)
+        points: NDArray[np.float64] = self._x[body][self._aside[body] == 0]
+        return points
+
+    # ----------------------------------------------------------------- motion
+
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
+        *, flow: bool = False,
+    ) -> MoveStats:  # fmt: skip
+        """See World. Raises ValueError for a tilted target, one that would crush the gels, a duration, and flow."""
+        if duration is not None:
+            raise ValueError("physics 'seed' knows no true inertia; leave out the duration, or use physics 'hybrid'")
+        if flow:
+            raise ValueError("physics 'seed' settles every motion; leave out flow, or use physics 'hybrid'")
+        return run(self.motion(Order(targets, loads or {})), self._advance)
+
+    def _carry_out(self, order: Order) -> Motion:
+        end = merged(self._poses, order.targets)
+        end.update((name, self._upright(name, end[name])) for name in order.targets)
+        self._check_room(end)
+        require_loads(order.loads, self.sensors)
+        begin, goals = dict(self._poses), dict(end)
+
+        def tried(refine: int) -> Motion:
+            if order.loads:
+                end.update(goals)
+                return keep_loads(self, begin, end, order.loads, refine, balanced=True)
+            path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
+            return move_and_settle(path, self.scene.settling, balanced=True)
+
+        stats = yield from retried(self, order, tried)
+        self._poses = end
+        return stats
+
+    def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+        """The path between two poses of all driven frames, at the scene's speed."""
+        lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
+        path = plan(start, end, self._mach, self._dt, lever, self.scene.gel.size[2] * MM)
+        return replace(path, substeps=max(path.substeps, GENTLE) if path.substeps else 0, look=LOOK)
+
+    def _upright(self, name: str, pose: Pose) -> Pose:
+        """`pose` without a tilt of up to TILT, which the scheme can't follow."""
+        flip = Rotation.identity() if name == "lower" else Rotation.from_quat(HALF_TURN)
+        turn = (Rotation.from_quat(pose.quaternion) * flip.inv()).as_matrix()
+        tilt = float(np.arctan2(np.hypot(turn[0, 2], turn[1, 2]), turn[2, 2]))
+        if tilt > TILT:
+            raise ValueError(
+                f"physics 'seed' cannot tilt a sensor: '{name}' was asked to tilt by {np.degrees(tilt):.3g} deg "
+                f"(limit {np.degrees(TILT):.2g} deg); keep its z axis along world z, or use physics 'hybrid'"
+            )
+        yaw = Rotation.from_euler("z", np.arctan2(turn[1, 0], turn[0, 0]))
+        return Pose(pose.position, (yaw * flip).as_quat())
+
+    def _check_room(self, poses: Mapping[str, Pose]) -> None:
+        thickness = self.scene.gel.size[2]
+        room = float(poses["upper"].position[2] - poses["lower"].position[2])
+        if room < -thickness:
+            raise ValueError(
+                f"the gels' rest surfaces would overlap by {-room * MM:.3g} mm, which leaves each gel less than half "
+                f"of its {thickness * MM:.3g} mm; keep the upper at least {-thickness * MM:.3g} mm above the lower"
+            )
+
+    def _advance(self, path: Path, first: int, last: int) -> Reading:
+        """Substeps first to last of a path, in one launch."""
+        aside = int(self._aside.sum())
+        where = path.place(self.sensors, first, last)
+        x0, y0 = self._fit_grid(path, first, last, where)
+
+        def launch() -> Health:
+            health = np.zeros((1, NUMBERS), np.float32)
+            Health.clear(health)
+            drive = path.drive(first, last)
+            self._launch(drive, path.step, x0, y0, health[0])
+            return Health.read(health, path.step / self._smallest_cell(drive))
+
+        good = copies(self.arrays())
+        health = judged(self.arrays(), good, launch(), where)
+        backing = self._backing[:, :3].astype(np.float64)
+        left = int(self._aside.sum()) - aside
+        if not len(self._body_points()):
+            failure = SimulationDiverged("every particle of the body left the grid", str(where))
+            raise failure.of_launch(good, self.arrays(), where)
+        scheme = Scheme(path.step, GEL_DAMPING, health.courant)
+        overlap = self._overlap(path, last)
+        return Reading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
+
+    @launching()
+    def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
+        from tacsim.physics.seed.kernels import Step, advance
+
+        thickness = self.scene.gel.size[2] * MM
+        step = Step(  # type: ignore[call-arg]  # a Taichi dataclass
+            dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
+            gel_damping=GEL_DAMPING / thickness, body_damping=BODY_DAMPING / thickness,
+            sway_damping=SWAY_DAMPING / thickness, gels=self._gels,
+        )  # fmt: skip
+        advance(
+            self._x, self._v, self._c, self._f, self._stress, self._aside, self._grid, drive, self._motion,
+            self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
+        )  # fmt: skip
+
+    def _fit_grid(self, path: Path, first: int, last: int, where: Place) -> tuple[float, float]:
+        """Makes the grid cover what the particles can reach; returns x, y of node (0, 0), whole multiples of dx."""
+        from tacsim.physics.seed.kernels import PAD
+
+        faces = path.drive(first, last)[:, :, 3, 2]
+        gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
+        low, high = gels.min(axis=0), gels.max(axis=0)
+        side = SIDE * float((high - low).max())
+        if len(body):
+            low = np.minimum(low, np.maximum(body.min(axis=0), low - side))
+            high = np.maximum(high, np.minimum(body.max(axis=0), high + side))
+        margin = MARGIN * self._dx + 2 * max(self._mach, FASTEST_MACH) * (last - first) * self._dt
+        room = [*(low - margin), faces.min()], [*(high + margin), faces.max()]
+        require_room(np.array(room[0]), np.array(room[1]), self._dx, where)
+        layers = self._fit_layers(faces)
+        corner = np.floor((low - margin) / self._dx)
+        nodes = np.ceil((high + margin) / self._dx) - corner + 1
+        shape = (int(nodes[0]), int(nodes[1]), layers + 2 * PAD + 1)
+        if self._grid.shape[:3] != shape:
+            self._grid = np.zeros((*shape, 4), np.float32)
+        return float(corner[0] * self._dx), float(corner[1] * self._dx)
+
+    def _fit_layers(self, faces: Float32) -> int:
+        """Cells of the grid between the backings, for a launch with sensor origins at heights `faces` (n, 2) [mm].
+
+        While the sensors close in, the layers are kept and shrink (a change of number shifts nodes against the contact
+        surfaces: a small jump of force). While they part, layers are added: in a grid that stretches with the motion
+        the body would stick to the gels, with nearly the force of the squeeze.
+        """
+        room = (faces[:, 1] - faces[:, 0] + 2 * self.scene.gel.size[2] * MM) / self._dx
+        if room[-1] > room[0]:
+            self._layers[0] = max(self._layers[0], round(float(room[-1] / self._layers[1])))
+        elif room[-1] < room[0]:
+            if room[-1] < FINEST * self._layers[0]:
+                self._layers[:] = max(round(float(room[-1])), 1), 1.0
+            self._layers[1] = min(self._layers[1], room[-1] / self._layers[0])
+        return int(self._layers[0])
+
+    def _smallest_cell(self, drive: Float32) -> float:
+        """Shortest edge of a grid cell in a launch along `drive` [mm]: the grid is squeezed with what lies in it."""
+        room = float((drive[:, 1, 3, 2] - drive[:, 0, 3, 2]).min()) + 2 * self.scene.gel.size[2] * MM
+        return min(self._dx, room / float(self._layers[0]))
+
+    def _overlap(self, path: Path, last: int) -> float:
+        """Deepest body particle below the nearest column of a gel; half a spacing lies outside the particles [mm]."""
+        nx, ny, nz = self._lattice.count
+        frames = path.drive(last - 1, last)[0].astype(np.float64)
+        body = self._body_points()
+        deepest = 0.0
+        for index, (rotation, origin) in enumerate((f[:3], f[3]) for f in frames):
+            x = (body - origin) @ rotation
+            gel = (self._x[index * self._gels : (index + 1) * self._gels : nz] - origin) @ rotation
+            column = np.rint(x[:, :2] / self._lattice.spacing + (np.array([nx, ny]) - 1) / 2).astype(int)
+            over = ((column >= 0) & (column < [nx, ny])).all(axis=1)
+            top = gel[column[over, 0] * ny + column[over, 1], 2] + self._lattice.layer / 2
+            gap = x[over, 2] - self._lattice.spacing / 2 - top
+            deepest = max(deepest, -float(gap.min(initial=0.0)))
+        return deepest
+
+
+def _rotation(pose: Pose) -> Rotation:
+    return Rotation.from_quat(pose.quaternion)

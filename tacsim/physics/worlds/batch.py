@@ -1,0 +1,135 @@
+"""Many worlds in step: what they do next is each one's own business, the launch of kernels is common.
+
+Threads of one world meet twice a substep; in a batch each environment has a thread to itself and meets nobody. Every
+environment is at its own place of its own motion, and comes out as it would alone, to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+from tacsim.compute.runtime import launching
+from tacsim.interface import Pose
+from tacsim.models.scene import Scene
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.motion.controller import Launch, Motion, advance_all
+from tacsim.physics.motion.load import LoadNotReached
+from tacsim.physics.worlds.hybrid import HybridState, HybridWorld
+from tacsim.physics.worlds.not_copyable import Single
+from tacsim.physics.worlds.press import PressState, PressWorld
+from tacsim.physics.worlds.world import MoveStats, Order
+
+Result = MoveStats | SimulationDiverged | LoadNotReached | None
+
+
+class Batch(Single):
+    """Worlds of several scenes, all round bodies or all with indenters, whose gels share one lattice.
+
+    All else is each scene's own: materials, friction, body or indenter, number of particles, settling. `worlds` are
+    whole: each moves alone, is read, kept and restored like any other, and no other changes.
+    """
+
+    _instead = "Batch(scenes) and restore each world's snapshot()"
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Raises ValueError for scenes that cannot share a launch, and says which; TypeError for what is no scene."""
+        _require_one_kind(scenes)
+        self._state: HybridState | PressState
+        self.worlds: tuple[HybridWorld | PressWorld, ...]
+        if scenes[0].indenter is None:
+            self._state = hybrid = HybridState(scenes)
+            self.worlds = tuple(HybridWorld(scene, hybrid, index) for index, scene in enumerate(scenes))
+        else:
+            self._state = press = PressState(scenes)
+            self.worlds = tuple(PressWorld(scene, press, index) for index, scene in enumerate(scenes))
+
+    def move(
+        self,
+        targets: Sequence[Mapping[str, Pose] | None],
+        loads: Sequence[Mapping[str, float] | None] | None = None,
+        duration: float | None = None,
+        *,
+        flow: bool = False,
+    ) -> list[Result]:
+        """`World.move` of every environment at once; None in `targets`: this one rests, and nothing of it changes.
+        `duration` and `flow` are those of all motions.
+
+        What became of each, in its place: a motion that fails is not raised but returned, with that world as it was
+        before. One that has to try again does so while the others go on.
+
+        Raises ValueError for a wrong number of targets or loads, or a load of an environment that rests; what
+        `World.move` raises for an order that makes no sense, before anything moves. Interrupted, worlds that
+        are still on their way are taken back.
+        """
+        if loads is None:
+            loads = [None] * len(self.worlds)
+        for what, given in (("targets", targets), ("loads", loads)):
+            if len(given) != len(self.worlds):
+                raise ValueError(f"{len(given)} {what} for {len(self.worlds)} environments; give one each, or None")
+        motions: dict[int, Motion] = {}
+        for index, (world, target, load) in enumerate(zip(self.worlds, targets, loads, strict=True)):
+            if target is not None:
+                motions[index] = world.motion(Order(target, load or {}, duration, flow))
+            elif load:
+                raise ValueError(f"environment {index} rests, so it cannot hold a load; give it targets, {{}} to stay")
+        return self._run(motions)
+
+    def _run(self, motions: Mapping[int, Motion]) -> list[Result]:
+        ends: list[Result] = [None] * len(self.worlds)
+        wanted: dict[int, Launch] = {}
+
+        def go_on(index: int, step: Callable[[], Launch]) -> None:
+            """Takes one motion to the next launch that it wants, or to its end."""
+            wanted.pop(index, None)
+            try:
+                wanted[index] = step()
+            except StopIteration as end:
+                ends[index] = end.value
+            except (SimulationDiverged, LoadNotReached) as failure:
+                ends[index] = failure
+
+        try:
+            for index, motion in motions.items():
+                try:
+                    go_on(index, motion.__next__)
+                except Exception as error:
+                    error.add_note(f"in the motion of environment {index}")
+                    raise
+            while wanted:
+                with launching():
+                    results = advance_all(self._state, self.worlds, wanted)
+                for index, result in results.items():
+                    motion = motions[index]
+                    if isinstance(result, SimulationDiverged):
+                        go_on(index, partial(motion.throw, result))
+                    else:
+                        go_on(index, partial(motion.send, result))
+        finally:
+            for motion in motions.values():
+                motion.close()
+        return ends
+
+
+def _require_one_kind(scenes: Sequence[Scene]) -> None:
+    if not scenes:
+        raise ValueError("a batch needs at least one scene")
+    for index, scene in enumerate(scenes):
+        if not isinstance(scene, Scene):
+            raise TypeError(f"environment {index} must be a Scene, found {scene!r}")
+    seeds = [index for index, scene in enumerate(scenes) if scene.physics == "seed"]
+    if seeds:
+        raise ValueError(
+            f"{_named(seeds)}: physics 'seed' does not run in a batch; use physics 'hybrid', or a world each"
+        )
+    pressed = [index for index, scene in enumerate(scenes) if scene.indenter is not None]
+    if pressed and len(pressed) < len(scenes):
+        others = [index for index in range(len(scenes)) if index not in pressed]
+        raise ValueError(
+            f"a batch holds bodies or indenters, not both: {_named(pressed)} with an indenter, {_named(others)} with a "
+            f"body; make a batch of each"
+        )
+
+
+def _named(indices: Sequence[int]) -> str:
+    return f"environment{'s' if len(indices) > 1 else ''} {', '.join(map(str, indices))}"

@@ -1,0 +1,307 @@
+"""Two gels (FEM in their sensor frames) round a plasticine body (MLS-MPM), coupled by contact with friction memory."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tacsim.compute.runtime import start
+from tacsim.geometry.sampling import body_points
+from tacsim.geometry.shapes import extent, volume
+from tacsim.interface import Pose, Truth
+from tacsim.models.scene import Scene
+from tacsim.physics.body.plasticine import (
+    BORDER,
+    BodyParams,
+    BodyState,
+    body_params,
+    bounds,
+    centre_of,
+)
+from tacsim.physics.body.surface import surface_points, tangent_planes
+from tacsim.physics.contact.contact import Kept
+from tacsim.physics.contact.gel_overlap import gel_overlap
+from tacsim.physics.exec.device import Mirror, run_hybrid
+from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
+from tacsim.physics.exec.layout import (
+    BACKING,
+    BODY_DAMPING,
+    BODY_MASS,
+    CENTRE,
+    COUNTS,
+    ELEMENTS,
+    FORCE,
+    FRICTION,
+    GEL_DAMPING,
+    GEL_DENSITY,
+    GRAVITY,
+    HOUSED,
+    HOUSING,
+    LIGHTNESS,
+    NUMBERS,
+    PARAMS,
+    SPREAD,
+    STEP,
+    STEPS,
+    STIFFNESS,
+    TURNING,
+)  # fmt: skip
+from tacsim.physics.exec.team import run_team
+from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, copies, judged, require_room
+from tacsim.physics.gel.gel import MM, MPA, GelState, gel_params, one_lattice
+from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
+from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
+from tacsim.physics.worlds.driven import DrivenWorld
+from tacsim.physics.worlds.hybrid_kernels import substeps
+from tacsim.pose import HALF_TURN_X
+
+# dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
+COURANT = 0.5
+# Damping on the way falsifies the path, since the gels give way and the body spreads; damping of the hold does not.
+ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0  # zeta in alpha = zeta c / thickness, while anything is driven and while held
+ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
+GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
+CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
+
+
+class HybridState:
+    """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
+
+    Environments share the gels' lattice; bodies, materials, friction and settling are each one's own.
+    """
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Raises ValueError for gels that are not cut alike."""
+        start()
+        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
+        self.gels = GelState(one_lattice(self.gel), len(scenes), 2)
+        placed = [_placed(scene) for scene in scenes]
+        self.body = [body for body, _, _ in placed]
+        self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
+        # of the contact law [mm]
+        self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), Kept.n), np.float32)
+        self.params = np.zeros((len(scenes), PARAMS), np.float32)
+        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
+        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
+        self._mirror = Mirror()
+
+    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
+        """One launch; drives: (n, 2, 6, 3) of the environments that go on, n each one's own."""
+        drive = side_by_side(drives, self.counts)
+        self.gels.refresh()
+        if ON_DEVICE:
+            run_hybrid(
+                self._mirror, drive, self.gels, self.particles, self.memory, self.params, self.counts, self.partial
+            )
+        else:
+            run_team(
+                substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.params,
+                self.counts, self.partial, active=list(drives),
+            )  # fmt: skip
+
+
+def _placed(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
+    """A scene's body: facts; particles at construction (n, 3) [mm]; their tangent planes (n, 3) [1/mm]."""
+    assert scene.body is not None
+    height = float(extent(scene.body.geometry)[2])
+    points = body_points(scene.body, scene.spacing)
+    body = body_params(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
+    planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM
+    return body, (points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM, planes
+
+
+def side_by_side(drives: Mapping[int, np.ndarray], counts: np.ndarray) -> np.ndarray:
+    """Drives (n, frames, 6, 3) of some environments in one array (E, longest, ...); writes all n into `counts`."""
+    counts[:, STEPS] = 0
+    first = next(iter(drives.values()))
+    longest = max(len(drive) for drive in drives.values())
+    together = np.zeros((len(counts), longest, *first.shape[1:]), np.float32)
+    for index, drive in drives.items():
+        together[index, : len(drive)] = drive
+        counts[index, STEPS] = len(drive)
+    return together
+
+
+class HybridWorld(DrivenWorld):
+    """World of a scene with a body: `lower` and `upper` gel, and the plasticine between them."""
+
+    sensors = ("lower", "upper")
+    balanced = True
+
+    def __init__(self, scene: Scene, state: HybridState | None = None, index: int = 0) -> None:
+        """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
+        assert scene.body is not None
+        self.scene = scene
+        self._state: HybridState = HybridState([scene]) if state is None else state
+        self._index = index
+        self._gel, self._body = self._state.gel[index], self._state.body[index]
+        self.yields = math.isfinite(scene.body.material.elastic_limit)
+        height = float(extent(scene.body.geometry)[2])
+        self._poses = {
+            "lower": Pose(),
+            "upper": Pose(np.array([0.0, 0.0, height + 2 * CLEARANCE]), HALF_TURN_X.quaternion),
+        }
+        self._rates = np.zeros((2, 6))
+        self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
+        self._mach = scene.peak_mach
+        self._speed = self._mach  # fastest particle seen in the last launch
+        housing = scene.gel.housing
+        # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
+        self._pull = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
+        self._weight = self._pull * self._body.volume * len(self._state.particles.x(index))  # [N]
+        params = {
+            **self._gel.params(), **self._body.params(),
+            FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
+            HOUSING: -1.0 if housing is None else housing * MM,
+        }  # fmt: skip
+        self._state.params[index, list(params)] = list(params.values())
+        self._scaled, self._true = self._scaled_inertia(height * MM), self._true_inertia()
+        self._take(self._scaled)
+
+    # ---------------------------------------------------------------- inertia
+
+    def _scaled_inertia(self, height: float) -> Inertia:
+        """For the way to rest; height: of the body [mm]."""
+        step = COURANT * min(self._body.cell, self._gel.spacing)
+        damping = {
+            GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
+            # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were
+            # lighter by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
+            # the step limit.
+            LIGHTNESS: max(1.0, height / self._body.spacing),
+        }  # fmt: skip
+        held = {
+            GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
+        }  # fmt: skip
+        masses = self._masses(self._gel.density, self._body.density, step)
+        return Inertia({**masses, **damping, SPREAD: 0.0}, step, held=held, flowing={SPREAD: 1.0})
+
+    def _true_inertia(self) -> Inertia:
+        assert self.scene.body is not None
+        second = kernel_second(self._gel, self.scene.gel.material.density)
+        density = kernel_density(self.scene.body.material.density, second)
+        wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
+        step = COURANT * min(self._body.cell / wave, self._gel.spacing)
+        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, LIGHTNESS: 1.0, SPREAD: 0.0}
+        return Inertia({**self._masses(self._gel.density, density, step), **undamped}, step, second)
+
+    def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
+        """Entries of `facts` that follow from the densities [MPa] and the substep [mm]."""
+        particle = body * self._body.volume
+        # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
+        share = gel * self._gel.spacing * self._body.spacing**2 / 2
+        reduced = 1.0 / (1.0 / particle + 1.0 / share)
+        gravity = self._pull / body  # [1/mm]
+        return {
+            GEL_DENSITY: gel, BODY_MASS: particle, STIFFNESS: reduced / step**2,
+            GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
+        }  # fmt: skip
+
+    def _stop(self) -> None:
+        b, i = self._state.particles, self._index
+        for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
+            moving[...] = 0.0
+
+    def _courant(self) -> float:
+        """Of gels and body; the body's grid does not shrink with it."""
+        params = self._state.params[self._index]
+        wave = math.sqrt(self._body.particle_mass / params[BODY_MASS])  # the speed of the body's pressure wave
+        return max(super()._courant(), float(params[STEP]) * wave / self._body.cell)
+
+    # ------------------------------------------------------------------ state
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        state, i = self._state, self._index
+        b = state.particles
+        return {
+            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i],
+            "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.flow(i),
+            "planes": b.plane(i), "contact": state.memory[i, :, : b.counts[i]], "sums": state.partial[i],
+        }  # fmt: skip
+
+    def _numbers(self) -> dict[str, np.ndarray]:
+        return {**super()._numbers(), "speed": np.array(self._speed)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        super().restore(state)
+        self._speed = float(state["speed"])
+
+    def truth(self) -> Truth:
+        x, planes = self._state.particles.x(self._index), self._state.particles.plane(self._index)
+        height = float(np.ptp(surface_points(x, planes)[:, 2])) / MM
+        return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
+
+    # ----------------------------------------------------------------- motion
+
+    def prepare(self, launch: Launch) -> Prepared:
+        """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
+        state, index, path = self._state, self._index, launch.path
+        span = (launch.last - launch.first) * path.dt
+        weight = float(np.linalg.norm(state.params[index, GRAVITY : GRAVITY + 3]))
+        fall = float(state.params[index, LIGHTNESS]) * weight * span
+        drive = path.drive(launch.first, launch.last)
+        driven = max(self._mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
+        margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
+        where = path.place(self._poses, launch.first, launch.last)
+        x = state.particles.x(index)
+        low, high = bounds(x)
+        reach = margin + BORDER / 2 * self._body.cell
+        require_room(low - reach, high + reach, self._body.cell, where, state.particles.most)
+        try:
+            state.particles.fit(index, self._body.cell, margin, state.params, state.counts)
+        except MemoryError as error:
+            raise SimulationDiverged(
+                f"no memory for the grid round the particles ({error})", str(where), NO_ROOM
+            ) from None
+        good = copies(self.arrays())
+        state.params[index, STEP] = path.step
+        self._note_inertia(x)
+        self._answer(launch)
+        Health.clear(state.partial[index])
+        return Prepared(launch, drive, where, good)
+
+    def _note_inertia(self, x: np.ndarray) -> None:
+        """Centre and inverse moment of inertia of the particles (n, 3) [mm], where the kernels find them."""
+        params = self._state.params[self._index]
+        centre = centre_of(x)
+        arms = x.T - centre[:, None]
+        second = arms @ arms.T * float(params[BODY_MASS])
+        inertia = np.trace(second) * np.eye(3) - second
+        inverse = np.linalg.pinv(inertia, rcond=1e-6, hermitian=True)  # particles on a line have none about it
+        params[CENTRE : CENTRE + 3] = centre
+        params[TURNING : TURNING + 6] = [*np.diagonal(inverse), inverse[0, 1], inverse[0, 2], inverse[1, 2]]
+
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        partial = self._state.partial[self._index]
+        health = judged(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
+        self._speed = health.fastest
+        rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
+        sums = partial.astype(np.float64)
+        force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
+        backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)  # which holds the housing too
+        backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
+        contact = np.einsum("gij,gj->gi", rotations, force)
+        backing = np.einsum("gij,gj->gi", rotations, backing)
+        centre = centre_of(self._state.particles.x(self._index))
+        torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
+        lever = max(self._gel.half)
+        meeting = self._gel_overlap(prepared)
+        return Reading(
+            contact, backing, self._floor, health.overlap, health.capped + (meeting > 0.0),
+            moment / lever, self._weight, torque / lever,
+            Scheme(prepared.launch.path.step, self._damping(), health.courant), meeting,
+        )  # fmt: skip
+
+    def _gel_overlap(self, prepared: Prepared) -> float:
+        """Of the two gels with one another, which they do not feel [mm]. Raises SimulationDiverged for too much."""
+        last = prepared.drive[-1].astype(np.float64)
+        found = gel_overlap(self._gel, self._state.gels.u[self._index, :, :, :, -1], last[:, :3], last[:, 3])
+        most = GEL_OVERLAP * self._gel.thickness
+        if found > most:
+            raise SimulationDiverged(
+                f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",
+                str(prepared.where), "keep the sensors further apart, or use physics 'seed'", retry=False,
+            ).of_launch(prepared.good, self.arrays(), prepared.where)  # fmt: skip
+        return found

@@ -1,0 +1,345 @@
+"""A rigid indenter pressed, slid or twisted on one gel: no particles, no grid."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tacsim.compute.runtime import start, ti
+from tacsim.geometry.shapes import MAX_NODES, extent, farthest
+from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
+from tacsim.interface import Pose
+from tacsim.models.scene import Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.physics.contact.indenter import (
+    BOX,
+    CYLINDER,
+    GRID,
+    POINTS,
+    SPHERE,
+    Pressure,
+    Slip,
+    Values,
+    indent,
+)
+from tacsim.physics.exec.device import Mirror, run_press
+from tacsim.physics.exec.lanes import MOST, ON_DEVICE, PARTS, Counts, Params, Partial, aligned_zeros
+from tacsim.physics.exec.layout import (
+    BACKING,
+    COUNTS,
+    ELEMENTS,
+    FORCE,
+    FRICTION,
+    GEL_DAMPING,
+    KIND,
+    NUMBERS,
+    PARAMS,
+    SHAPE,
+    SHAPE_FIRST,
+    SHAPE_NODES,
+    SHAPE_ORIGIN,
+    SHAPE_SPACING,
+    STEP,
+    STEPS,
+    STIFFNESS,
+)  # fmt: skip
+from tacsim.physics.exec.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.failure.health import Health, SimulationDiverged, copies, judged
+from tacsim.physics.gel.gel import (
+    MM,
+    MPA,
+    Corners,
+    GelParams,
+    GelState,
+    Lattice,
+    Nodes,
+    Skin,
+    Touch,
+    gel_advance,
+    gel_forces,
+    gel_params,
+    one_lattice,
+)
+from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
+from tacsim.physics.motion.inertia import Inertia, kernel_second
+from tacsim.physics.worlds.driven import DrivenWorld
+from tacsim.physics.worlds.hybrid import ZETA_GEL_HELD, side_by_side
+from tacsim.physics.worlds.hybrid_kernels import Drive
+
+# dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
+# with the step's square, so 0.5 costs overlap.
+COURANT = 0.4
+CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
+GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
+UNSEEN = 0.5  # spacings of contact points that an indenter may dip between them; a ball that just does not fit: 0.35
+MARGIN = 2.0  # elements round a mesh, or the part of a gel that lies there: nothing else touches in the next launch
+TOO_MUCH = "cut off of mesh and gel what cannot touch; worlds of a smaller batch have more room each"
+
+
+@ti.kernel
+def press_substeps(
+    team: ti.i32, drive: Drive,
+    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    slip: Slip, pressure: Pressure, values: Values,
+    params: Params, counts: Counts, partial: Partial, sync: Sync,
+):  # fmt: skip
+    """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
+    for task in range(sync.shape[0] * team * CHUNK):
+        for _ in range(first_in_chunk(task)):
+            turn, member = task // CHUNK // team, task // CHUNK % team
+            env = sync[turn, WHO]
+            nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
+            for it in range(counts[env, STEPS]):
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    indent(env, part, it, drive, skin, touch, slip, pressure, values, params, counts, partial, nx, ny)
+                    gel_forces(
+                        env, part, 1, nodes, corners, lattice, params, counts, partial,
+                        layers, nx, ny,
+                    )  # fmt: skip
+                meet(sync, turn, team, 2 * it + 1)
+                for share in range(shares(member, team)):
+                    part = member + share * team
+                    gel_advance(env, part, 1, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
+                meet(sync, turn, team, 2 * it + 2)
+
+
+def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
+    """The indenter's motion in the frame of the moving sensor, (n, 1, 6, 3), from both motions in world (n, 6, 3)."""
+    s, i = sensor.astype(np.float64), indenter.astype(np.float64)
+    back = np.swapaxes(s[:, :3], 1, 2)
+    arm = i[:, 3] - s[:, 3]
+    out = np.empty((len(s), 1, 6, 3))
+    out[:, 0, :3] = back @ i[:, :3]
+    out[:, 0, 3] = np.einsum("nij,nj->ni", back, arm)
+    out[:, 0, 4] = np.einsum("nij,nj->ni", back, i[:, 4] - s[:, 4] - np.cross(s[:, 5], arm))
+    out[:, 0, 5] = np.einsum("nij,nj->ni", back, i[:, 5] - s[:, 5])
+    return np.ascontiguousarray(out, np.float32)
+
+
+class PressState:
+    """Arrays of E environments that one launch of `press_substeps` advances; each environment is a PressWorld.
+
+    Environments share the gel's lattice; indenters, materials, friction and settling are each one's own.
+    """
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
+        start()
+        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
+        lattice = one_lattice(self.gel)
+        self.gels = GelState(lattice, len(scenes), 1)
+        nx, ny, _ = lattice.elements
+        self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
+        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # multiplier of the normal contact [MPa]
+        self.params = np.zeros((len(scenes), PARAMS), np.float32)
+        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
+        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
+        self._mirror = Mirror()
+        self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
+        self._covered = 0  # how often these have changed: a device has its copy of them until they do
+        self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
+        self._laid: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # tiles at hand, of environments with a mesh
+
+    def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
+        """Writes one environment's indenter into facts and counts; returns the distances of a mesh."""
+        assert scene.indenter is not None
+        _require_resolved(scene.indenter.geometry, self.gel[index])
+        kind, size, mesh = _shape_facts(scene.indenter.geometry)
+        self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
+        self.params[index, SHAPE_SPACING] = GRID_SPACING * MM
+        if mesh is not None:
+            self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
+        return mesh
+
+    def cover(self, index: int, low: np.ndarray, high: np.ndarray) -> None:
+        """Has at hand the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
+
+        The memory of all environments grows if this one needs more. Raises ValueError for more nodes than one may have,
+        MemoryError where there is no memory for them; nothing has changed then.
+        """
+        mesh = self.meshes[index]
+        assert mesh is not None
+        first, end = mesh.around(low / MM, high / MM)
+        old = self._laid.get(index)
+        if old is not None:
+            if (first >= old[0]).all() and (end <= old[1]).all():
+                return
+            both = np.minimum(first, old[0]), np.maximum(end, old[1])
+            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= min(MAX_NODES, MOST // len(self._values)):
+                first, end = both
+        values = mesh.values(first, end) * np.float32(MM)
+        held = self._values.shape[1:]
+        room = tuple(map(max, held, values.shape))
+        if room != held:
+            grown = aligned_zeros(len(self._values), *room)
+            grown[(slice(None), *map(slice, held))] = self._values
+            self._values = grown
+        nx, ny, nz = values.shape
+        self._values[index, :nx, :ny, :nz] = values
+        self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
+        self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
+        self._laid[index] = first, end
+        self._covered += 1
+
+    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
+        """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
+        drive = side_by_side(drives, self.counts)
+        self.gels.refresh()
+        if ON_DEVICE:
+            run_press(
+                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self._covered, self.params,
+                self.counts, self.partial,
+            )  # fmt: skip
+        else:
+            run_team(
+                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.params,
+                self.counts, self.partial, active=list(drives),
+            )  # fmt: skip
+
+
+class PressWorld(DrivenWorld):
+    """World of a scene with an indenter: the `lower` gel, and the `indenter` above it."""
+
+    sensors = ("lower",)
+    balanced = False
+    yields = False
+
+    def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
+        """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
+        assert scene.indenter is not None
+        self.scene = scene
+        self._state: PressState = PressState([scene]) if state is None else state
+        self._index = index
+        self._gel = self._state.gel[index]
+        step = COURANT * self._gel.spacing
+        # An elastic gel forgets its way, so it is damped on it as in the hold.
+        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness}, step)
+        self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
+        self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
+        params = {
+            **self._gel.params(), STIFFNESS: self._gel.density * self._gel.spacing / (2 * step**2),
+            FRICTION: scene.indenter.friction,
+        }  # fmt: skip
+        self._state.params[index, list(params)] = list(params.values())
+        self._take(self._scaled)
+        height = float(extent(scene.indenter.geometry)[2])
+        turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
+        self._rates = np.zeros((2, 6))
+        self._poses = {"lower": Pose(), "indenter": Pose(np.array([0.0, 0.0, height / 2 + CLEARANCE]), turned)}
+
+    def _stop(self) -> None:
+        self._state.gels.v[self._index] = 0.0
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        state, i = self._state, self._index
+        return {
+            "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "slip": state.slip[i],
+            "pressure": state.pressure[i], "sums": state.partial[i],
+        }  # fmt: skip
+
+    def truth(self) -> None:
+        return None
+
+    def prepare(self, launch: Launch) -> Prepared:
+        """Sets this environment's numbers for a launch. Raises SimulationDiverged: too much of a mesh to lay."""
+        path = launch.path
+        where = path.place(self._poses, launch.first, launch.last)
+        both = path.drive(launch.first, launch.last)
+        drive = relative_drive(both[:, 0], both[:, 1])
+        try:
+            self._cover(drive)
+        except ValueError as error:
+            raise SimulationDiverged(str(error), str(where), TOO_MUCH, retry=False) from None
+        except MemoryError as error:
+            cause = f"no memory for the distances from the indenter's mesh ({error})"
+            raise SimulationDiverged(cause, str(where), TOO_MUCH, retry=False) from None
+        good = copies(self.arrays())
+        self._state.params[self._index, STEP] = path.step
+        Health.clear(self._state.partial[self._index])
+        return Prepared(launch, drive, where, good)
+
+    def _cover(self, drive: np.ndarray) -> None:
+        """A mesh's distances wherever the gel's surface may meet it in this launch."""
+        mesh = self._state.meshes[self._index]
+        if mesh is None:
+            return
+        margin, half = MARGIN * self._gel.spacing, mesh.half * MM
+        nodes = self._surface_nodes()
+        at = np.concatenate([(nodes - rows[3]) @ rows[:3] for rows in drive[[0, -1], 0].astype(np.float64)])
+        near = at[(np.abs(at) <= half + margin).all(axis=1)]
+        if len(near):
+            self._state.cover(self._index, near.min(axis=0) - margin, near.max(axis=0) + margin)
+
+    def _surface_nodes(self) -> np.ndarray:
+        """Where the nodes of the gel's surface are (n, 3) [mm], sensor frame."""
+        top = self._state.gels.u[self._index, 0, :, :, -1].astype(np.float64)
+        axes = (self._gel.spacing * (np.arange(n) - (n - 1) / 2) for n in top.shape[:2])
+        top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        return top.reshape(-1, 3)
+
+    def outcome(self, prepared: Prepared) -> Reading:
+        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        partial = self._state.partial[self._index]
+        health = judged(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
+        sums = partial.astype(np.float64).sum(axis=0)
+        force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
+        backing = sums[None, BACKING : BACKING + 3]
+        if not force.any() and (prepared.launch.held or prepared.launch.last == prepared.launch.path.substeps):
+            self._require_touch(prepared)
+        return Reading(
+            force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
+            scheme=Scheme(prepared.launch.path.step, self._damping(), health.courant),
+        )  # fmt: skip
+
+    def _require_touch(self, prepared: Prepared) -> None:
+        """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points."""
+        assert self.scene.indenter is not None
+        rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
+        down = rows[:3].T @ [0.0, 0.0, -1.0]
+        mesh, geometry = self._state.meshes[self._index], self.scene.indenter.geometry
+        if isinstance(geometry, Mesh):
+            assert mesh is not None
+            lowest = mesh.vertices[np.argmax(mesh.vertices @ down)]
+        else:
+            lowest = farthest(geometry, down)
+        tip = rows[:3] @ (lowest * MM) + rows[3]
+        if (np.abs(tip[:2]) > np.array(self._gel.half) - spacing).any():
+            return  # beside the gel, or at its rim
+        nodes = self._surface_nodes()
+        near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
+        depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
+        if depth > UNSEEN * spacing / POINTS:
+            cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
+            finer = self._gel.thickness / (2 * self._gel.elements[2])
+            advice = (
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
+                f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
+            )
+            failure = SimulationDiverged(cause, str(prepared.where), advice, retry=False)
+            raise failure.of_launch(prepared.good, self.arrays(), prepared.where)
+
+
+def _require_resolved(geometry: Shape, gel: GelParams) -> None:
+    """Raises ValueError for an indenter that fits between the points at which the gel's surface feels it."""
+    narrow, spacing = float(extent(geometry)[:2].min()) * MM, gel.spacing / POINTS
+    if narrow < math.sqrt(2.0) * spacing:
+        layers = math.ceil(gel.thickness / (narrow * POINTS / math.sqrt(2.0)))
+        raise ValueError(
+            f"the indenter ({geometry.shape}) is {narrow:.4g} mm wide and fits between the gel's contact points, which "
+            f"lie {spacing:.4g} mm apart (element_size / {POINTS}): choose element_size at most "
+            f"{math.floor(1e4 * gel.thickness / layers) / 1e4:g} mm"
+        )
+
+
+def _shape_facts(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistance | None]:
+    """Kind and size [mm] for the kernels (`signed_distance`), and the distances of a mesh."""
+    match geometry:
+        case Sphere():
+            return SPHERE, (geometry.radius * MM, 0.0, 0.0), None
+        case Cylinder():
+            return CYLINDER, (geometry.radius * MM, 0.0, geometry.height / 2 * MM), None
+        case Box():
+            return BOX, tuple(side / 2 * MM for side in geometry.size), None
+    mesh = tiled_distance(geometry, GRID_SPACING)
+    return GRID, tuple(float(side) * MM for side in mesh.half), mesh

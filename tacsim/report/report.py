@@ -1,0 +1,186 @@
+"""Report of an episode: `summary.json`, `report.png`, and `report.html` (one file, nothing from outside)."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import statistics
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacsim.record.episode import Episode, Step
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+FILMSTRIP = 12  # frames a sensor in report.html
+THUMBNAIL = 320  # [px]
+
+
+def summary(episode: Episode) -> dict[str, Any]:
+    """Facts and curves of an episode as JSON: an entry of each list a control step (the state after reset has none).
+
+    `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
+    `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.report.timing; null unless the rig is
+    live), `trust` (tacsim.report.trust; null where nothing is found in pictures). What is unknown or not finite is
+    null.
+    """
+    from tacsim.report.figure import contact_signals, normal_force, signal_against_force
+    from tacsim.report.timing import timing
+    from tacsim.report.trust import trust
+
+    meta, done = episode.meta, [step for step in episode.steps if step.index > 0]
+    signals = contact_signals(Episode(meta, done))
+    settled = _settled(done)
+    return {
+        "rig": meta.rig,
+        "task": meta.task,
+        "policy": meta.policy,
+        "seed": meta.seed,
+        "goal": list(meta.goal) if isinstance(meta.goal, tuple) else meta.goal,
+        "steps": len(done),
+        "step": [step.index for step in done],
+        "reward": [_number(step.reward) for step in done],
+        "distance": [_number(step.distance) for step in done],
+        "force": [{name: _number(value) for name, value in normal_force(step).items()} for step in done],
+        "contact_signal": {name: [_number(value) for value in values] for name, values in signals.items()},
+        "correlation": {name: _number(pair[2]) for name, pair in signal_against_force(episode).items()},
+        "seconds_per_step": _number(statistics.median(step.seconds for step in done)) if done else None,
+        "seconds": [_number(step.seconds) for step in done],
+        "settled": settled,
+        "timing": timing(episode),
+        "trust": trust(episode),
+        "complete": episode.complete,
+        "dropped": episode.dropped,
+        "versions": dict(meta.versions),
+    }
+
+
+def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
+    """Writes `summary.json`, `report.png` and `report.html` below `directory`; their paths by those three names.
+
+    Raises OSError when the directory can't be written, ValueError for an episode without steps.
+    """
+    from tacsim.report import figure
+
+    if not episode.steps:
+        raise ValueError("the episode has no steps, there is nothing to report; record at least the state after reset")
+    config = summary(episode)
+    paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
+    directory.mkdir(parents=True, exist_ok=True)
+    paths["summary.json"].write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    page = figure.overview(
+        episode, _title(config), " · ".join(f"{key}: {value}" for key, value in _headline(config, episode))
+    )
+    figure.save(page, paths["report.png"])
+    paths["report.html"].write_text(_html(episode, config), encoding="utf-8")
+    return paths
+
+
+def end_table(config: Mapping[str, Any], paths: Iterable[Path]) -> Table:
+    """What a person wants to know at the end of a run, as a rich table. `facts` are those of :func:`summary`."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(_title(config)), show_header=False, title_justify="left", min_width=60)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in _results(config):
+        table.add_row(name, Text(value))
+    for number, path in enumerate(paths):
+        table.add_row("files" if number == 0 else "", Text(str(path)))
+    return table
+
+
+def _results(config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    from tacsim.report.timing import timing_rows
+    from tacsim.report.trust import trust_rows
+
+    known = [(value, k) for k, value in zip(config["step"], config["distance"], strict=True) if value is not None]
+    best = min(known, default=None)
+    rewards = [value for value in config["reward"] if value is not None]
+    rows_of_force = zip(config["step"], config["force"], strict=True)
+    forces = [(value, arm, k) for k, row in rows_of_force for arm, value in row.items() if value is not None]
+    peak = max(forces, key=lambda row: row[0], default=None)  # of equal ones the first
+    rows = [
+        ("steps", f"{config['steps']}" + ("" if config["complete"] else " (recording incomplete)")),
+        ("best distance", f"{best[0] * 1e3:.3f} mm at step {best[1]}" if best else "–"),
+        ("final reward", f"{rewards[-1]:.3f}" if rewards else "–"),
+        ("peak force |Fz|", f"{peak[0]:.2f} N ({peak[1]}, step {peak[2]})" if peak else "–"),
+        ("contact signal", _signal_text(config)),
+        ("step time, median", f"{config['seconds_per_step']:.3f} s" if config["seconds_per_step"] is not None else "–"),
+    ]
+    if config["settled"] is not None:
+        rows.append(("settled", f"{config['settled']} of {config['steps']} steps"))
+    if config["timing"] is not None:
+        rows += timing_rows(config["timing"])
+    if config["trust"] is not None:
+        rows += trust_rows(config["trust"])
+    if config["dropped"]:
+        rows.append(("dropped", f"{config['dropped']} steps were not recorded"))
+    return rows
+
+
+def _signal_text(config: Mapping[str, Any]) -> str:
+    parts = []
+    for name, values in config["contact_signal"].items():
+        known = [value for value in values if value is not None]
+        if known:
+            correlation = config["correlation"].get(name)
+            with_force = "" if correlation is None else f", r = {correlation:.3f} with force"
+            parts.append(f"{name}: peak {max(known):.3g}{with_force}")
+    return "; ".join(parts) or "–"
+
+
+def _title(config: Mapping[str, Any]) -> str:
+    return f"{config['task'] or 'episode'} on rig {config['rig']}"
+
+
+def _headline(config: Mapping[str, Any], episode: Episode) -> list[tuple[str, str]]:
+    from tacsim.report.figure import goal_text
+
+    return [
+        ("policy", str(config["policy"])),
+        ("seed", str(config["seed"])),
+        ("steps", str(config["steps"])),
+        ("goal", goal_text(episode.meta.goal)),
+    ]
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _settled(done: list[Step]) -> int | None:
+    told = [step.info["settled"] for step in done if "settled" in step.info]
+    return sum(bool(value) for value in told) if told else None
+
+
+def _inline(content: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
+
+
+def _html(episode: Episode, config: Mapping[str, Any]) -> str:
+    from jinja2 import Environment, StrictUndefined
+
+    from tacsim.report import figure
+
+    strips = []
+    for name in figure.sensors_of(episode):
+        seen = [step for step in episode.steps if name in step.frames]
+        shown = [seen[k] for k in figure.moments(len(seen), FILMSTRIP)]
+        images = [(step.index, _inline(figure.png(step.frames[name].image, THUMBNAIL))) for step in shown]
+        strips.append({"name": name, "frames": images, "total": len(seen)})
+    template = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string(Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8"))
+    return template.render(
+        title=_title(config),
+        config=[("rig", config["rig"]), ("task", config["task"] or "–"), *_headline(config, episode)],
+        results=_results(config),
+        versions=sorted(config["versions"].items()),
+        strips=strips,
+        plots=_inline(figure.png_of(figure.plots(episode))),
+    )

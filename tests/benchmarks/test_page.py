@@ -1,0 +1,163 @@
+"""The command, the page, the picture."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner, Result
+
+from benchmarks.harness.schema import Report
+from benchmarks.pages.page import cells, costs, markdown
+from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
+from robot.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+REFERENCE = ROOT / "benchmarks" / "reference.json"
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    return Report.model_validate_json(REFERENCE.read_bytes())
+
+
+def tacsim(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
+
+
+def test_the_published_page_is_that_of_the_published_report(report: Report) -> None:
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    gpus = sorted((ROOT / "benchmarks" / "gpu").glob("*.json"))
+    devices = [Report.model_validate_json(path.read_bytes()) for path in gpus]
+    files = [path.relative_to(ROOT) for path in (REFERENCE, *gpus)]
+    assert page == markdown(report, devices), f"run: tacsim bench --from {' --from '.join(map(str, files))} --docs docs"
+
+
+def test_the_published_report_is_whole(report: Report) -> None:
+    assert report.failures == []
+    assert {row.group for row in report.results} == {"press", "squeeze", "materials", "scenes", "real"}
+    assert {"tacsim", "layer", "seed", "textbook", "tacchi-settings"} == {row.method for row in report.results}
+
+
+def test_a_row_is_shown_with_time_error_and_memory(report: Report) -> None:
+    row = report.results[0].model_copy(
+        update={
+            "seconds": 0.12345,
+            "spread": 0.02,
+            "error": 3.4567,
+            "error_unit": "%",
+            "peak_mb": 171.3,
+            "variant": "v",
+        }
+    )
+    shown = cells(row)
+    assert shown[0] == f"{row.case}: v"
+    assert "0.123 ± 0.02" in shown and "3.46 %" in shown and "171" in shown
+    beside = row.model_copy(update={"error": 3.4567, "error_unit": "grey", "figures": {"null_grey": 42.17}})
+    assert "3.46 grey (null 42.2)" in cells(beside)
+    bare = row.model_copy(update={"figures": {"wall_per_particle_substep_ns": 75.4, "force_n": 1.0}})
+    assert costs(bare) == ["75 ns wall a substep and particle"]
+
+
+def test_a_report_is_shown_and_written_again_without_measuring(tmp_path: Path, report: Report) -> None:
+    result = tacsim(
+        "bench", "--from", REFERENCE, "--json", tmp_path / "new" / "again.json", "--docs", tmp_path / "docs"
+    )
+    assert result.exit_code == 0, result.output
+    assert "sphere_press" in result.stdout and "tacchi-settings" in result.stdout
+    again = Report.model_validate_json((tmp_path / "new" / "again.json").read_bytes())
+    assert again == report
+    assert imread(tmp_path / "new" / PICTURE).std() > 0.01
+    assert (tmp_path / "docs" / "benchmarks.md").is_file() and (tmp_path / "docs" / "images" / PICTURE).is_file()
+
+
+def test_a_picture_of_nothing_is_drawn_too(tmp_path: Path) -> None:
+    draw([], tmp_path / "empty.png")
+    assert imread(tmp_path / "empty.png").shape[2] in (3, 4)
+
+
+def test_a_failure_is_shown_and_is_the_exit_code(tmp_path: Path, report: Report) -> None:
+    failure = {"group": "press", "case": "lost", "method": "tacsim", "resolution": "h", "cause": "it broke | here"}
+    broken = json.loads(report.model_dump_json()) | {"failures": [failure]}
+    (tmp_path / "broken.json").write_text(json.dumps(broken), encoding="utf-8")
+    result = tacsim("bench", "--from", tmp_path / "broken.json")
+    assert result.exit_code == 1
+    assert "lost" in result.output and "it broke" in result.output
+
+
+def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text('{"results": []}', encoding="utf-8")
+    result = tacsim("bench", "--from", tmp_path / "other.json")
+    assert result.exit_code == 2
+    assert "metadata" in result.output
+    assert tacsim("bench", "--from", tmp_path / "none.json").exit_code != 0
+    assert tacsim("bench", "nothing").exit_code == 2
+    assert tacsim("bench", "--repeat", "0").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "repetitions"),
+    [(["robot"], 1), (["robot", "--long"], 5), (["press"], 5), (["robot", "--repeat", "3"], 3)],
+)
+def test_the_robot_is_measured_once_without_long(
+    monkeypatch: pytest.MonkeyPatch, report: Report, words: list[str], repetitions: int
+) -> None:
+    asked = []
+
+    def run(cases: object, repeat: int, **_: object) -> Report:
+        asked.append(repeat)
+        return report
+
+    monkeypatch.setattr("benchmarks.harness.runner.run_cases", run)
+    assert tacsim("bench", *words).exit_code == 0
+    assert asked == [repetitions]
+
+
+def test_the_page_shows_figures_and_a_missed_one(report: Report) -> None:
+    page = markdown(report)
+    assert "| figure | measured | must | aim | verdict |" in page and "## How to read and rerun" in page
+    late = {"figures": {"second_ms": 99.0}}
+    slow = [row.model_copy(update=late) for row in report.results if row.case == "second_world"]
+    missed = markdown(report.model_copy(update={"results": slow}))
+    assert "| a second world is ready | 99 ms | ≤ 50 |  | **missed** |" in missed
+
+
+def test_the_page_shows_how_long_a_group_takes(report: Report) -> None:
+    def page(**seconds: float) -> str:
+        return markdown(report.model_copy(update={"metadata": report.metadata.model_copy(
+            update={"group_seconds": seconds})}))  # fmt: skip
+
+    name = "a group without `--baselines` and `--long`"
+    assert f"| {name} (press 12 s, squeeze 39 s) | 39.4 s | ≤ 40 |  | met |" in page(press=12.3, squeeze=39.4)
+    assert f"| {name} (press 41 s) | 41 s | ≤ 40 |  | **missed** |" in page(press=41.0)
+    assert f"| {name} |  | ≤ 40 |  | not measured |" in page()
+
+
+def test_real_rows_bring_their_picture(tmp_path: Path, report: Report) -> None:
+    figures = {"depth_mm": 0.5, "ball_radius_mm": 3.0, "thickness_mm": 10.0, "real_px": 20.0, "pressure_px": 21.0}
+    changes = {"group": "real", "case": "contact_radius", "variant": "R 3 mm: image", "figures": figures}
+    row = report.results[0].model_copy(update=changes)
+    made_up = report.model_copy(update={"results": [row for row in report.results if row.group != "real"]})
+    more = made_up.model_copy(update={"results": [*made_up.results, row]})
+    assert f"](images/{RADII})" in markdown(more) and f"](images/{RADII})" not in markdown(made_up)
+    assert not draw_radii(made_up.results, tmp_path / RADII) and not (tmp_path / RADII).exists()
+    (tmp_path / "real.json").write_text(more.model_dump_json(), encoding="utf-8")
+    result = tacsim("bench", "--from", tmp_path / "real.json", "--docs", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert imread(tmp_path / "images" / RADII).std() > 0.01
+
+
+def test_help_and_schema() -> None:
+    assert "Example: tacsim bench" in tacsim("bench", "--help").stdout
+    schema = json.loads(tacsim("schema", "bench").stdout)
+    assert set(schema["required"]) == {"metadata", "results"}
+
+
+def test_listing_the_cases_starts_no_taichi() -> None:
+    code = "import sys, benchmarks.cases.registry, benchmarks.pages.page; print('taichi' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "False"

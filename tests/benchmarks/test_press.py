@@ -1,0 +1,56 @@
+"""Press group: our own presses against the truths that they are measured with."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.cases import press
+from benchmarks.harness.measure import Measurement
+
+
+def forces(coarse: Measurement, fine: Measurement, order: int) -> tuple[float, float]:
+    """Of the limit of fine meshes, from two of which the second is twice as fine; and of the layer [N]."""
+    assert coarse.figures["truth_n"] == fine.figures["truth_n"]
+    weight = 2**order
+    limit = (weight * fine.figures["force_n"] - coarse.figures["force_n"]) / (weight - 1)
+    return limit, fine.figures["truth_n"]
+
+
+def test_a_balls_dent_is_that_of_fine_meshes() -> None:
+    """2.1 um rms of 1 mm; by the largest, an edge of contact is in the wrong cell."""
+    (row,) = press.sphere_press(0.5e-3, 1)
+    assert row.note == ""
+    assert row.error < 2.4  # um rms
+    assert row.error < row.figures["largest_um"] < 25
+    assert row.figures["overlap_um"] < 5
+
+
+def test_a_press_ends_where_a_slow_one_does() -> None:
+    settled, *speeds = press.quasi_static(1)
+    assert settled.error < 1.2 and settled.figures["force_percent"] < 0.5
+    by_mach = dict(zip(press.OTHERS, speeds, strict=True))
+    for mach, most in ((0.015, 3.0), (0.05, 5.0), (0.1, 25.0)):  # um at most
+        row = by_mach[mach]
+        assert 0 < row.figures["rms_um"] < row.error < most
+        assert row.substeps is not None and settled.substeps is not None
+        assert (row.substeps > settled.substeps) == (mach < press.USUAL)
+
+
+def test_a_shallow_balls_force_goes_to_that_of_an_elastic_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With h^2, within a percent of the layer's."""
+    monkeypatch.setattr(press, "FORCE_DEPTHS", (0.3e-3,))
+    fine, incompressible = press.sphere_force(0.5e-3, 1)
+    assert fine.error < 5.0 and incompressible.error < 3.5  # %
+    assert incompressible.figures["force_n"] > fine.figures["force_n"]
+    monkeypatch.setattr(press, "FORCE_RATIOS", (0.45,))
+    (coarse,) = press.sphere_force(1e-3, 1)
+    limit, truth = forces(coarse, fine, order=2)
+    assert limit == pytest.approx(truth, rel=0.015)
+
+
+def test_a_flat_punchs_force_goes_to_that_of_an_elastic_layer() -> None:
+    """With h, since the mesh widens the punch by a share of an element; within a percent of the layer's."""
+    ((coarse,), (fine,)) = (press.flat_punch(h, 1) for h in (1e-3, 0.5e-3))
+    assert fine.error < 14.0  # %
+    limit, truth = forces(coarse, fine, order=1)
+    assert limit == pytest.approx(truth, rel=0.01)

@@ -1,0 +1,266 @@
+"""The calibration loop on made-up sensors whose lights nobody tells the calibrator."""
+
+import numpy as np
+import pytest
+
+from calibration.height.depth import Integrator
+from calibration.height.inverse import PolynomialSlopes, to_normal
+from calibration.light.ball_press import BadPresses, Fit, calibrate_light, normal_angle
+from calibration.light.dent import ContactCircle, Skirt, dent_gradient
+from calibration.markers.dots import DotEraser
+from tacsim.models.photometric import PhotometricLight, place_in_image, places_in_image
+from tests.calibration.dotted import draw, lattice_points
+from tests.calibration.presses import BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
+
+
+def named(presses: list[Made]) -> list[tuple[str, np.ndarray]]:
+    return [(f"press {i}", press.image) for i, press in enumerate(presses)]
+
+
+def found_slopes(fit: Fit, image: np.ndarray) -> np.ndarray:
+    """(H, W, 2) by the inverse model."""
+    import cv2
+
+    reference = fit.reference.astype(np.float32)
+    change = cv2.GaussianBlur((image - reference) / reference.mean(axis=(0, 1)), (0, 0), 1.2)
+    u, v = place_in_image(COLUMNS, ROWS)
+    slopes, _ = PolynomialSlopes(fit.inverse, *np.meshgrid(2 * u, 2 * v))(change)
+    return slopes
+
+
+def angle_in_contact(fit: Fit, unseen: Made) -> float:
+    v, u = np.mgrid[:ROWS, :COLUMNS]
+    inside = np.hypot(u - unseen.circle[0], v - unseen.circle[1]) < unseen.circle[2]
+    angles = normal_angle(to_normal(found_slopes(fit, unseen.image).astype(float)), to_normal(unseen.gradient))
+    return float(angles[inside].mean())
+
+
+@pytest.fixture(scope="module", params=[3, 11])
+def sensor(request: pytest.FixtureRequest) -> HiddenSensor:
+    return HiddenSensor(request.param)
+
+
+@pytest.fixture(scope="module")
+def calibrated(sensor: HiddenSensor) -> tuple[Fit, list[Made]]:
+    presses = sensor.presses(6)
+    return calibrate_light(sensor.empty(), named(presses), BALL_PX), presses
+
+
+def test_circles_are_found_without_a_click(calibrated: tuple[Fit, list[Made]]) -> None:
+    fit, presses = calibrated
+    assert fit.left_out == ()
+    assert fit.warnings == ()
+    for press, truth in zip(fit.presses, presses, strict=True):
+        assert (press.circle.x, press.circle.y) == pytest.approx(truth.circle[:2], abs=0.5)
+        assert press.circle.radius == pytest.approx(truth.circle[2], abs=0.8)
+
+
+def test_normals_of_an_unseen_press_come_back_within_a_degree(
+    sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]
+) -> None:
+    assert angle_in_contact(calibrated[0], sensor.press(0.5e-3, 150, 90)) < 1.1
+
+
+def test_depth_of_an_unseen_press_comes_back(sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]) -> None:
+    """Within 4 %: the true surface is Hertz's, whose skirt reaches farther than the one that is assumed."""
+    unseen = sensor.press(0.5e-3, 150, 90)
+    found = Integrator((ROWS, COLUMNS), PITCH)(found_slopes(calibrated[0], unseen.image))
+    border = np.r_[unseen.height[0], unseen.height[-1], unseen.height[:, 0], unseen.height[:, -1]]
+    assert float(found.max()) == pytest.approx(float(unseen.height.max() - np.median(border)), rel=0.04)
+
+
+def test_skirt_and_depth_come_back_where_the_gel_is_as_assumed() -> None:
+    """Dents with an exponential skirt, their rim smooth over a pixel as a gel's is, integrated along r in closed form.
+    What is left, 2 %, is the blur before the inverse."""
+    sensor, skirt = HiddenSensor(5), Skirt(0.25 * BALL_PX, 0.6)
+    v, u = np.mgrid[:ROWS, :COLUMNS].astype(float)
+
+    def pressed(x: float, y: float, radius: float) -> np.ndarray:
+        return sensor.photograph(dent_gradient(u, v, ContactCircle(x, y, radius), skirt, BALL_PX, 1.0))
+
+    places = [(70, 60, 14), (190, 140, 12), (130, 100, 16), (60, 150, 13), (200, 60, 15), (100, 50, 10), (160, 60, 16)]
+    frames = [(f"{i}", pressed(*place)) for i, place in enumerate(places)]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    assert fit.skirt.length == pytest.approx(skirt.length, rel=0.15)
+    assert fit.skirt.fraction == pytest.approx(skirt.fraction, rel=0.15)
+    radius = 15.0
+    rim = skirt.fraction * radius / np.sqrt(BALL_PX**2 - radius**2)
+    depth = (BALL_PX - np.sqrt(BALL_PX**2 - radius**2) + rim * skirt.length) * PITCH
+    found = Integrator((ROWS, COLUMNS), PITCH)(found_slopes(fit, pressed(125.0, 105.0, radius)))
+    assert float(found.max()) == pytest.approx(depth, rel=0.03)
+
+
+def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]) -> None:
+    fit, _ = calibrated
+    unseen = sensor.press(0.45e-3, 140, 110)
+    places = places_in_image(COLUMNS, ROWS)
+    change, _ = PhotometricLight(fit.forward).change(unseen.gradient.astype(np.float32), *places)
+    drawn = fit.reference + change * fit.reference.mean(axis=(0, 1))
+    v, u = np.mgrid[:ROWS, :COLUMNS]
+    near = np.hypot(u - unseen.circle[0], v - unseen.circle[1]) < 1.5 * unseen.circle[2]
+    error = np.abs(drawn - unseen.image)[near].mean()
+    nothing = np.abs(fit.reference - unseen.image.astype(float))[near].mean()
+    assert nothing > 12.0
+    assert error < 3.0  # two frames with a noise of 1.5 differ by 1.7
+
+
+def test_left_out_scores_are_those_of_presses_nobody_has_seen(calibrated: tuple[Fit, list[Made]]) -> None:
+    for score in calibrated[0].scores:
+        assert score.error < 0.25 * score.nothing
+        assert score.correlation > 0.97
+        assert score.untouched_angle < 0.6
+    assert np.median([score.angle for score in calibrated[0].scores]) < 2.0
+
+
+def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None:
+    """The bright side of every press is white in one channel. The other two still show the slope there, and what the
+    camera cut off is not asked of the model."""
+    lit, burnt = HiddenSensor(3), HiddenSensor(3)
+    colour = int(np.argmax(lit.empty().mean(axis=(0, 1))))
+    burnt._base = burnt._base + 110.0 * np.eye(3)[colour]
+    fits = []
+    for sensor in (lit, burnt):
+        fits.append(calibrate_light(sensor.empty(), named(sensor.presses(6)), BALL_PX))
+    shares = [1.0 - press.lit.mean() for press in fits[1].presses]
+    assert min(shares) > 0.001 and len(fits[1].scores) == 6
+    wanted = np.mean([score.error for score in fits[0].scores])
+    assert np.mean([score.error for score in fits[1].scores]) < 1.05 * wanted
+    unseen = burnt.press(0.5e-3, 150, 90)
+    assert angle_in_contact(fits[1], unseen) < 1.2
+
+
+def test_one_press_gives_a_plain_model_and_a_warning(sensor: HiddenSensor) -> None:
+    fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, 130, 100)]), BALL_PX)
+    assert (fit.order.degree, fit.order.position) == (3, 0)
+    assert fit.scores == ()
+    assert any("only one press" in warning for warning in fit.warnings)
+    assert angle_in_contact(fit, sensor.press(0.45e-3, 110, 110)) < 2.0
+
+
+def test_a_drifting_lamp_does_no_harm(sensor: HiddenSensor) -> None:
+    presses = sensor.presses(6)
+    ramp = np.linspace(-8, 8, COLUMNS)[None, :, None] + np.array([5.0, -3.0, 0.0])
+    drifted = [
+        sensor.press(0.5e-3, p.circle[0], p.circle[1], drift=ramp) if i == 2 else p for i, p in enumerate(presses)
+    ]
+    fit = calibrate_light(sensor.empty(), named(drifted), BALL_PX)
+    assert fit.left_out == ()
+    assert fit.scores[2].error < 0.3 * fit.scores[2].nothing
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda sensor: sensor.empty(), "no ball's contact"),
+        (lambda sensor: np.maximum(sensor.press(0.5e-3, 70, 60).image, sensor.press(0.5e-3, 190, 140).image), "second"),
+        (lambda sensor: sensor.press(0.5e-3, 130, 100).image[..., ::-1].copy(), "unexplained|no ball's contact"),
+        (lambda sensor: np.clip(sensor.press(0.5e-3, 130, 100, drift=160.0).image, 0, 255), "saturated|no ball"),
+    ],
+    ids=["no contact", "two balls", "swapped colours", "saturated"],
+)
+def test_a_bad_frame_is_left_out_and_says_why(sensor: HiddenSensor, spoil, why: str) -> None:
+    frames = [*named(sensor.presses(5)), ("bad", spoil(sensor))]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    assert [name for name, _ in fit.left_out] == ["bad"]
+    import re
+
+    assert re.search(why, fit.left_out[0][1])
+    assert angle_in_contact(fit, sensor.press(0.5e-3, 150, 90)) < 1.3
+
+
+def test_a_ball_smaller_than_its_contact_is_doubted(sensor: HiddenSensor) -> None:
+    fit = calibrate_light(sensor.empty(), named(sensor.presses(6)), 0.4 * BALL_PX)
+    assert any("is the ball's radius (or the pixel pitch) right" in warning for warning in fit.warnings)
+
+
+def test_a_picture_without_contact_of_another_light_is_doubted(sensor: HiddenSensor) -> None:
+    stale = np.clip(sensor.empty() + np.array([15, 0, 3]), 0, 255).astype(np.uint8)
+    fit = calibrate_light(stale, named(sensor.presses(5)), BALL_PX)
+    assert fit.left_out == ()
+    assert [words for words in fit.warnings if "with the same light, just before?" in words]
+    assert angle_in_contact(fit, sensor.press(0.5e-3, 150, 90, drift=np.array([15.0, 0, 3]))) < 2.0  # it is removed
+
+
+def test_a_picture_without_contact_that_shows_one_is_doubted(sensor: HiddenSensor) -> None:
+    presses = sensor.presses(5)
+    with pytest.raises(BadPresses, match="second contact"):
+        calibrate_light(presses[0].image, named(presses), BALL_PX)
+    frames = [("empty", sensor.empty()), ("again", sensor.empty()), *named(presses[1:2])]
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    assert any("does the picture without contact really show none?" in words for words in fit.warnings)
+
+
+@pytest.mark.parametrize("which", ["frames", "reference"])
+def test_exchanged_colours_are_called_by_their_name(sensor: HiddenSensor, which: str) -> None:
+    frames, reference = named(sensor.presses(3)), sensor.empty()
+    if which == "frames":
+        frames = [(name, image[..., ::-1].copy()) for name, image in frames]
+    else:
+        reference = reference[..., ::-1].copy()
+    with pytest.raises(BadPresses, match="only with red and blue exchanged"):
+        calibrate_light(reference, frames, BALL_PX)
+
+
+def test_presses_in_one_place_are_doubted(sensor: HiddenSensor) -> None:
+    places = [(130, 100), (140, 104), (124, 96)]
+    fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, *place) for place in places]), BALL_PX)
+    assert any("all presses are in one place" in words for words in fit.warnings)
+
+
+def test_a_press_of_another_ball_is_left_out(sensor: HiddenSensor) -> None:
+    other = sensor.press(0.5e-3, 60, 150, ball=2 * BALL_PX)
+    fit = calibrate_light(sensor.empty(), [*named(sensor.presses(4)), ("other", other.image)], BALL_PX)
+    doubted = [name for name, _ in fit.left_out] + [words.partition(" ")[0] for words in fit.warnings]
+    assert doubted == ["other"]
+
+
+def test_a_wrong_radius_scales_every_slope_and_nothing_gives_it_away(sensor: HiddenSensor) -> None:
+    """Why the ball must be measured: the docs say so."""
+    right, wrong = (calibrate_light(sensor.empty(), named(sensor.presses(4)), k * BALL_PX) for k in (1.0, 1.3))
+    assert wrong.warnings == right.warnings == ()
+    assert wrong.steepest < 0.85 * right.steepest
+
+
+def test_nothing_usable_is_refused_with_every_reason(sensor: HiddenSensor) -> None:
+    with pytest.raises(BadPresses, match=r"(?s)a: no ball's contact.*b: no ball's contact"):
+        calibrate_light(sensor.empty(), [("a", sensor.empty()), ("b", sensor.empty())], BALL_PX)
+    with pytest.raises(BadPresses, match="no frame of a press"):
+        calibrate_light(sensor.empty(), [], BALL_PX)
+
+
+def test_frames_of_another_size_are_named(sensor: HiddenSensor) -> None:
+    small = sensor.press(0.5e-3, 70, 60).image[:100]
+    with pytest.raises(BadPresses, match=r"small \(260 x 100\)"):
+        calibrate_light(sensor.empty(), [*named(sensor.presses(1)), ("small", small)], BALL_PX)
+
+
+def test_printed_dots_that_move_are_erased() -> None:
+    """Dots sink in and aside under a ball; taken for light, they would spoil circles and colours."""
+    sensor = HiddenSensor(5)
+    rest = lattice_points(8, 10, 24.0) + [(COLUMNS - 1) / 2, (ROWS - 1) / 2]
+
+    def dotted(made: Made | None) -> np.ndarray:
+        moved = rest
+        if made is not None:
+            away = rest - made.circle[:2]
+            distance = np.linalg.norm(away, axis=-1, keepdims=True)
+            moved = rest + 3.0 * away / distance * np.exp(-((distance / made.circle[2] - 1) ** 2))
+        image = sensor.empty() if made is None else made.image
+        return draw(moved, 4.0, (ROWS, COLUMNS), light=image.astype(float))
+
+    presses, reference = sensor.presses(6), dotted(None)
+    frames = [(f"press {i}", dotted(press)) for i, press in enumerate(presses)]
+    plain = calibrate_light(sensor.empty(), named(presses), BALL_PX)
+    erased = calibrate_light(reference, frames, BALL_PX, DotEraser(4.0))
+    assert erased.left_out == ()
+    for press, truth in zip(erased.presses, presses, strict=True):
+        assert (press.circle.x, press.circle.y) == pytest.approx(truth.circle[:2], abs=1.0)
+        assert press.circle.radius == pytest.approx(truth.circle[2], abs=1.5)
+
+    def left_out_error(fit: Fit) -> float:
+        return float(np.mean([score.error for score in fit.scores]))
+
+    assert left_out_error(erased) < 1.5 * left_out_error(plain)
+    np.testing.assert_array_equal(erased.reference, reference)
+    with pytest.raises(BadPresses, match="no frame can be used"):
+        calibrate_light(reference, frames, BALL_PX)

@@ -1,0 +1,49 @@
+"""The contact circle is found in images whose light the fit does not know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.light.circle import NoCircle, contact_circle, dent_slope
+
+PITCH = 0.0625e-3
+
+
+@pytest.mark.parametrize(
+    ("ball", "depth", "centre"),
+    [(2e-3, 0.2e-3, (100, 100)), (3e-3, 0.5e-3, (80, 115)), (5e-3, 0.8e-3, (110, 95)), (3e-3, 0.5e-3, (180, 30))],
+    ids=["small", "middle", "large", "near a corner"],
+)
+def test_the_circle_is_that_of_the_contact(
+    press_image: Callable[..., Any], ball: float, depth: float, centre: tuple[int, int]
+) -> None:
+    image, empty, truth = press_image(ball, depth, centre)
+    found = contact_circle(image, empty, ball / PITCH)
+    assert (found.x, found.y) == pytest.approx(centre, abs=0.7)
+    assert found.radius == pytest.approx(truth, abs=1.2)
+    assert found.explained > 0.85
+
+
+def test_the_slope_is_the_balls_inside_meets_it_at_the_rim_and_dies_away() -> None:
+    r = np.array([0.5, 1.0 - 1e-9, 1.0 + 1e-9, 1.5, 20.0])
+    slope = dent_slope(r, 1.0, 3.0)
+    assert slope[0] == pytest.approx(0.5 / np.sqrt(9 - 0.25))
+    assert slope[1] == pytest.approx(slope[2], rel=1e-3)
+    assert slope[2] > slope[3] > slope[4]
+    # far away Hertz is a point force: u = 4 a^3 / (3 pi R r)
+    assert slope[4] * np.sqrt(9 - 1) == pytest.approx(4 / (3 * np.pi * 400), rel=0.01)
+
+
+def test_what_shows_no_ball_is_refused(press_image: Callable[..., Any]) -> None:
+    _, empty, _ = press_image(3e-3, 0.5e-3, (100, 100))
+    with pytest.raises(NoCircle, match="is the one without contact"):
+        contact_circle(empty, empty, 48.0)
+    noisy = np.clip(empty + np.random.default_rng(5).normal(0, 4, empty.shape), 0, 255).astype(np.uint8)
+    with pytest.raises(NoCircle, match="70% are needed"):
+        contact_circle(noisy, empty, 48.0)
+    with pytest.raises(ValueError, match="of one camera"):
+        contact_circle(empty[:100], empty, 48.0)

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from calibration.markers.dots import DotFinder
+from tests.calibration.dotted import draw, lattice_points, uneven
+
+MIDDLE = np.array([159.3, 119.8])
+
+
+def found_near(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(n,) distance from each true dot to the nearest found one [px]."""
+    return np.linalg.norm(true.reshape(-1, 2)[:, None] - found[None], axis=2).min(axis=1)
+
+
+@pytest.mark.parametrize("radius", [2.5, 4.0, 7.0])
+def test_centres_are_found_to_a_fraction_of_a_pixel(radius: float) -> None:
+    true = lattice_points(6, 8, 5.3 * radius, angle=0.1) + MIDDLE
+    dots = DotFinder(radius)(draw(true, radius, noise=1.0))
+    assert len(dots.centres) == 48
+    assert np.sqrt((found_near(dots.centres, true) ** 2).mean()) < 0.04
+    assert dots.radius == pytest.approx(radius, rel=0.25)
+
+
+def test_dots_are_found_in_uneven_light_and_across_a_step_of_it() -> None:
+    true = lattice_points(8, 10, 25.0) + MIDDLE
+    away = found_near(DotFinder(4.0)(draw(true, 4.0, light=uneven(), noise=1.5)).centres, true)
+    assert (away < 0.5).all()
+    assert np.median(away) < 0.05
+
+
+def test_a_step_of_light_and_a_line_are_no_dots() -> None:
+    light = uneven()
+    light[:, 60:66] *= 0.4  # a scratch
+    dots = DotFinder(4.0)(draw(np.zeros((0, 2)), 4.0, light=light, noise=1.5))
+    assert len(dots.centres) == 0
+
+
+def test_dots_of_other_sizes_are_found_and_specks_are_not() -> None:
+    true = np.array([(60.0, 60.0), (150.0, 60.0), (240.0, 60.0)])
+    image = np.minimum(draw(true[:1], 3.0), np.minimum(draw(true[1:2], 5.0), draw(true[2:], 7.5)))
+    image = np.minimum(image, draw(np.array([(100.0, 150.0)]), 1.0))
+    centres = DotFinder(5.0)(image).centres
+    assert len(centres) == 3
+    assert (found_near(centres, true) < 0.1).all()
+
+
+def test_a_dot_on_a_dark_ridge_is_parted_from_it() -> None:
+    """As between the ridges of a fingerprint: the lowest level joins both."""
+    light = np.full((240, 320, 3), 150.0)
+    light[:, 96:103] = 105.0
+    true = np.array([(99.0, 80.0), (99.0, 160.0)])
+    assert (found_near(DotFinder(5.0)(draw(true, 5.0, light=light)).centres, true) < 0.5).all()
+
+
+def test_a_dark_or_empty_picture_shows_nothing() -> None:
+    for level in (0, 90, 255):
+        assert len(DotFinder(3.0)(np.full((60, 80, 3), level, dtype=np.uint8)).centres) == 0
+
+
+def test_dots_too_small_to_be_found_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"radius 0\.9 px cannot be found"):
+        DotFinder(0.9)

@@ -1,0 +1,97 @@
+"""The worker process by itself: what it loads, and how it ends when nobody wants it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from robot.arm import shared_ring, worker
+from robot.arm.channel import ArmStatus, Link, Orders
+from robot.arm.ur import _orders
+from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
+
+ROOT = Path(worker.__file__).parents[2]
+NOBODY = f"127.223.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+
+
+def orders(segment: str, **changes: object) -> Orders:
+    box = Workspace(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
+    config = UrArmConfig(
+        driver="ur",
+        host=NOBODY,
+        world_from_base=Placement(),
+        limits=ArmLimits(workspace=box),
+        mock=MockArmConfig(),
+    )
+    return dataclasses.replace(_orders(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
+
+
+def start(text: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "robot.arm.worker"],
+        input=text,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def test_it_starts_light() -> None:
+    """A new worker has half a second; SciPy or pydantic alone take that long."""
+    heavy = {"scipy", "pydantic", "taichi", "cv2", "rtde_control", "rtde_receive"}
+    code = (
+        f"import sys, robot.arm.worker; print(*sorted({{name.partition('.')[0] for name in sys.modules}} & {heavy!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.split() == []
+
+
+def test_every_variable_is_in_the_librarys_own_table() -> None:
+    """A name that the library does not know shifts all fields after it, without a word."""
+    receive = pytest.importorskip("rtde_receive", reason="ur_rtde has no wheel for this Python")
+    library = Path(receive.__file__).read_bytes()
+    # The compiled library carries its table's names as text.
+    assert [name for name in worker.VARIABLES if name.encode() not in library] == []
+
+
+def test_nobody_else_imports_the_library() -> None:
+    names = {"rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
+    found = set()
+    for path in (path for package in ("tacsim", "calibration", "robot") for path in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            imported = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                imported = [node.module]
+            if names & {module.partition(".")[0] for module in imported}:
+                found.add(path.relative_to(ROOT).as_posix())
+    assert found == {"robot/arm/worker.py"}
+
+
+def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
+    segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "failing"), Link.SIZE)
+    try:
+        done = start(orders(segment.name).to_json())
+        assert done.returncode == worker.FAILED
+        told = json.loads(done.stdout)
+        assert told["error"] == "DeviceNotConnectedError"
+        assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["text"]
+        latest = Link(segment).states.latest()
+        assert latest is not None and latest["status"] == ArmStatus.CONNECTING
+    finally:
+        segment.close()
+
+
+def test_without_memory_to_write_to_it_says_so() -> None:
+    done = start(orders("tacsim-0-missing").to_json())
+    assert done.returncode == worker.FAILED
+    assert "No such file" in json.loads(done.stdout)["text"]

@@ -1,0 +1,421 @@
+"""The camera driver against the mock camera: ages, drops, faults, reopening, and what is left behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from robot.camera import stamp
+from robot.camera.camera import BACK_OFF, Camera, StaleFrame
+from robot.camera.picture import WrongSource
+from robot.errors import DeviceNotConnectedError, StaleObservationError
+from robot.mock.camera.camera import MockCamera
+from tacsim.interface import EndOfEpisode, TactileFrame, TactileSource
+from tacsim.models.hardware import CameraSensorConfig
+
+HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+WAIT = 20.0  # for what must come, however slow the machine [s]
+
+
+def config(source: object, **options: object) -> CameraSensorConfig:
+    known: dict[str, object] = {"width": 320, "height": 240, "fps": 30.0, "max_age": 1.0}
+    return CameraSensorConfig.model_validate({"driver": "camera", "source": str(source), **known, **options})
+
+
+def stamped(mock: MockCamera, **options: object) -> CameraSensorConfig:
+    return config(mock.url, stamped=True, **options)
+
+
+def grey(value: int) -> np.ndarray:
+    return np.full((240, 320, 3), value, dtype=np.uint8)
+
+
+def until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT
+    while not holds():
+        assert time.monotonic() < deadline, "it never came"
+        time.sleep(0.005)
+
+
+def sockets() -> set[str]:
+    targets = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    return {target for target in targets if target.startswith("socket:")}
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left() -> Iterator[None]:
+    threads, open_sockets = set(threading.enumerate()), sockets()
+    yield
+    assert [t.name for t in set(threading.enumerate()) - threads if t.name.startswith("camera")] == []
+    assert sockets() - open_sockets == set()
+
+
+@pytest.fixture
+def mock() -> Iterator[MockCamera]:
+    with MockCamera(host=HOST) as mock:
+        yield mock
+
+
+def newer(camera: Camera, than: TactileFrame) -> TactileFrame:
+    deadline = time.monotonic() + WAIT
+    while (frame := camera.read(WAIT)).index <= than.index:
+        assert time.monotonic() < deadline, "no newer frame came"
+        time.sleep(0.002)
+    return frame
+
+
+def test_delivers_the_picture_without_its_strip(mock: MockCamera) -> None:
+    picture = grey(120)
+    picture[:, :160] = (200, 100, 50)
+    number = mock.push(picture)
+    with Camera(stamped(mock, arm=None), "left") as camera:
+        source: TactileSource = camera
+        assert source.spec.image_shape == (240, 320) and not source.spec.height and source.spec.arm is None
+        frame = camera.wait_for(number, WAIT)
+    assert frame.image.shape == (240, 320, 3) and frame.image.dtype == np.uint8 and frame.surface is None
+    assert np.abs(frame.image[:, :150].reshape(-1, 3).mean(axis=0) - (200, 100, 50)).max() < 3  # RGB, not BGR
+    with pytest.raises(ValueError, match="read-only"):
+        frame.image[0] = 0
+
+
+def test_status_and_times(mock: MockCamera) -> None:
+    with Camera(stamped(mock), "left") as camera:
+        first = camera.read(WAIT)
+        until(lambda: camera.status.frames > 20)
+        frame, status = camera.read(WAIT), camera.status
+    assert status.open and status.clock == "stamp" and status.damaged == 0 and status.reopened == 0
+    assert status.error is None and status.fps is not None and 3 < status.fps < 45
+    assert status.age is not None and 0 < status.age < 1.0
+    assert frame.time > first.time and frame.index - first.index >= 19
+
+
+def test_between_two_exposures_the_same_frame_comes_again_with_the_same_index() -> None:
+    with (
+        MockCamera(host=HOST, fps=0.2) as mock,
+        Camera(stamped(mock, fps=0.2, max_age=60.0), "left", connect_timeout=WAIT) as camera,
+    ):
+        one, two = camera.read(WAIT), camera.read(WAIT)
+        assert one is two
+
+
+def test_lock_step(mock: MockCamera) -> None:
+    with Camera(stamped(mock), "left") as camera:
+        for value in (10, 60, 110, 160, 210):
+            frame = camera.wait_for(mock.push(grey(value)), WAIT)
+            assert abs(float(frame.image.mean()) - value) < 3
+        assert camera.image_number == 5 and camera.stamp is not None and camera.stamp.image == 5
+        with pytest.raises(StaleFrame, match=r"no frame of picture 6 within .* shows picture 5"):
+            camera.wait_for(6, 0.2)
+
+
+def test_a_consumer_that_pauses_gets_the_newest_frame(mock: MockCamera) -> None:
+    """Promise 11, counted in frames: at most two periods behind, most of the time, however long it has paused."""
+    behind = []
+    with Camera(stamped(mock), "left") as camera:
+        for _ in range(9):
+            time.sleep(0.4)
+            newest = mock.state().frames
+            camera.read(WAIT)
+            assert camera.stamp is not None
+            behind.append(newest - camera.stamp.frame)
+    assert sorted(behind)[len(behind) // 2] <= 2 and max(behind) <= 8  # a queue would hold twelve after each pause
+
+
+def test_lost_frames_are_gaps_in_the_index(mock: MockCamera) -> None:
+    with Camera(stamped(mock), "left") as camera:
+        first, start = camera.read(WAIT), camera.stamp
+        mock.drop(0.5)
+        until(lambda: mock.state().dropped > 10)
+        mock.drop(0.0)
+        last = newer(camera, camera.read(WAIT))
+        mark, status = camera.stamp, camera.status
+    assert start is not None and mark is not None and status.dropped >= 5
+    assert abs((last.index - first.index) - (mark.frame - start.frame)) <= 2  # a frame may come between two lines here
+
+
+def test_a_delay_is_seen_as_age(mock: MockCamera) -> None:
+    mock.delay(0.3)
+    with Camera(stamped(mock), "left") as camera:
+        until(lambda: camera.status.frames > 12)
+        assert time.monotonic() - camera.read(WAIT).time > 0.299
+
+
+def test_frames_beyond_the_age_limit_are_refused(mock: MockCamera) -> None:
+    with Camera(stamped(mock, max_age=0.25), "left") as camera:
+        camera.read(WAIT)
+        mock.delay(0.4)
+        until(lambda: mock.state().frames > 60)
+        with pytest.raises(StaleFrame, match="ms old, limit 250 ms"):
+            camera.read(0.1)
+        mock.delay(0.0)
+        assert time.monotonic() - camera.read(WAIT).time < 1.0
+
+
+def test_a_stall_is_a_timeout_then_a_new_opening(mock: MockCamera) -> None:
+    with Camera(stamped(mock, max_age=0.2), "left") as camera:
+        before = camera.read(WAIT)
+        mock.stall(True)
+        until(lambda: camera.status.reopened >= 1)
+        with pytest.raises(TimeoutError, match=r"no frame within 0.05 s") as caught:
+            camera.read(0.05)
+        assert isinstance(caught.value, StaleObservationError)
+        mock.stall(False)
+        assert newer(camera, before).time > before.time
+
+
+def test_cut_clients_come_back(mock: MockCamera) -> None:
+    with Camera(stamped(mock), "left") as camera:
+        before = camera.read(WAIT)
+        assert mock.disconnect() == 1
+        until(lambda: camera.status.reopened == 1)
+        assert newer(camera, before).index > before.index
+        assert camera.status.open
+
+
+def test_a_camera_that_is_killed_and_started_again(mock: MockCamera) -> None:
+    with Camera(stamped(mock, max_age=0.2), "left") as camera:
+        before = camera.read(WAIT)
+        os.kill(mock.pid, signal.SIGKILL)
+        until(lambda: not camera.status.open)
+        time.sleep(0.5)
+        with pytest.raises(StaleFrame):
+            camera.read(0.05)
+        assert camera.status.error is not None and mock.url in camera.status.error
+        with MockCamera(host=HOST, port=mock.port) as again:
+            after = newer(camera, before)
+            assert again.state().clients == 1
+    # The numbers of the stamps began anew, above or below the last; the interruption counts by time: 0.5 s at least.
+    assert after.index - before.index >= 10
+    assert camera.status.dropped >= 9
+    assert BACK_OFF[1] < 1.0  # promise 11: reopened within a second of its return
+
+
+def test_a_source_that_refuses_for_a_while(mock: MockCamera) -> None:
+    mock.refuse(True)
+    threading.Timer(0.5, mock.refuse, (False,)).start()
+    with Camera(stamped(mock), "left", connect_timeout=WAIT) as camera:
+        assert camera.read(WAIT).index >= 0
+
+
+def test_damaged_pictures_are_counted_and_never_delivered(mock: MockCamera) -> None:
+    mock.push(grey(200))
+    with Camera(stamped(mock, max_age=0.2), "left") as camera:
+        before = camera.read(WAIT)
+        mock.corrupt(True)
+        until(lambda: camera.status.damaged > 10)
+        time.sleep(0.25)
+        with pytest.raises(StaleFrame):
+            camera.read(0.05)
+        assert camera.status.open and camera.status.reopened == 0
+        mock.corrupt(False)
+        after = newer(camera, before)
+        assert abs(float(after.image.mean()) - 200) < 3
+        assert after.index - before.index > 10
+
+
+def test_another_size_is_refused_until_it_is_right_again(mock: MockCamera) -> None:
+    with Camera(stamped(mock), "left") as camera:
+        before = camera.read(WAIT)
+        mock.resize(160, 120)
+
+        def refused() -> bool:
+            try:
+                camera.read(0.05)
+            except WrongSource as error:
+                return "frames are 160 x 152 px, expected are 320 x 256" in str(error)
+            return False
+
+        until(refused)
+        mock.resize(320, 240)
+
+        def mended() -> bool:
+            try:
+                return camera.read(0.05).index > before.index
+            except WrongSource:
+                return False
+
+        until(mended)
+
+
+@pytest.mark.parametrize(("width", "height"), [(320, 241), (640, 480), (16, 16)])
+def test_a_source_of_another_size_is_not_opened(mock: MockCamera, width: int, height: int) -> None:
+    with pytest.raises(WrongSource, match="frames are 320 x 256 px, expected are"):
+        Camera(stamped(mock, width=width, height=height), "left")
+
+
+def test_a_stamped_source_needs_stamps() -> None:
+    with MockCamera(host=HOST, height=256, stamped=False) as mock:
+        with pytest.raises(DeviceNotConnectedError, match="without a readable stamp"):
+            Camera(config(mock.url, stamped=True), "left", connect_timeout=2.0)
+        with Camera(config(mock.url, height=256, latency=0.05), "left") as camera:
+            frame = camera.read(WAIT)
+            assert frame.image.shape == (256, 320, 3) and camera.status.clock == "arrival"
+            assert time.monotonic() - frame.time > 0.05 and camera.image_number is None
+            with pytest.raises(ValueError, match="needs a stamped source"):
+                camera.wait_for(1, 1.0)
+
+
+def test_a_stamp_of_another_clock_is_refused(mock: MockCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    split = stamp.split
+
+    def shifted(image: np.ndarray) -> tuple[np.ndarray, stamp.Stamp | None]:
+        picture, mark = split(image)
+        return picture, None if mark is None else stamp.Stamp(mark.frame, mark.image, mark.clock + 10**9)
+
+    monkeypatch.setattr(stamp, "split", shifted)
+    with pytest.raises(WrongSource, match="the clock of another machine"):
+        Camera(stamped(mock), "left")
+
+
+def test_nobody_there() -> None:
+    begin = time.monotonic()
+    with pytest.raises(DeviceNotConnectedError, match=r"no picture from http://.* within 1 s.*[Rr]efused"):
+        Camera(config(f"http://{HOST}:9/"), "left", connect_timeout=1.0)
+    assert time.monotonic() - begin < WAIT
+
+
+def test_close_is_idempotent_and_final(mock: MockCamera) -> None:
+    camera = Camera(stamped(mock), "left")
+    camera.close()
+    camera.close()
+    with pytest.raises(DeviceNotConnectedError, match="closed"):
+        camera.read(1.0)
+    until(lambda: mock.state().clients == 0)
+
+
+def test_close_wakes_who_waits(mock: MockCamera) -> None:
+    camera = Camera(stamped(mock), "left")
+    caught: list[Exception] = []
+
+    def wait() -> None:
+        try:
+            camera.wait_for(99, 1000.0)
+        except DeviceNotConnectedError as error:
+            caught.append(error)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    time.sleep(0.1)
+    camera.close()
+    waiting.join(WAIT)
+    assert len(caught) == 1
+
+
+def test_a_program_may_end_without_closing(mock: MockCamera) -> None:
+    code = (
+        "from robot.camera.camera import Camera; from tacsim.models.hardware import CameraSensorFacts\n"
+        f"facts = CameraSensorFacts(driver='camera', source={mock.url!r}, width=320, height=240, stamped=True)\n"
+        "camera = Camera(facts, 'left'); print(camera.read(10).index >= 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
+
+
+def test_many_openings_leave_nothing(mock: MockCamera) -> None:
+    for _ in range(10):
+        with Camera(stamped(mock), "left") as camera:
+            camera.read(WAIT)
+    until(lambda: mock.state().clients == 0)
+
+
+# Stand-ins: folders and videos
+
+
+def write_pictures(folder: Path, count: int) -> list[Path]:
+    paths = [folder / f"{number}.png" for number in range(count)]
+    for number, path in enumerate(paths):
+        Image.fromarray(np.full((24, 32, 3), 10 * number, dtype=np.uint8)).save(path)
+    return paths
+
+
+def played(source: object, **options: object) -> Camera:
+    return Camera(config(source, **{"width": 32, "height": 24, "fps": 20.0, "max_age": 10.0, **options}), "left")
+
+
+def read_all(camera: Camera, end: type[Exception], text: str) -> dict[int, TactileFrame]:
+    """Frames by index, until `end` is raised with `text`."""
+    seen: dict[int, TactileFrame] = {}
+    try:
+        while True:
+            frame = camera.read(WAIT)
+            seen[frame.index] = frame
+    except end as reason:
+        if re.search(text, str(reason)) is None:
+            raise
+        return seen
+
+
+def test_a_folder_is_played_once(tmp_path: Path) -> None:
+    write_pictures(tmp_path, 12)
+    with played(tmp_path) as camera:
+        seen = read_all(camera, EndOfEpisode, "is over")
+    assert set(seen) <= set(range(12)) and len(seen) > 3
+    assert all((frame.image == 10 * index).all() for index, frame in seen.items())
+    times = [seen[index].time for index in sorted(seen)]
+    assert times[-1] - times[0] > 0.045 * (max(seen) - min(seen))
+
+
+def test_a_video_is_played_once(tmp_path: Path) -> None:
+    import cv2
+
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (32, 24))
+    for number in range(8):
+        writer.write(np.full((24, 32, 3), (10 * number, 0, 0), dtype=np.uint8))
+    writer.release()
+    with played(path, fps=1.0) as camera:
+        image = camera.read(WAIT).image
+        assert image[0, 0, 0] == 0 and image[0, 0, 2] % 10 <= 1  # BGR in the file, RGB here
+        read_all(camera, EndOfEpisode, "is over")
+    assert camera.status.frames == 8
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 100])
+    with pytest.raises(WrongSource, match="no readable video"):
+        played(path)
+
+
+def test_a_slow_folder_closes_at_once(tmp_path: Path) -> None:
+    write_pictures(tmp_path, 2)
+    camera = played(tmp_path, fps=0.001)
+    begin = time.monotonic()
+    camera.close()
+    assert time.monotonic() - begin < 4.0
+
+
+def test_folders_that_are_no_source(tmp_path: Path) -> None:
+    with pytest.raises(WrongSource, match="no pictures in this folder"):
+        played(tmp_path)
+    paths = write_pictures(tmp_path, 3)
+    with pytest.raises(WrongSource, match="frames are 32 x 24 px, expected are 64 x 48"):
+        played(tmp_path, width=64, height=48)
+    paths[1].write_bytes(b"no picture")
+    with pytest.raises(WrongSource, match=r"1\.png"):
+        played(tmp_path)
+    paths[1].write_bytes(b"")
+    with pytest.raises(WrongSource, match=r"1\.png"):
+        played(tmp_path)
+    with pytest.raises(WrongSource, match="no such file or folder"):
+        played(tmp_path / "nothing")
+    with pytest.raises(WrongSource, match="no readable video"):
+        played(paths[1])
+
+
+def test_a_picture_that_breaks_off_ends_the_folder(tmp_path: Path) -> None:
+    paths = write_pictures(tmp_path, 3)
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)).save(paths[1])
+    paths[1].write_bytes(paths[1].read_bytes()[:-800])
+    with played(tmp_path) as camera:
+        seen = read_all(camera, WrongSource, r"1\.png")
+    assert set(seen) == {0}

@@ -1,0 +1,329 @@
+"""The control loop: exactly so many steps, all of them kept, whatever happens; and policies by name."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode, versions
+from robot.deploy.policy import FunctionPolicy, PolicyNotFound, load_policy
+from tacsim.interface import (
+    Action,
+    ArmState,
+    EndOfEpisode,
+    IncompatibleRig,
+    Needs,
+    Observation,
+    Pose,
+    SensorSpec,
+    TactileFrame,
+    TactileObservation,
+    Truth,
+)
+from tacsim.models.rig import SqueezeConfig
+from tacsim.record.episode import EpisodeMeta, Step
+from tacsim.record.images import reference_image
+from tacsim.rig import Rig
+from tacsim.tasks import make_task
+from tacsim.tasks.grip import Grip
+from tacsim.tasks.squeeze import ScriptedSqueeze
+
+
+class Hand:
+    """Sensor, arm, clock, normaliser and start of a rig that closes on a body of 10 mm by what it is commanded."""
+
+    period = 0.1
+
+    def __init__(self, frames: int = 1000) -> None:
+        self.spec = SensorSpec((8, 8), height=False, flow=False, arm="lower")
+        self.frames, self.ticks, self.stops, self.resets = frames, 0, 0, 0
+        self.pose = Pose()
+
+    def read(self, timeout: float) -> TactileFrame:
+        if self.ticks >= self.frames:
+            raise EndOfEpisode(f"{self.frames} frames")
+        return TactileFrame(np.full((8, 8, 3), self.ticks, np.uint8), self.now(), self.ticks)
+
+    def state(self, at: float | None = None) -> ArmState:
+        return ArmState(self.pose, np.zeros(6), np.zeros(6), None, self.now())
+
+    def command(self, target: Pose | None) -> Pose | None:
+        self.pose = target or self.pose
+        return target
+
+    def now(self) -> float:
+        return self.ticks * self.period
+
+    def tick(self) -> None:
+        self.ticks += 1
+
+    def clear(self, seed: int) -> Mapping[str, TactileFrame]:
+        self.ticks, self.resets = 0, self.resets + 1
+        return {"lower": TactileFrame(np.full((8, 8, 3), 200 + seed, np.uint8), 0.0, 0)}
+
+    def touch(self) -> None:
+        pass
+
+    def diagnostics(self) -> dict[str, float]:
+        return {"stale": 0.0}
+
+    def take_reference(self, frame: TactileFrame) -> None:
+        pass
+
+    def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
+        mask = np.ones((4, 4), bool)
+        return TactileObservation(frame.image, None, None, mask, mask, None, frame.time, 0.0)
+
+    def truth(self) -> Truth:
+        height = 10e-3 - self.pose.position[2]
+        return Truth(height, np.array([1e-3, 0.0, height / 2]), np.zeros((1, 3), np.float32), {})
+
+    def stop(self) -> None:
+        self.stops += 1
+
+    recover = close = touch
+
+
+def make_rig(hand: Hand, truth: bool = True) -> Rig:
+    return Rig(
+        name="hand",
+        sensors={"lower": hand},
+        arms={"lower": hand, "upper": hand},
+        clock=hand,
+        normalisers={"lower": hand},
+        start=hand,
+        truth=hand.truth if truth else None,
+        diagnostics=lambda: {"residual": 0.25},
+    )
+
+
+def lift(observation: Observation) -> Action:
+    """One millimetre up a step."""
+    return Action({"lower": Pose(observation.arms["lower"].pose.position + [0, 0, 1e-3])})
+
+
+TASK = make_task(SqueezeConfig(kind="squeeze", goal=7e-3))
+
+
+class Recorder:
+    def __init__(self, meta: EpisodeMeta) -> None:
+        self.meta, self.steps = meta, list[Step]()
+        self.error: Exception | None = None
+
+    def write(self, step: Step) -> bool:
+        self.steps.append(step)
+        return len(self.steps) != 2  # the second one is dropped
+
+
+def test_exactly_so_many_steps_after_the_reset() -> None:
+    hand = Hand()
+    episode = run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 4)
+    assert [step.index for step in episode.steps] == [0, 1, 2, 3, 4]
+    assert hand.ticks == 4
+    assert hand.stops > 0
+    first, last = episode.steps[0], episode.steps[-1]
+    assert first.action is None
+    assert first.distance == pytest.approx(3e-3)
+    assert last.action is not None
+    assert last.sent["lower"] is last.action.tool["lower"]
+    assert last.time == pytest.approx(0.4)
+    assert [step.distance for step in episode.steps] == pytest.approx([3e-3, 2e-3, 1e-3, 0, 1e-3], abs=1e-12)
+    assert last.reward == pytest.approx(-1.0)
+    assert last.info["body_height"] == pytest.approx(6e-3)
+    assert last.info["residual"] == 0.25
+    assert last.info["contact_signal_lower"] == pytest.approx((128 - 4) / 128)
+    assert last.frames["lower"].image.max() == 4
+    assert last.seconds > 0
+    assert run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, 0).steps[-1].index == 0
+
+
+def test_a_recording_that_can_go_on_no_more_ends_the_episode_with_the_arms_stopped() -> None:
+    class FullDisk(Recorder):
+        def write(self, step: Step) -> bool:
+            if len(self.steps) == 2:
+                self.error = OSError(28, "No space left on device")
+                return False
+            self.steps.append(step)
+            return True
+
+    hand = Hand()
+    with pytest.raises(EpisodeFailed, match=r"after 2 of 40 steps: RecordingFailed: .* No space") as failed:
+        run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 40, recorder=FullDisk)
+    assert len(failed.value.episode.steps) == 3
+    assert hand.stops > 0
+
+
+def test_every_step_goes_to_the_recorder_with_meta_and_references() -> None:
+    recorders: list[Recorder] = []
+
+    def open_recorder(meta: EpisodeMeta) -> Recorder:
+        recorders.append(Recorder(meta))
+        return recorders[-1]
+
+    shown: list[int] = []
+    episode = run_episode(
+        make_rig(Hand()),
+        FunctionPolicy(lift),
+        TASK,
+        3,
+        setup=EpisodeSetup("lift", 7, {"rig.yaml": b"name: hand"}),
+        recorder=open_recorder,
+        on_step=lambda step: shown.append(step.index),
+    )
+    (recorder,) = recorders
+    assert recorder.steps == episode.steps
+    assert shown == [0, 1, 2, 3]
+    assert episode.dropped == 1
+    meta = recorder.meta
+    assert (meta.rig, meta.task, meta.policy, meta.seed, meta.goal) == ("hand", "squeeze", "lift", 7, 7e-3)
+    assert meta.attachments["rig.yaml"] == b"name: hand"
+    reference = reference_image(meta.attachments, "lower")
+    assert reference is not None
+    assert reference.max() == reference.min() == 207
+    assert meta.versions == versions()
+    assert {"python", "numpy"} <= set(meta.versions)
+
+
+def test_a_rig_without_truth_is_not_judged() -> None:
+    episode = run_episode(make_rig(Hand(), truth=False), FunctionPolicy(lift), None, 2)
+    assert all(step.reward is None and step.distance is None for step in episode.steps)
+    assert "body_height" not in episode.steps[0].info
+
+
+def test_needs_are_checked_before_anything_moves() -> None:
+    hand = Hand()
+    with pytest.raises(IncompatibleRig, match="task 'squeeze' cannot run on rig 'hand': it lacks ground truth"):
+        run_episode(make_rig(hand, truth=False), FunctionPolicy(lift), TASK, 2)
+    with pytest.raises(IncompatibleRig, match="policy 'scripted'"):
+        run_episode(make_rig(hand), TASK.scripted(), TASK, 2, setup=EpisodeSetup("scripted"))
+    assert hand.resets == 0
+
+
+def test_a_recording_ends_the_episode_cleanly() -> None:
+    episode = run_episode(make_rig(Hand(frames=3)), FunctionPolicy(lift), TASK, 100)
+    assert [step.index for step in episode.steps] == [0, 1, 2]
+
+
+def test_the_stop_flag_ends_the_episode_after_the_step() -> None:
+    hand = Hand()
+    episode = run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 100, stop=lambda: hand.ticks >= 2)
+    assert len(episode.steps) == 3
+    assert hand.stops > 0
+
+
+def test_ctrl_c_keeps_what_was_done() -> None:
+    hand = Hand()
+
+    def act(observation: Observation) -> Action:
+        if hand.ticks == 2:
+            raise KeyboardInterrupt
+        return lift(observation)
+
+    assert len(run_episode(make_rig(hand), FunctionPolicy(act), TASK, 100).steps) == 3
+    assert hand.stops > 0
+
+
+def test_a_policy_that_raises_stops_the_arms_and_keeps_the_episode() -> None:
+    hand = Hand()
+
+    def act(observation: Observation) -> Action:
+        if hand.ticks == 2:
+            raise ZeroDivisionError("no grip")
+        return lift(observation)
+
+    with pytest.raises(EpisodeFailed, match="ended after 2 of 100 steps: ZeroDivisionError: no grip") as caught:
+        run_episode(make_rig(hand), FunctionPolicy(act), TASK, 100)
+    assert len(caught.value.episode.steps) == 3
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    assert hand.stops > 0
+
+
+def test_a_policy_that_ends_python_ends_the_episode() -> None:
+    def act(observation: Observation) -> Action:
+        sys.exit(7)
+
+    with pytest.raises(EpisodeFailed, match="ended after 0 of 5 steps: SystemExit: 7"):
+        run_episode(make_rig(Hand()), FunctionPolicy(act), TASK, 5)
+
+
+def test_negative_steps_are_refused() -> None:
+    with pytest.raises(ValueError, match="-1"):
+        run_episode(make_rig(Hand()), FunctionPolicy(lift), TASK, -1)
+
+
+MODULE = """
+from tacsim.interface import Action, Needs
+
+def hold(observation):
+    return Action()
+
+class Counting:
+    needs = Needs(height=True)
+    def reset(self): self.count = 0
+    def __call__(self, observation): return Action()
+
+class Demanding(Counting):
+    def __init__(self, force): pass
+
+class Needless(Counting):
+    needs = None
+
+ready = Counting()
+number = 3
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_policies.py").write_text(MODULE)
+    (tmp_path / "broken_policies.py").write_text("import no_such_package\n")
+    (tmp_path / "failing_policies.py").write_text("1 / 0\n")
+    (tmp_path / "ending_policies.py").write_text("import sys\nsys.exit(3)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+def load(name: str, task: Any = TASK) -> Any:
+    return load_policy(name, task, make_rig(Hand()).spec)
+
+
+@pytest.mark.usefixtures("module")
+def test_policies_by_name() -> None:
+    assert isinstance(load("scripted"), ScriptedSqueeze)
+    assert isinstance(load("grip"), Grip)
+    assert load("my_policies:hold").needs == Needs()
+    assert load("my_policies:hold")(None).tool == {}
+    assert load("my_policies:Counting").needs == Needs(height=True)
+    import my_policies  # type: ignore[import-not-found]
+
+    assert load("my_policies:ready") is my_policies.ready
+
+
+@pytest.mark.usefixtures("module")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scriptd", "no policy 'scriptd'; allowed: 'scripted', 'grip', or 'package.module:attribute'"),
+        ("my_policies:", "must have the form"),
+        ("no_policies:hold", "no module 'no_policies'"),
+        ("my_policies:absent", "'my_policies' has no 'absent'"),
+        ("my_policies:number", "is a int: neither a policy nor a function"),
+        ("my_policies:Demanding", "cannot be made without arguments"),
+        ("broken_policies:hold", "itself imports 'no_such_package', which is missing"),
+        ("failing_policies:hold", "importing 'failing_policies' failed: ZeroDivisionError"),
+        ("ending_policies:hold", r"importing 'ending_policies' failed: SystemExit\(3\)"),
+        ("my_policies:Needless", "its needs must be a tacsim.interface.Needs, got NoneType"),
+    ],
+)
+def test_a_name_that_leads_nowhere_says_why(name: str, message: str) -> None:
+    with pytest.raises(PolicyNotFound, match=message):
+        load(name)
+
+
+def test_scripted_needs_a_task() -> None:
+    with pytest.raises(PolicyNotFound, match="this rig has none"):
+        load("scripted", task=None)

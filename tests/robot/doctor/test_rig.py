@@ -1,0 +1,183 @@
+"""A rig is looked at before anything moves: what is wrong is found and named, and nothing is commanded."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import robot.doctor.rig
+from robot.cli import app
+from robot.doctor.machine import Check
+from robot.doctor.rig import examine_rig
+from robot.mock import Door, MockCamera, MockUR
+from robot.mock.cell.cell import MockBench
+from robot.mock.fixtures import mock_host
+from tacsim.config import load_rig
+from tacsim.models.rig import RigConfig
+
+RIG = """
+name: looked at
+clock: wall
+arms:
+  left:
+    driver: ur
+    host: HOST
+    world_from_base: { position: [-450 mm, 0, -300 mm] }
+    limits: { workspace: { lower: [-30 mm, -30 mm, -30 mm], upper: [30 mm, 30 mm, 60 mm] } }
+    start: { position: [0, 0, 0] }
+    mock: { joints: [0, -1.5, 1.5, -1.5, -1.5, 0] }
+sensors:
+  finger: { driver: camera, source: 'SOURCE', arm: left, width: 80, height: 60, stamped: true }
+"""
+REAL = ("arms.left.mock=null", f"arms.left.host={mock_host(72)}")
+
+
+@pytest.fixture(scope="module")
+def camera() -> Iterator[MockCamera]:
+    with MockCamera(mock_host(71), width=80, height=60) as running:
+        yield running
+
+
+@pytest.fixture
+def file(camera: MockCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(robot.doctor.rig, "TIMEOUT", 1.0)
+    monkeypatch.setattr(robot.doctor.rig, "LOOK", 0.3)
+    path = tmp_path / "looked.yaml"
+    path.write_text(RIG.replace("HOST", mock_host(71)).replace("SOURCE", camera.url))
+    return path
+
+
+def looked(
+    monkeypatch: pytest.MonkeyPatch, file: Path, *overrides: str, fault: Callable[[Door], object] = lambda door: None,
+    **started: object,
+) -> dict[str, Check]:  # fmt: skip
+    """The checks by name, after `fault` was done to the controller; it was started with other facts if `started`."""
+    commanded = []
+
+    class Faulty(MockBench):
+        def __init__(self, config: RigConfig) -> None:
+            arms = {name: arm.model_copy(update=started) for name, arm in config.arms.items()}
+            super().__init__(config.model_copy(update={"arms": arms}))
+            for door in self.doors.values():
+                fault(door)
+
+        def close(self) -> None:
+            commanded.extend(entry for door in self.doors.values() for entry in door.received().entries)
+            super().close()
+
+    monkeypatch.setattr(robot.doctor.rig, "MockBench", Faulty)
+    checks = examine_rig(load_rig(file, overrides=overrides).config)
+    assert commanded == []  # it only looks
+    return {check.name: check for check in checks}
+
+
+def unpowered(door: Door) -> None:
+    """After an emergency stop that a person has released already."""
+    door.estop()
+    deadline = time.monotonic() + 10.0
+    while door.state().mode == "RUNNING":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    door.release()
+
+
+def bad(checks: dict[str, Check]) -> dict[str, str]:
+    return {name: check.state for name, check in checks.items() if check.state != "ok"}
+
+
+def test_a_sound_rig_passes_every_check(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    checks = looked(monkeypatch, file)
+    kinds = {"network", "PolyScope", "model", "ready", "RTDE", "limits", "start"}
+    assert set(checks) == {f"left: {kind}" for kind in kinds} | {"finger: camera"}
+    camera = checks.pop("finger: camera")
+    assert bad(checks) == {}
+    assert camera.state in ("ok", "warn") and "80 x 60 px" in camera.found  # how fast it is depends on the machine
+    assert "60 x 60 x 90 mm" in checks["left: limits"].found
+
+
+@pytest.mark.parametrize(
+    ("fault", "check", "words"),
+    [
+        (Door.protective_stop, "ready", "protective stop"),
+        (Door.estop, "ready", "emergency stop; a person must release it"),
+        (lambda door: door.remote_control(False), "ready", "switch it to remote control"),
+        (unpowered, "ready", "power it on"),
+        (Door.dashboard_mute, "dashboard", "does not answer"),
+        (Door.refuse, "network", "no answer at 29999 (dashboard), 30003 (script), 30004 (RTDE)"),
+        (Door.black_hole, "dashboard", "does not answer"),
+    ],
+)
+def test_what_is_wrong_with_a_controller_is_named(
+    monkeypatch: pytest.MonkeyPatch, file: Path, fault: Callable[[Door], object], check: str, words: str
+) -> None:
+    found = looked(monkeypatch, file, fault=fault)
+    one = found[f"left: {check}"]
+    assert one.state == "fail" and one.advice
+    assert words in one.found, one
+
+
+def test_an_old_controller_is_a_warning(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    found = looked(monkeypatch, file, fault=lambda door: door.version(5, 4, 3, 1))
+    assert found["left: PolyScope"].state == "warn" and "5.6" in found["left: PolyScope"].advice
+
+
+def test_another_model_than_the_file_says_is_found(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    found = looked(monkeypatch, file, model="ur3e")
+    assert found["left: model"].state == "fail"
+    assert "UR3" in found["left: model"].found and "ur5e" in found["left: model"].advice
+
+
+def test_a_controller_that_is_not_there_is_found(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    found = looked(monkeypatch, file, *REAL)
+    assert found["left: network"].state == "fail"
+    assert "is the controller on" in found["left: network"].advice
+    assert "finger: camera" in found  # the rest is looked at nevertheless
+
+
+def test_a_mock_is_not_taken_for_a_robot(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    with MockUR(mock_host(72)):
+        found = looked(monkeypatch, file, *REAL)
+    assert found["left: kind"].state == "fail" and found["left: kind"].found == "a mock"
+
+
+@pytest.mark.parametrize(
+    ("override", "check", "words"),
+    [
+        ("sensors.finger.width=100", "finger: camera", "expected are 100 x"),
+        ("sensors.finger.source=http://127.0.0.1:1/?action=stream", "finger: camera", "no picture"),
+        ("arms.left.start.position=[0, 0, 70 mm]", "left: start", "outside the workspace"),
+        ("arms.left.world_from_base.position=[-2, 0, 0]", "left: start", "out of reach"),
+    ],
+)
+def test_what_the_file_has_wrong_is_named(
+    monkeypatch: pytest.MonkeyPatch, file: Path, override: str, check: str, words: str
+) -> None:
+    found = looked(monkeypatch, file, override)
+    assert found[check].state == "fail" and words in found[check].found and found[check].advice
+
+
+def test_a_camera_slower_than_asked_for_is_a_warning(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    found = looked(monkeypatch, file, "sensors.finger.fps=500")
+    assert found["finger: camera"].state == "warn" and "500 frames/s were asked for" in found["finger: camera"].advice
+
+
+def test_addresses_that_are_taken_are_a_failed_check_not_a_crash(file: Path) -> None:
+    with MockUR(mock_host(71)):
+        (check,) = examine_rig(load_rig(file).config)
+    assert check.state == "fail" and "in use" in check.found
+
+
+def test_a_rig_without_hardware_has_nothing_to_check() -> None:
+    (check,) = examine_rig(load_rig("sim").config)
+    assert check.state == "ok" and "no hardware" in check.found
+
+
+def test_the_command_ends_with_1_if_something_must_be_mended(file: Path) -> None:
+    for overrides, code in (((), 0), (("--set", "sensors.finger.width=100"), 1)):
+        done = CliRunner().invoke(app, ["doctor", "--rig", str(file), *overrides], env={"COLUMNS": "200"})
+        assert done.exit_code == code, done.output
+    assert "expected are 100 x" in done.output

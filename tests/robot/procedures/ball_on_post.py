@@ -1,0 +1,85 @@
+"""A gel on a mock arm that touches a fixed ball: where the sensor really sits is known only here."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robot.mock import Door, MockCamera
+from tacsim import pose as se3
+from tacsim.interface import Pose
+from tacsim.models.scene import GelSurface
+from tacsim.models.sensor import SensorModel
+from tacsim.optics.render import Renderer
+
+GEL = (16e-3, 16e-3)  # [m]
+SPACING = 0.25e-3
+
+
+class BallOnPost:
+    """While open, draws what the camera in the gel sees of the ball, wherever the arm is.
+
+    host: of the mock controller, whose TCP is the flange; base_from_ball: (3,) [m]; flange_from_sensor: the truth.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        camera: MockCamera,
+        model: SensorModel,
+        flange_from_sensor: Pose,
+        base_from_ball: np.ndarray,
+        ball_radius: float,
+    ) -> None:
+        self._host, self._camera, self._radius = host, camera, ball_radius
+        self._sensor, self._ball = flange_from_sensor, base_from_ball
+        self._render = Renderer(model, GEL)
+        axis = SPACING * (np.arange(round(GEL[0] / SPACING) + 1)) - GEL[0] / 2
+        self._x, self._y = np.meshgrid(axis, axis, indexing="ij")
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._draw)
+        self.deepest = 0.0  # that the gel was pressed [m]
+        camera.push(self.picture(0.0, 0.0, -1e-3))
+
+    def picture(self, x: float, y: float, depth: float) -> np.ndarray:
+        """The gel with the ball `depth` [m] in it at x, y [m]: a ball's cap, and a soft skirt round it."""
+        r = np.hypot(self._x - x, self._y - y)
+        dent = np.zeros_like(r)
+        if depth > 0:
+            contact = np.sqrt(self._radius * depth)
+            q = np.maximum(r / contact, 1.0)
+            skirt = depth / np.pi * ((2 - q * q) * np.arcsin(1 / q) + np.sqrt(q * q - 1))
+            inside = depth - self._radius + np.sqrt(np.maximum(self._radius**2 - r**2, 0.0))
+            dent = np.where(r < contact, inside, skirt * np.exp(-np.maximum(r - contact, 0.0) / 1e-3))
+        values = np.zeros((*r.shape, 3), dtype=np.float32)
+        values[..., 2] = -dent
+        return self._render(GelSurface(values, SPACING, (-GEL[0] / 2, -GEL[1] / 2)))
+
+    def _draw(self) -> None:
+        door, last = Door(self._host), None
+        while not self._over.is_set():
+            try:
+                pose = door.state().pose
+            except RuntimeError:  # the controller comes and goes with the rig
+                self._over.wait(0.02)
+                continue
+            flange = Pose(np.array(pose[:3]), Rotation.from_rotvec(pose[3:]).as_quat())
+            x, y, z = se3.transform(se3.inverse(se3.compose(flange, self._sensor)), self._ball)
+            depth = self._radius - z
+            self.deepest = max(self.deepest, depth)
+            seen = (x, y, depth) if depth > 0 else None
+            if seen != last:
+                self._camera.push(self.picture(x, y, depth))
+                last = seen
+            self._over.wait(2e-3)
+        door.close()
+
+    def __enter__(self) -> BallOnPost:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._over.set()
+        self._thread.join()

@@ -1,0 +1,168 @@
+"""Taps that tell how late a camera is: their schedule, what belongs into the rig file, and a delay that is found."""
+
+from __future__ import annotations
+
+import threading
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calibration.poses.latency import Latency
+from robot.cli import app
+from robot.mock import Door, MockCamera
+from robot.mock.fixtures import mock_host, rig_addresses
+from robot.procedures.taps import AWAY, PAUSE, STAY, CannotTap, TapPlan, entries, schedule, untimed
+from tacsim.config import load_rig
+from tacsim.models.hardware import UrArmConfig
+
+WIDTH, HEIGHT = 64, 48
+DELAY = 0.15  # of the camera [s]
+SLACK = 0.05  # what a busy machine may add on either side: the test's own hand between arm and camera [s]
+
+
+def arm_facts(latency: float = 0.0) -> UrArmConfig:
+    found = load_rig("mock").config.arms["upper"]
+    assert isinstance(found, UrArmConfig)
+    return found.model_copy(update={"latency": latency})
+
+
+def latency(seconds: float) -> Latency:
+    return Latency(seconds=seconds, uncertainty=1e-3, correlation=0.99, samples=200)
+
+
+def test_taps_come_at_uneven_intervals_with_a_pause_before_and_after() -> None:
+    travel = 0.1
+    moves = schedule(TapPlan(taps=6), travel)
+    times, down = [time for time, _ in moves], [each for _, each in moves]
+    assert down == [True, False] * 6 + [False]
+    assert times[0] == PAUSE and times[-1] - times[-2] >= PAUSE + travel + AWAY[0]
+    ways = np.diff(times[:-1])
+    assert (ways[::2] >= travel + STAY[0]).all() and (ways[1::2] >= travel + AWAY[0]).all()
+    assert np.ptp(np.diff(times[:-1:2])) > 0.1  # regular taps fit several latencies
+    assert schedule(TapPlan(taps=6), travel) == moves
+    assert schedule(TapPlan(taps=6, seed=1), travel) != moves
+
+
+@pytest.mark.parametrize(
+    ("clock", "seconds", "known", "wanted"),
+    [
+        ("arrival", 0.120, 0.0, {"sensors.upper.latency": 0.120}),
+        ("arrival", 0.120, 0.010, {"sensors.upper.latency": 0.130}),  # the arm keeps its own
+        ("arrival", -0.020, 0.0, {"sensors.upper.latency": 0.0, "arms.upper.latency": 0.020}),
+        ("stamp", -0.008, 0.0, {"arms.upper.latency": 0.008}),
+        ("device", 0.001, 0.0, {"arms.upper.latency": 0.0}),
+    ],
+)
+def test_both_times_shall_be_those_of_the_event(
+    clock: str, seconds: float, known: float, wanted: dict[str, float]
+) -> None:
+    found = entries(latency(seconds), clock, "upper", arm_facts(known), "upper")  # type: ignore[arg-type]
+    assert found == pytest.approx(wanted)
+    camera = found.get("sensors.upper.latency", 0.0 if clock != "arrival" else None)
+    assert camera is not None
+    if clock == "arrival":  # with these entries a second measurement would find the pictures in time
+        assert seconds - camera + found.get("arms.upper.latency", known) == pytest.approx(0.0)
+
+
+def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
+    config = load_rig("mock", overrides=["arms.upper.latency=10 ms", "sensors.upper.latency=50 ms"]).config
+    bare = untimed(config, "upper", "upper")
+    assert bare.contact == "hertz"
+    assert bare.arms["upper"].latency == bare.sensors["upper"].latency == 0.0  # type: ignore[union-attr]
+    assert not bare.lock_step and bare.arms["lower"] == config.arms["lower"]
+
+
+@pytest.mark.parametrize(
+    ("rig", "arm", "sensor", "words"),
+    [
+        ("sim", "upper", "upper", "'upper' is no arm that can tap"),
+        ("mock", "third", "upper", "'third' is no arm.*lower, upper"),
+        ("mock", "upper", "third", "'third' is no sensor with a camera.*lower, upper"),
+        ("mock", "upper", "lower", "carried by lower, not by 'upper'"),
+    ],
+)
+def test_parts_that_cannot_tell_are_refused(rig: str, arm: str, sensor: str, words: str) -> None:
+    with pytest.raises(CannotTap, match=words):
+        untimed(load_rig(rig).config, arm, sensor)
+    done = CliRunner().invoke(app, ["calibrate", "latency", rig, "--arm", arm, "--sensor", sensor])
+    assert done.exit_code == 2
+
+
+RIG = """
+name: tapper
+clock: wall
+arms:
+  upper:
+    driver: ur
+    host: {host}
+    world_from_base: {{ position: [-450 mm, 0, -300 mm] }}
+    limits:
+      workspace: {{ lower: [-20 mm, -20 mm, -20 mm], upper: [20 mm, 20 mm, 20 mm] }}
+      acceleration: 2 m/s^2
+    start: {{ position: [0, 0, 0] }}
+    link_timeout: 2 s
+    watchdog: 0.4
+    latency: 100 ms  # wrong on purpose: it must not enter what is measured, but what is written
+    mock: {{}}
+sensors:
+  upper: {{ driver: camera, source: '{source}', arm: upper, width: 64, height: 48, fps: 60, max_age: 10 s }}
+"""
+
+
+class Hand:
+    """Draws what a camera in the gel would see: the deeper the arm, the brighter the picture."""
+
+    def __init__(self, host: str, camera: MockCamera) -> None:
+        self._door, self._camera, self._over = Door(host), camera, threading.Event()
+        self._thread = threading.Thread(target=self._draw)
+
+    def _draw(self) -> None:
+        deep = None
+        while not self._over.is_set():
+            try:
+                height = self._door.state().pose[2]
+            except RuntimeError:  # the controller comes and goes with the rig
+                self._over.wait(0.02)
+                continue
+            deep = max(0.0, height - 0.3)  # the base stands 300 mm below the surface [m]
+            self._camera.push(np.full((HEIGHT, WIDTH, 3), 100 + min(100, int(1e5 * deep)), np.uint8))
+            self._over.wait(4e-3)
+        self._door.close()
+
+    def __enter__(self) -> Hand:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+@pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
+def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
+    host = mock_host(31)
+    with MockCamera(host, width=WIDTH, height=HEIGHT, fps=60.0, stamped=False) as camera:
+        (tmp_path / "tapper.yaml").write_text(RIG.format(host=host, source=camera.url))
+        camera.delay(DELAY)
+        words = ["calibrate", "latency", str(tmp_path / "tapper.yaml"), "--arm", "upper", "--sensor", "upper"]
+        with Hand(host, camera):
+            done = CliRunner().invoke(app, [*words, "--depth", "1 mm", "--taps", "5"], env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    said = done.stdout.split()
+    found = float(said[said.index("is") + 1])
+    assert abs(found - 1e3 * DELAY) < 1e3 * SLACK, done.output
+    written = float(said[said.index("sensors.upper.latency:") + 1])
+    assert written == pytest.approx(found + 100.0, abs=0.11)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
+def test_the_mock_rig_taps_a_ball_in_closed_form() -> None:
+    addresses = [word for override in rig_addresses() for word in ("--set", override)]
+    words = ["calibrate", "latency", "mock", "--arm", "upper", "--sensor", "upper", "--taps", "4", *addresses]
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    assert "sensors.upper is" in done.stdout

@@ -1,0 +1,178 @@
+"""Clocks of rigs with hardware, on a time of the tests' own."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from robot.errors import DeviceError, ProtectiveStop
+from robot.mock.cell.cell import MockBench
+from robot.rig import clock as clocks
+from robot.rig.clock import Driven, LockStep, WallClock, drive
+from tacsim.interface import Pose
+
+PERIOD = 0.1  # [s]
+
+
+class Time:
+    """Passes only when somebody sleeps, or works."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds >= 0.0
+        self.now += seconds
+
+
+@pytest.fixture
+def time(monkeypatch: pytest.MonkeyPatch) -> Time:
+    made = Time()
+    monkeypatch.setattr(clocks, "time", made)
+    return made
+
+
+class StubArm:
+    """Needs some commands to get there."""
+
+    def __init__(self, needs: int = 3, error: Exception | None = None) -> None:
+        self.commands: list[Pose] = []
+        self._needs, self._error = needs, error
+
+    def at_rest(self) -> bool:
+        return True
+
+    def arrived(self, target: Pose, **within: float) -> bool:
+        return len(self.commands) >= self._needs
+
+    def command(self, target: Pose) -> Pose:
+        if self._error is not None:
+            raise self._error
+        self.commands.append(target)
+        return target
+
+    def explain(self) -> str:
+        return "follows its target"
+
+
+def driven(arm: StubArm, target: Pose | None = None) -> Driven:
+    made = Driven(arm)  # type: ignore[arg-type]
+    made.target = target
+    return made
+
+
+def test_ticks_end_a_period_apart_whatever_the_work_between_takes(time: Time) -> None:
+    clock = WallClock(PERIOD)
+    ends = []
+    for work in (0.0, 0.03, 0.09, 0.05):
+        time.now += work
+        clock.tick()
+        ends.append(clock.now())
+    assert np.diff(ends) == pytest.approx([PERIOD] * 3)
+    assert clock.diagnostics()["period_median"] == pytest.approx(PERIOD)
+    assert clock.late == 0
+
+
+def test_a_period_that_is_missed_is_counted_and_not_made_up_for(time: Time) -> None:
+    clock = WallClock(PERIOD)
+    clock.tick()
+    time.now += 0.35
+    before = clock.now()
+    clock.tick()
+    clock.tick()
+    assert clock.now() - before == pytest.approx(2 * PERIOD)  # no burst of short periods
+    assert clock.late == 1
+    assert clock.diagnostics()["period_max"] == pytest.approx(0.45)
+
+
+def test_after_a_reset_the_time_it_took_counts_for_nothing(time: Time) -> None:
+    clock = WallClock(PERIOD)
+    clock.tick()
+    time.now += 30.0
+    clock.restart()
+    before = clock.now()
+    clock.tick()
+    assert clock.now() - before == pytest.approx(PERIOD)
+    assert clock.late == 0 and clock.periods == []
+
+
+def test_looking_takes_a_tenth_of_a_second_at_least(time: Time) -> None:
+    for period, wanted in ((0.02, 0.1), (0.5, 0.5)):
+        before = time.now
+        WallClock(period).look()
+        assert time.now - before == pytest.approx(wanted)
+
+
+def test_a_command_is_repeated_until_its_arm_is_there(time: Time) -> None:
+    arms = {"left": StubArm(3), "right": StubArm(7)}
+    target = Pose(np.array([1.0, 2.0, 3.0]))
+    drive({name: driven(arm, target) for name, arm in arms.items()}, timeout=1.0)
+    assert [len(arm.commands) for arm in arms.values()] == [3, 7]
+    assert all(sent is target for arm in arms.values() for sent in arm.commands)
+
+
+def test_an_arm_without_target_is_only_waited_for(time: Time) -> None:
+    arm = StubArm()
+    drive({"left": driven(arm)}, timeout=1.0)
+    assert arm.commands == []
+
+
+def test_an_arm_that_does_not_arrive_is_named(time: Time) -> None:
+    arms = {"left": driven(StubArm(0), Pose()), "right": driven(StubArm(10**9), Pose())}
+    before = time.now
+    with pytest.raises(DeviceError, match=r"arm 'right' did not come to its target within 2 s; it follows its target"):
+        drive(arms, timeout=2.0)
+    assert time.now - before == pytest.approx(2.0, abs=0.02)
+
+
+def test_what_stops_an_arm_is_what_is_raised(time: Time) -> None:
+    with pytest.raises(ProtectiveStop):
+        drive({"left": driven(StubArm(error=ProtectiveStop("stopped")), Pose())}, timeout=2.0)
+
+
+def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Time) -> None:
+    log: list[object] = []
+
+    class Bench:
+        def step(self, pause: float) -> dict[str, int]:
+            log.append(("step", len(arm.commands), pause))
+            return {"finger": 17}
+
+    class Eye:
+        def wait_for(self, number: int, timeout: float) -> None:
+            log.append(("picture", number))
+
+    arm = StubArm(4)
+    clock = LockStep(PERIOD, {"left": driven(arm, Pose())}, {"finger": Eye()}, Bench())  # type: ignore[dict-item, arg-type]
+    clock.tick()
+    assert log == [("step", 4, clocks.SETTLED), ("picture", 17)]
+    assert clock.period == PERIOD and clock.diagnostics() == {}
+
+
+def test_a_look_waits_for_the_simulator_first() -> None:
+    """Else an approach would go on while the simulator is busy with the first touch."""
+    seen: list[str] = []
+    WallClock(PERIOD, lambda: seen.append("caught up")).look()
+    assert seen == ["caught up"]
+
+
+def test_catching_up_needs_a_look_that_began_afterwards_and_tells_of_a_failure() -> None:
+    bench = object.__new__(MockBench)
+    bench._looks, bench._failure = 5, None
+
+    def look() -> None:
+        bench._looks += 1
+
+    timers = [threading.Timer(0.05 * k, look) for k in (1, 2)]
+    for timer in timers:
+        timer.start()
+    bench.catch_up()
+    assert bench._looks == 7
+    bench._failure = RuntimeError("no more")
+    with pytest.raises(DeviceError, match="no more"):
+        bench.catch_up()

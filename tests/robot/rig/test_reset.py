@@ -1,0 +1,192 @@
+"""How an episode begins on hardware, with arms and clocks of the tests' own: the order of things, and what stops it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from robot.errors import EmergencyStop
+from robot.rig import reset as starts
+from robot.rig.clock import Driven
+from robot.rig.reset import RETREAT, GuidedStart, NotConfirmed, NoTouch
+from tacsim import pose as se3
+from tacsim.interface import ArmState, Pose, SensorSpec, TactileFrame
+from tacsim.models.hardware import HardwareStart
+
+LOWER, UPPER = Pose(np.array([0.0, 0.0, -0.02])), Pose(np.array([0.0, 0.0, 0.03]), np.array([1.0, 0.0, 0.0, 0.0]))
+PARAMS = HardwareStart(approach_step=1e-3, approach_way=10e-3, approach_speed=20e-3)
+
+
+class StubArm:
+    """Is at once where it is sent; tells the log."""
+
+    def __init__(self, name: str, pose: Pose, log: list[object]) -> None:
+        self.name, self.pose, self._log = name, pose, log
+        self.stopped = False
+        self.told: object = "what was seen last"
+
+    def tell(self, shown: object) -> None:
+        self.told = shown
+
+    def state(self) -> ArmState:
+        return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
+
+    def command(self, target: Pose) -> Pose:
+        if self.stopped:
+            raise EmergencyStop(f"arm '{self.name}' has an emergency stop")
+        self.pose = target
+        self._log.append((self.name, target))
+        return target
+
+    def arrived(self, target: Pose, **within: float) -> bool:
+        return True
+
+    def zero_wrench(self) -> None:
+        self._log.append((self.name, "zero"))
+
+
+class StubSensor:
+    spec = SensorSpec(image_shape=(4, 4), height=False, flow=False, arm=None)
+
+    def __init__(self, log: list[object]) -> None:
+        self._log = log
+
+    def read(self, timeout: float) -> TactileFrame:
+        self._log.append("reference")
+        return TactileFrame(np.zeros((4, 4, 3), np.uint8), 0.0, 0)
+
+    def close(self) -> None: ...
+
+
+@dataclass
+class Scene:
+    """A start, and all that happened."""
+
+    touch_at: float | None = None  # how far both must come until they touch [m]
+    yes: bool = True
+    arms: bool = True
+    placement: float = 0.0
+    log: list[object] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.lower, self.upper = StubArm("lower", LOWER, self.log), StubArm("upper", UPPER, self.log)
+        driven = {"lower": Driven(self.lower), "upper": Driven(self.upper)}  # type: ignore[arg-type]
+        self.start = GuidedStart(
+            arms=driven if self.arms else {},
+            sensors={"finger": StubSensor(self.log)},
+            start={"lower": LOWER, "upper": UPPER},
+            clock=self,
+            config=PARAMS,
+            feel=None if self.touch_at is None else self.feel,
+            confirm=self.confirm,
+            placement=self.placement,
+        )
+
+    def look(self) -> None:
+        self.log.append("look")
+
+    def restart(self) -> None:
+        self.log.append("restart")
+
+    def confirm(self) -> bool:
+        self.log.append("asked")
+        return self.yes
+
+    def feel(self) -> float:
+        assert self.touch_at is not None
+        return float(self.lower.pose.position[2] - LOWER.position[2]) / self.touch_at
+
+    def motions(self) -> list[tuple[str, Pose]]:
+        return [each for each in self.log if isinstance(each, tuple) and isinstance(each[1], Pose)]
+
+
+@pytest.fixture(autouse=True)
+def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(starts.time, "sleep", lambda seconds: None)
+
+
+def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
+    scene = Scene()
+    scene.lower.pose, scene.upper.pose = (
+        Pose(np.array([5e-3, 0, 0])),
+        Pose(np.array([5e-3, 0, 10e-3]), UPPER.quaternion),
+    )
+    scene.start.clear(0)
+    assert scene.lower.told is scene.upper.told is None  # until it sees anew, nothing is decided by what it saw
+    back = dict(scene.motions()[:2])
+    assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT])
+    assert back["upper"].position == pytest.approx([5e-3, 0, 10e-3 + RETREAT])  # it faces down
+    there = dict(scene.motions()[2:])
+    assert se3.distance(there["lower"], LOWER)[0] == se3.distance(there["upper"], UPPER)[0] == 0.0
+
+
+def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last() -> None:
+    scene = Scene()
+    scene.start.clear(0)
+    assert scene.log[4:] == ["look", ("lower", "zero"), ("upper", "zero"), "look", "reference"]
+
+
+def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms() -> None:
+    found = []
+    for seed in (3, 3, 4):
+        scene = Scene(placement=2e-3)
+        scene.start.clear(seed)
+        shifts = [
+            pose.position - there.position for (_, pose), there in zip(scene.motions()[2:], (LOWER, UPPER), strict=True)
+        ]
+        np.testing.assert_array_equal(shifts[0], shifts[1])
+        assert shifts[0][2] == 0.0 and 0.0 < np.abs(shifts[0][:2]).max() <= 2e-3
+        found.append(shifts[0])
+    assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
+
+
+def test_both_approach_by_steps_until_they_feel_enough() -> None:
+    scene = Scene(touch_at=3.5e-3)
+    scene.start.clear(0)
+    before = len(scene.motions())
+    scene.start.touch()
+    steps = scene.motions()[before:]
+    lower = [pose.position[2] - LOWER.position[2] for name, pose in steps if name == "lower"]
+    upper = [UPPER.position[2] - pose.position[2] for name, pose in steps if name == "upper"]
+    assert lower == pytest.approx([1e-3, 2e-3, 3e-3, 4e-3])
+    assert upper == pytest.approx(lower)
+    assert scene.log[-1] == "restart"
+    assert scene.log.index("asked") < scene.log.index(steps[0])
+
+
+def test_without_a_yes_nothing_moves() -> None:
+    scene = Scene(touch_at=1e-3, yes=False)
+    scene.start.clear(0)
+    before = len(scene.motions())
+    with pytest.raises(NotConfirmed, match="nothing approaches"):
+        scene.start.touch()
+    assert len(scene.motions()) == before and "restart" not in scene.log
+
+
+def test_no_touch_goes_back_to_the_start() -> None:
+    scene = Scene(touch_at=1.0)
+    scene.start.clear(0)
+    with pytest.raises(NoTouch, match=r"no touch after an approach of 1[01] mm.*back at their start"):
+        scene.start.touch()
+    assert scene.lower.pose.position == pytest.approx(LOWER.position)
+    assert scene.upper.pose.position == pytest.approx(UPPER.position)
+    farthest = max(pose.position[2] for name, pose in scene.motions() if name == "lower")
+    assert 8e-3 < farthest - LOWER.position[2] <= PARAMS.approach_way + 1e-9  # never beyond
+
+
+def test_an_arm_that_is_stopped_ends_it() -> None:
+    scene = Scene(touch_at=1.0)
+    scene.upper.stopped = True
+    with pytest.raises(EmergencyStop):
+        scene.start.clear(0)
+    assert "reference" not in scene.log
+
+
+def test_a_dry_run_moves_nothing_and_still_asks_and_looks() -> None:
+    scene = Scene(arms=False, touch_at=1.0)
+    scene.start.clear(0)
+    scene.start.touch()
+    assert scene.motions() == [] and ("lower", "zero") not in scene.log
+    assert scene.log == ["look", "reference", "asked", "look", "restart"]

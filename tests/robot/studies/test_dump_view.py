@@ -1,0 +1,158 @@
+"""`tacsim debug`: table, picture and replay of a dump; and that `tacsim run` leaves one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner, Result
+
+from robot.cli import app
+from robot.studies import dump_view
+from tacsim.interface import Pose
+from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Settling, Sphere
+from tacsim.physics.failure import health
+from tacsim.physics.failure.dump import DumpError, dumps_in, read
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.worlds.world import make_world
+
+SMALL = Gel(size=(6e-3, 6e-3, 4e-3))
+CLAY = BodyMaterial(yield_stress=30e3)
+SCENES = {
+    "press": Scene(body=None, indenter=Indenter(geometry=Sphere(radius=3e-3)), gel=SMALL, settling=Settling(mach=0.1)),
+    "hybrid": Scene(body=Body(geometry=Box(size=(2e-3,) * 3), material=CLAY), gel=SMALL),
+    "seed": Scene(physics="seed", body=Body(geometry=Box(size=(2e-3,) * 3), material=CLAY), gel=SMALL),
+}
+
+
+def tacsim(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
+
+
+def diverge(scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dump of a motion that breaks a limit, which is lowered where the scheme would not break it by itself."""
+    world = make_world(scene)
+    frame = "upper" if scene.indenter is None else "indenter"
+    pose = world.pose(frame)
+    monkeypatch.setattr(health, "FASTEST", 0.005)
+    with dumps_in(folder), pytest.raises(SimulationDiverged):
+        world.move({frame: Pose(pose.position - [0, 0, 0.5e-3], pose.quaternion)})
+    return folder / "00"
+
+
+@pytest.mark.parametrize("physics", SCENES)
+def test_a_dump_is_shown_drawn_and_replayed(physics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = diverge(SCENES[physics], tmp_path / "out", monkeypatch)
+    result = tacsim("debug", place)
+    assert result.exit_code == 1, result.output
+    assert "of the wave speed (limit 0.005)" in result.stdout
+    assert "diverges again, exactly as recorded, to the last bit" in result.stdout
+    assert "before the motion" in result.stdout and "last good" in result.stdout and "failed" in result.stdout
+    assert "numbers not finite" in result.stdout and "smallest volume ratio" in result.stdout
+    picture = imread(place / "debug.png")
+    assert picture.shape[1] > 1000 and np.ptp(picture[..., :3].mean(axis=2)) > 0.5
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]  # the replay wrote no dump
+    monkeypatch.undo()
+    mended = tacsim("debug", place / "dump.json")
+    assert mended.exit_code == 0, mended.output
+    assert "does not diverge: reached its targets at the first attempt" in mended.stdout
+    assert tacsim("debug", place, "--no-replay").exit_code == 0
+
+
+@pytest.mark.parametrize("physics", SCENES)
+def test_a_motion_at_constant_load_is_replayed_with_its_load(
+    physics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = make_world(SCENES[physics])
+    loads = {world.sensors[-1]: 0.3}
+    monkeypatch.setattr(health, "FASTEST", 1e-4)
+    with dumps_in(tmp_path), pytest.raises(SimulationDiverged):
+        world.move({}, loads)
+    dump = read(tmp_path / "00")
+    assert dump.info.loads == loads and dump.order.targets == {}
+    assert dump_view.replay(dump, dump_view.open_world(dump)).identical
+
+
+def test_the_table_tells_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dump = read(diverge(SCENES["hybrid"], tmp_path, monkeypatch))
+    dump.states["failed"]["velocity"][:3] = np.nan
+    dump.states["failed"]["gel_displacement"][0, 2, 2, 4, 2] = -1.5  # the element is 1 mm high
+    rows = dict(dump_view.table(dump))
+    assert rows["numbers not finite"]["failed"].startswith("9 of ")
+    assert rows["numbers not finite"]["before"].startswith("0 of ")
+    assert float(rows["smallest at a corner of one"]["failed"]) == pytest.approx(-0.5, abs=0.02)
+    assert "9 not finite" in rows["fastest of particles [wave speed]"]["failed"]
+    assert "deepest overlap [mm]" in rows
+    dump_view.draw(dump, tmp_path / "debug.png")
+
+
+def test_arrays_of_another_scene_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = diverge(SCENES["hybrid"], tmp_path, monkeypatch)
+    info = json.loads((place / "dump.json").read_text())
+
+    def changed(**scene: object) -> Result:
+        (place / "dump.json").write_text(json.dumps({**info, "scene": {**info["scene"], **scene}}))
+        return tacsim("debug", place)
+
+    fewer = changed(element_size=2e-3)
+    assert fewer.exit_code == 2 and "'before.gel_displacement' must be float32" in fewer.output
+    huge = changed(element_size=0.05e-3)  # a thousand times as much memory
+    assert huge.exit_code == 2 and "gel nodes, but 'before.gel_displacement' holds" in huge.output
+    other = changed(particle_spacing=1e-3)
+    assert other.exit_code == 2 and "for this scene, found" in other.output
+    (place / "dump.json").write_text(json.dumps(info))
+    dump = read(place)
+    dump.states["before"]["poses"][0, 3:] = 0.0
+    with pytest.raises(DumpError, match=r"unsound: .*'lower': Pose\.quaternion"):
+        dump_view.open_world(dump)
+
+
+def test_a_run_that_diverges_leaves_a_dump_and_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(health, "FASTEST", 1e-4)
+    tiny = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")
+    result = tacsim("run", "sim", "--steps", 2, "--out", "first", *tiny)
+    assert result.exit_code == 1
+    assert "tacsim debug first/diverged/00" in result.output.replace("\n", "")
+    assert (tmp_path / "first" / "diverged" / "00" / "state.npz").is_file()
+    assert tacsim("debug", "first/diverged/00").exit_code == 1
+    nowhere = tacsim("debug", "first")
+    assert nowhere.exit_code == 2 and "is no dump: it has no dump.json" in nowhere.output
+
+
+def test_an_altered_dump_is_refused_with_file_and_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = diverge(SCENES["press"], tmp_path, monkeypatch)
+    text, arrays = (place / "dump.json").read_text(), (place / "state.npz").read_bytes()
+    here, none = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], [0.0] * 7
+
+    def refused(said: str) -> None:
+        result = tacsim("debug", place)
+        assert result.exit_code == 2 and said in " ".join(result.output.split()), result.output
+
+    for change, said in (
+        ({"poses": {"other": here}}, "dump.json: poses.indenter: this scene drives lower, indenter"),
+        ({"poses": {"lower": none, "indenter": here}}, "dump.json: poses.lower: Pose.quaternion must have unit length"),
+        ({"failed_poses": {"lower": here}}, "dump.json: failed_poses.indenter"),
+        ({"targets": {"other": here}}, "dump.json: targets.other: this scene drives"),
+        ({"loads": {"other": 1.0}}, "dump.json: loads.other: must be 0 N or more on one of lower, found 1"),
+        ({"loads": {"lower": -1.0}}, "dump.json: loads.lower"),
+        ({"duration": 1e308}, "dump.json: duration: Input should be less than or equal to 1000"),
+    ):
+        (place / "dump.json").write_text(json.dumps({**json.loads(text), **change}))
+        refused(said)
+    (place / "dump.json").write_text(text)
+
+    for name, array, said in (
+        ("before.rates", np.full((2, 6), np.inf), "state.npz: before.rates: not all of its numbers are finite"),
+        ("good.position", np.zeros(3, np.float32), "array 'good.position' is none of this scene's"),
+        ("before.strain", np.zeros((3, 2), np.float32), "array 'before.strain' is none of this scene's"),
+        ("good.gel_displacement", None, "array 'good.gel_displacement' must be float32"),
+    ):
+        (place / "state.npz").write_bytes(arrays)
+        with np.load(place / "state.npz", allow_pickle=False) as archive:
+            altered = {**archive, name: array}
+        np.savez(place / "state.npz", **{key: a for key, a in altered.items() if a is not None})
+        refused(said)

@@ -1,0 +1,90 @@
+"""Taichi in one process: started once, used by one thread at a time, never by a forked child."""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+
+import pytest
+
+WORLD = """
+import os, sys, threading
+import numpy as np
+from tacsim.interface import Pose
+from tacsim.physics.worlds.press import PressWorld
+from tacsim.models.scene import Gel, Indenter, Scene, Sphere
+
+def world():
+    gel = Gel(size=(8e-3, 8e-3, 4e-3))
+    return PressWorld(Scene(body=None, indenter=Indenter(geometry=Sphere(radius=3e-3)), gel=gel))
+
+def press(world):
+    world.move({"indenter": Pose(world.pose("indenter").position - [0.0, 0.0, 0.3e-3])})
+    return float(world.wrench("lower")[2])
+
+def in_threads(*calls):
+    found, together = [], threading.Barrier(len(calls))
+    def run(call):
+        together.wait()
+        try:
+            found.append(call())
+        except BaseException as error:
+            found.append(repr(error))
+    threads = [threading.Thread(target=run, args=(call,)) for call in calls]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return found
+"""
+
+
+def run(code: str) -> str:
+    """What a fresh process prints, none of whose kernels is compiled yet."""
+    command = [sys.executable, "-W", "ignore", "-c", WORLD + code]  # from 3.12 on Python warns of a fork beside threads
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.strip()
+
+
+def test_a_world_made_here_may_first_move_in_another_thread() -> None:
+    """Where its kernels are compiled; and the thread in which Taichi was started may be gone by then."""
+    code = """
+made = world()
+forces = in_threads(lambda: press(made)) + [press(world())]
+print(len(set(forces)) == 1 and forces[0] < 0 or forces)
+"""
+    assert run(code) == "True"
+    assert run(code.replace("made = world()", "made, = in_threads(world)")) == "True"
+
+
+def test_threads_that_make_and_move_their_first_worlds_at_once_take_turns() -> None:
+    code = """
+forces = in_threads(*[lambda: press(world())] * 3)
+print(len(set(forces)) == 1 and forces[0] < 0 or forces)
+"""
+    assert run(code) == "True"
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="processes are never forked here")
+def test_a_world_is_not_moved_in_a_forked_child() -> None:
+    """It says so, and the world is as it was: nothing waits for threads that are not there."""
+    code = """
+import signal
+made = world()
+press(made)
+before = made.snapshot()
+if os.fork() == 0:
+    signal.alarm(30)
+    for call in (lambda: press(made), world):
+        try:
+            call()
+        except RuntimeError as error:
+            print(error)
+    print(all(np.array_equal(a, before[name]) for name, a in made.snapshot().items()), flush=True)
+    os._exit(0)
+print(os.wait()[1])
+"""
+    told = "Taichi does not survive a fork: start worker processes with the 'spawn' method"
+    assert run(code).splitlines() == [told, told, "True", "0"]

@@ -1,0 +1,334 @@
+"""Particles, signed distance and distance grids against closed forms and brute force."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from tacsim.geometry import shapes
+from tacsim.geometry.mesh import Axes, Surface, fingerprint, load_mesh, signed_distance_on_grid
+from tacsim.geometry.shapes import distance, distance_grid, extent, farthest, particles, sample, volume
+from tacsim.models.scene import Box, Cylinder, Mesh, Shape, Sphere
+
+MM = 1e-3
+WEDGE = np.array([[0, 0, 0], [6, 0, 0], [0, 4, 0], [0, 0, 3.0]])  # a right-angled tetrahedron: no symmetry at all
+
+
+def stl(folder: Path, mesh: trimesh.Trimesh, name: str = "part.stl") -> Mesh:
+    """Writes `mesh` [mm] as a binary STL."""
+    mesh.export(folder / name)
+    return Mesh(path=str(folder / name))
+
+
+def wedge() -> trimesh.Trimesh:
+    return trimesh.Trimesh(WEDGE, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+def ell() -> trimesh.Trimesh:
+    """A prism over an L: has a concave edge, where signs taken from the nearest face alone go wrong."""
+    outline = np.array([[0, 0], [5, 0], [5, 2], [2, 2], [2, 4], [0, 4.0]])
+    caps = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    sides = [[i, (i + 1) % 6, i + 6] for i in range(6)] + [[(i + 1) % 6, (i + 1) % 6 + 6, i + 6] for i in range(6)]
+    corners = np.vstack([np.column_stack([outline, np.full(6, z)]) for z in (0.0, 3.0)])
+    return trimesh.Trimesh(corners, np.vstack([caps[:, ::-1], caps + 6, sides]))
+
+
+def ell_distance(points: np.ndarray) -> np.ndarray:
+    """Closed form of `ell` [mm], centred: union of two boxes outside; inside the complement's distance."""
+    at = np.abs(points[:, 2]) - 1.5
+    x, y = points[:, 0] + 2.5, points[:, 1] + 2.0
+    outline = np.array([[0, 0], [5, 0], [5, 2], [2, 2], [2, 4], [0, 4.0], [0, 0]])
+    flat = np.full(len(points), np.inf)
+    for a, b in pairwise(outline):
+        s = np.clip(((x - a[0]) * (b - a)[0] + (y - a[1]) * (b - a)[1]) / ((b - a) @ (b - a)), 0, 1)
+        flat = np.minimum(flat, np.hypot(x - a[0] - s * (b - a)[0], y - a[1] - s * (b - a)[1]))
+    inside = (x > 0) & (y > 0) & (((x < 5) & (y < 2)) | ((x < 2) & (y < 4)))
+    flat = np.where(inside, -flat, flat)
+    return np.hypot(np.maximum(flat, 0), np.maximum(at, 0)) + np.minimum(np.maximum(flat, at), 0)
+
+
+# particles
+
+
+def test_box_lattice_starts_half_a_spacing_inside_each_face() -> None:
+    found = particles(Box(size=(3 * MM, 5 * MM, 2 * MM)), 0.5 * MM)
+    assert found.shape == (6 * 10 * 4, 3)
+    assert np.allclose(found.max(axis=0), [1.25 * MM, 2.25 * MM, 0.75 * MM])
+    assert np.allclose(found.min(axis=0), -found.max(axis=0))
+    assert len(np.unique(np.round(found[:, 2] / MM, 9))) == 4  # flat layers, no orange peel
+
+
+@pytest.mark.parametrize(
+    "geometry", [Box(size=(4 * MM, 5 * MM, 6 * MM)), Sphere(radius=3 * MM), Cylinder(radius=3 * MM, height=4 * MM)]
+)
+def test_particles_fill_the_shape_evenly(geometry: Shape) -> None:
+    spacing = 0.25 * MM
+    found = particles(geometry, spacing)
+    assert len(found) * spacing**3 == pytest.approx(volume(geometry), rel=0.02)
+    assert (distance(geometry, found) <= 1e-12).all()
+    assert np.allclose(found.mean(axis=0), 0, atol=1e-12)
+    assert np.allclose(np.ptp(found, axis=0) + spacing, extent(geometry))
+    steps = (found - found[0]) / spacing
+    assert np.allclose(steps, np.rint(steps), atol=1e-9)
+
+
+def test_mesh_is_filled_like_the_solid_it_describes(tmp_path: Path) -> None:
+    geometry = stl(tmp_path, wedge())
+    spacing = 0.1 * MM
+    found = particles(geometry, spacing)
+    assert volume(geometry) == pytest.approx(12e-9, rel=1e-5)
+    assert len(found) * spacing**3 == pytest.approx(volume(geometry), rel=0.03)
+    corner = found / MM + [3, 2, 1.5]  # back to the file's frame: x/6 + y/4 + z/3 <= 1 in the positive octant
+    assert (corner > 0).all()
+    assert (corner @ [1 / 6, 1 / 4, 1 / 3] <= 1 + 1e-6).all()
+
+
+def test_mesh_of_a_box_has_the_particles_of_the_box(tmp_path: Path) -> None:
+    geometry = stl(tmp_path, trimesh.creation.box((3, 5, 2)).apply_translation([7, -3, 11]))
+    assert np.allclose(extent(geometry), [3 * MM, 5 * MM, 2 * MM])
+    assert np.allclose(particles(geometry, 0.5 * MM), particles(Box(size=(3 * MM, 5 * MM, 2 * MM)), 0.5 * MM))
+
+
+def test_the_nearest_number_of_layers_is_taken() -> None:
+    assert np.allclose(np.ptp(particles(Box(size=(10.2 * MM,) * 3), 0.5 * MM), axis=0), 9.5 * MM)
+    assert np.allclose(np.ptp(particles(Box(size=(10.3 * MM,) * 3), 0.5 * MM), axis=0), 10.0 * MM)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "spacing", "message"),
+    [
+        (
+            Box(size=(1.3 * MM, 4 * MM, 4 * MM)),
+            1 * MM,
+            r"1\.3 mm along x, but 1 layers .* 1 mm \(-23%, limit 10%\); use",
+        ),
+        (Box(size=(4 * MM, 4 * MM, 0.4 * MM)), 1 * MM, r"only 0\.4 mm along z: no particle fits at a spacing of 1 mm"),
+        (Sphere(radius=0.1 * MM), 1 * MM, "no particle fits"),
+        (Box(), 0.01 * MM, r"1,000,000,000 particles .* the limit is 5,000,000: use a larger spacing"),
+        (Box(), 0.0, "positive"),
+        (Box(), float("nan"), "positive"),
+    ],
+)
+def test_impossible_spacing_is_refused_with_advice(geometry: Shape, spacing: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        particles(geometry, spacing)
+
+
+def test_walls_thinner_than_the_spacing_are_refused(tmp_path: Path) -> None:
+    outer, inner = trimesh.creation.box((10, 10, 10)), trimesh.creation.box((8.8, 8.8, 8.8))
+    inner.invert()
+    geometry = stl(tmp_path, trimesh.util.concatenate([outer, inner]))
+    with pytest.raises(ValueError, match=r"miss its volume by \+53% .* thinner than the spacing"):
+        particles(geometry, 1 * MM)
+
+
+# signed distance
+
+
+def test_closed_forms_at_known_points() -> None:
+    box = Box(size=(2.0, 4.0, 6.0))
+    at = [[0, 0, 0], [0.9, 0, 0], [1, 0, 0], [4, 0, 0], [4, 6, 3], [4, 6, 15]]
+    assert np.allclose(distance(box, at), [-1, -0.1, 0, 3, 5, 13])
+    cylinder = Cylinder(radius=1.0, height=4.0)
+    at = [[0, 0, 0], [0, 0, 1.75], [0.6, 0.8, 0], [3, 0, 0], [0, 3, 3.5], [3, 4, 5]]
+    assert np.allclose(distance(cylinder, at), [-1, -0.25, 0, 2, 2.5, 5])
+    assert np.allclose(distance(Sphere(radius=2.0), [[0, 0, 0], [3, 4, 0]]), [-2, 3])
+
+
+def test_mesh_distance_is_exact(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    at = rng.uniform(-6, 6, (4000, 3)) * MM
+    box = stl(tmp_path, trimesh.creation.box((4, 6, 3)))
+    assert np.abs(distance(box, at) - distance(Box(size=(4 * MM, 6 * MM, 3 * MM)), at)).max() < 1e-10
+    concave = stl(tmp_path, ell())
+    assert np.abs(distance(concave, at) - ell_distance(at / MM) * MM).max() < 1e-10
+
+
+@pytest.mark.parametrize("case", ["centre of a ball", "coarse beside fine"])
+def test_no_nearer_triangle_is_overlooked(tmp_path: Path, case: str) -> None:
+    """Hard for a search by centres of triangles: all are equally near, or small ones stand before a large one."""
+    rng = np.random.default_rng(3)
+    if case == "centre of a ball":
+        mesh, points = trimesh.creation.icosphere(3, 4.0), rng.normal(scale=0.2, size=(40, 3))
+    else:
+        crumb = trimesh.creation.icosphere(3, 0.05).apply_translation([0.0, 0.0, 1.6])
+        mesh = trimesh.util.concatenate([trimesh.creation.box((4, 6, 3)), crumb])
+        points = rng.uniform([-0.1, -0.1, 1.5], [0.1, 0.1, 1.53], (200, 3))
+    geometry = stl(tmp_path, mesh)
+    triangles = trimesh.load_mesh(geometry.path).triangles
+    found = distance(geometry, (points - mesh.bounds.mean(axis=0)) * MM)
+    for at, here in zip(points, found, strict=True):
+        brute = trimesh.triangles.closest_point(triangles, np.tile(at, (len(triangles), 1))) - at
+        assert abs(here) == pytest.approx(np.linalg.norm(brute, axis=1).min() * MM, abs=1e-10)
+
+
+def test_the_side_is_right_round_a_sharp_tip(tmp_path: Path) -> None:
+    """Across an edge seen at an acute angle the nearest faces disagree about the side; the pseudonormal decides."""
+    geometry = stl(tmp_path, wedge())
+    tip = np.array([6, 0, 0.0]) - [3, 2, 1.5]
+    outward = np.array([1, -0.2, -0.1])
+    assert (distance(geometry, (tip + np.outer([0.01, 0.1, 1, 3], outward)) * MM) > 0).all()
+    inward = WEDGE.mean(axis=0) - [6, 0, 0]
+    assert (distance(geometry, (tip + np.outer([0.01, 0.1, 1.0], inward)) * MM) < 0).all()
+
+
+def test_distance_refuses_bad_points() -> None:
+    with pytest.raises(ValueError, match=r"shape \(n, 3\)"):
+        distance(Sphere(), [[0.0, 0.0]])
+    with pytest.raises(ValueError, match="finite"):
+        distance(Sphere(), [[0.0, 0.0, np.nan]])
+
+
+def test_the_farthest_point_is_the_middle_of_a_face_that_rounding_tilts() -> None:
+    box, cylinder = Box(size=(2.0, 4.0, 6.0)), Cylinder(radius=1.0, height=4.0)
+    for noise in (0.0, 1e-7, -1e-7):
+        assert farthest(box, [noise, -1.0, noise]).tolist() == [0.0, -2.0, 0.0]
+        assert farthest(cylinder, [noise, noise, 2.0]).tolist() == [0.0, 0.0, 2.0]
+        assert farthest(cylinder, [-3.0, noise, noise]).tolist() == [-1.0, 0.0, 0.0]
+    assert farthest(box, [1e-3, -1.0, -1e-3]).tolist() == [1.0, -2.0, -3.0]
+    assert farthest(cylinder, [0.0, 1e-3, 1.0]).tolist() == [0.0, 1.0, 2.0]
+    assert farthest(Sphere(radius=2.0), [3.0, 0.0, -4.0]) == pytest.approx([1.2, 0.0, -1.6])
+
+
+# distance grid
+
+
+@pytest.mark.parametrize("make", ["sphere", "box", "ell"])
+def test_mesh_grid_matches_the_closed_form(tmp_path: Path, make: str) -> None:
+    spacing = 0.2 * MM
+    mesh, exact, tolerance = {
+        "sphere": (trimesh.creation.icosphere(4, 3.0), lambda p: distance(Sphere(radius=3 * MM), p), 6e-6),
+        "box": (trimesh.creation.box((4, 6, 3)), lambda p: distance(Box(size=(4 * MM, 6 * MM, 3 * MM)), p), 2e-9),
+        "ell": (ell(), lambda p: ell_distance(p / MM) * MM, 2e-9),
+    }[make]
+    grid = distance_grid(stl(tmp_path, mesh), spacing)
+    assert grid.values.dtype == np.float32
+    index = np.stack(np.indices(grid.values.shape), axis=-1).reshape(-1, 3)
+    truth = exact(grid.origin + spacing * index)
+    error = grid.values.ravel() - truth
+    band = np.abs(truth) < shapes.BAND * spacing
+    assert np.abs(error[band]).max() < tolerance  # the sphere's is that of its facets, R (1 - cos(half an edge))
+    assert (np.sign(grid.values.ravel())[~band] == np.sign(truth[~band])).all()
+    assert (np.abs(grid.values.ravel()) > np.abs(truth) - tolerance)[~band].all()
+    assert np.abs(error).max() < 0.5 * spacing  # beyond the band, as promised
+    assert grid.values.min() < 0 < grid.values.max()
+
+
+def test_sample_is_trilinear_with_its_own_gradient() -> None:
+    spacing = 0.1 * MM
+    nodes = spacing * (np.stack(np.indices((45, 45, 45)), axis=-1) - 22.0)
+    values = distance(Sphere(radius=2 * MM), nodes.reshape(-1, 3)).reshape(45, 45, 45).astype(np.float32)
+    grid = shapes.DistanceGrid(values=values, origin=nodes[0, 0, 0], spacing=spacing)
+    rng = np.random.default_rng(2)
+    at = rng.normal(size=(500, 3))
+    at *= (2 * MM + rng.uniform(-0.2, 0.2, (500, 1)) * MM) / np.linalg.norm(at, axis=1, keepdims=True)
+    value, gradient = sample(grid, at)
+    assert np.abs(value - distance(Sphere(radius=2 * MM), at)).max() < 3 / 8 * spacing**2 / (1.75 * MM)
+    assert np.abs(gradient - at / np.linalg.norm(at, axis=1, keepdims=True)).max() < 1.1 * spacing / (1.75 * MM)
+    step = 1e-3 * spacing
+    for axis in range(3):
+        ahead, _ = sample(grid, at + step * np.eye(3)[axis])
+        slope = (ahead - value) / step
+        assert np.median(np.abs(slope - gradient[:, axis])) < 1e-6
+
+
+def test_sample_reproduces_a_linear_field_and_knows_nothing_outside() -> None:
+    slope, shape = np.array([2.0, -3.0, 5.0]), (4, 5, 6)
+    values = np.einsum("a,aijk->ijk", slope, np.indices(shape) * 0.5).astype(np.float32)
+    grid = shapes.DistanceGrid(values=values, origin=np.array([1.0, 2.0, 3.0]), spacing=0.5)
+    at = np.array([[1.0, 2.0, 3.0], [1.7, 2.3, 4.1], [2.5, 4.0, 5.5]])
+    value, gradient = sample(grid, at)
+    assert np.allclose(value, (at - grid.origin) @ slope)
+    assert np.allclose(gradient, slope)
+    value, gradient = sample(grid, [[0.9, 2.1, 3.1], [1.0, 2.0, 5.6]])
+    assert np.isposinf(value).all()
+    assert (gradient == 0).all()
+
+
+def test_a_fine_stl_is_gridded_within_seconds(tmp_path: Path) -> None:
+    mesh = trimesh.creation.icosphere(4, 4.0)
+    assert len(mesh.faces) == 5120
+    geometry = stl(tmp_path, mesh)
+    start = time.process_time()
+    grid = distance_grid(geometry, 0.1 * MM)
+    assert time.process_time() - start < 10.0
+    assert grid.values.shape == (85, 85, 85)
+    value, _ = sample(grid, [[0.0, 0.0, -4.1 * MM], [0.0, 0.0, -3.5 * MM]])
+    assert value == pytest.approx([0.1 * MM, -0.5 * MM], abs=2e-5)
+
+
+@pytest.fixture
+def gridded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Nodes of each mesh grid that was computed."""
+    nodes = []
+
+    def counted(surface: Surface, axes: Axes, band: float) -> np.ndarray:
+        values = signed_distance_on_grid(surface, axes, band)
+        nodes.append(values.size)
+        return values
+
+    monkeypatch.setattr(shapes, "signed_distance_on_grid", counted)
+    return nodes
+
+
+def test_a_mesh_is_gridded_once_and_its_grid_is_read_only(tmp_path: Path, gridded: list[int]) -> None:
+    geometry = stl(tmp_path, wedge())
+    grid = distance_grid(geometry, 0.5 * MM)
+    assert distance_grid(Mesh(path=geometry.path), 0.5 * MM) is grid
+    assert gridded == [17 * 13 * 11]
+    for array in (grid.values, grid.origin):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    others = [
+        distance_grid(geometry, 0.4 * MM),
+        distance_grid(geometry.model_copy(update={"scale": 0.9 * MM}), 0.5 * MM),
+    ]
+    assert len(gridded) == 3 and len({id(each) for each in (grid, *others)}) == 3
+
+
+def test_a_rewritten_file_gives_a_new_grid(tmp_path: Path, gridded: list[int]) -> None:
+    """Even with the size and the times of the old one."""
+    geometry = stl(tmp_path, trimesh.creation.icosphere(2, 3.0))
+    path, grid = Path(geometry.path), distance_grid(geometry, 0.5 * MM)
+    old = path.stat()
+    stl(tmp_path, trimesh.creation.icosphere(2, 2.0))
+    os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (old.st_size, old.st_mtime_ns)
+    assert extent(geometry) == pytest.approx(4 * MM, rel=0.05)
+    assert distance_grid(geometry, 0.5 * MM).values.min() == pytest.approx(-2 * MM, rel=0.05)
+    assert grid.values.min() == pytest.approx(-3 * MM, rel=0.05) and len(gridded) == 2
+
+
+def test_a_file_changed_between_two_looks_is_not_taken_for_the_old_one(tmp_path: Path) -> None:
+    geometry = stl(tmp_path, wedge())
+    before = fingerprint(geometry.path)
+    stl(tmp_path, ell())
+    with pytest.raises(ValueError, match=r"part\.stl: the file was changed while it was read"):
+        load_mesh(geometry.path, geometry.scale, before)
+
+
+def test_bad_grids_are_refused(tmp_path: Path) -> None:
+    geometry = stl(tmp_path, wedge())
+    with pytest.raises(
+        ValueError, match=r"part\.stl at 0\.005 mm would have 5\d\d,\d{3},\d{3} nodes, .* a larger spacing"
+    ):
+        distance_grid(geometry, 0.005 * MM)
+    with pytest.raises(ValueError, match="positive"):
+        distance_grid(geometry, -1.0)
+
+
+def test_shapes_import_neither_taichi_nor_trimesh_nor_opencv() -> None:
+    code = (
+        "import sys, tacsim.geometry.shapes, tacsim.geometry.mesh; "
+        "print([m for m in ('taichi', 'trimesh', 'cv2') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from tacsim.models.photometric import (
+    PhotometricLight,
+    PhotometricModel,
+    clipped,
+    normal_terms,
+    places_in_image,
+    term_count,
+)
+from tacsim.models.sensor import Lighting, SensorGeometry, SensorModel
+from tacsim.optics.grid import image_grid
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import sample_surface
+from tests.tacsim.optics.surfaces import dent, flat
+
+GEL = (20e-3, 20e-3)
+RNG = np.random.default_rng(3)
+
+
+def model(degree: int, position: int, steepest: float = 0.8, blur: float = 0.0) -> PhotometricModel:
+    weights = RNG.normal(0, 0.3, (term_count(degree, position), 3))
+    return PhotometricModel(
+        degree=degree, position=position, weights=tuple(map(tuple, weights.tolist())), steepest=steepest, blur=blur
+    )
+
+
+@pytest.mark.parametrize(("degree", "position", "count"), [(1, 0, 3), (3, 0, 10), (3, 2, 60), (5, 1, 63)])
+def test_number_of_terms(degree: int, position: int, count: int) -> None:
+    assert term_count(degree, position) == count
+
+
+def test_terms_are_the_powers_of_the_normal() -> None:
+    gx, gy = 0.3, -0.5
+    nz = 1 / np.sqrt(1 + gx**2 + gy**2)
+    nx, ny = -gx * nz, -gy * nz
+    wanted = [nx, ny, 1 - nz, nx**2, nx * ny, ny**2, nx**3, nx**2 * ny, nx * ny**2, ny**3]
+    np.testing.assert_allclose([float(t) for t in normal_terms(np.array([gx, gy]), 3)], wanted)
+
+
+def test_change_is_the_polynomial_written_out() -> None:
+    calibrated = model(2, 1)
+    gradient = RNG.uniform(-0.4, 0.4, (20, 30, 2)).astype(np.float32)
+    u, v = places_in_image(30, 20)
+    change, beyond = PhotometricLight(calibrated).change(gradient, u, v)
+    row, column = 4, 17
+    normal = [float(t) for t in normal_terms(gradient[row, column].astype(float), 2)]
+    at_u, at_v = (column + 0.5) / 30 - 0.5, (row + 0.5) / 20 - 0.5
+    terms = [place * term for place in (1.0, at_u, at_v) for term in normal]
+    np.testing.assert_allclose(change[row, column], np.array(terms) @ np.array(calibrated.weights), atol=1e-5)
+    assert beyond == 0
+    scaled, _ = PhotometricLight(calibrated, (0.5, 1.0, 2.0)).change(gradient[8:12], u[8:12], v[8:12])
+    np.testing.assert_allclose(scaled, change[8:12] * [0.5, 1.0, 2.0], atol=1e-6)
+
+
+def test_slopes_beyond_the_calibrated_are_clipped_and_counted() -> None:
+    gradient = np.array([[[3.0, 4.0], [0.3, 0.4]]], dtype=np.float32)
+    shorter, beyond = clipped(gradient, 1.0)
+    np.testing.assert_allclose(shorter, [[[0.6, 0.8], [0.3, 0.4]]], rtol=1e-6)
+    assert beyond == 1
+    assert PhotometricLight(model(3, 0, steepest=1.0)).change(gradient, *places_in_image(2, 1))[1] == 1
+
+
+def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
+    sensor = SensorModel(photometric=model(3, 2, steepest=0.1, blur=0.8), texture=0.0)
+    render = Renderer(sensor, GEL)
+    base = np.rint(255 * np.array([0.42, 0.44, 0.46]))
+    np.testing.assert_array_equal(render(flat()).reshape(-1, 3), np.tile(base, (76800, 1)))
+    assert render.beyond == 0.0
+    seen = render(dent())
+    assert np.abs(seen - base).max() > 5
+    assert render.beyond > 0.01
+    phong = Renderer(SensorModel(texture=0.0), GEL)
+    phong(dent())
+    assert phong.beyond == 0.0
+
+
+@pytest.mark.parametrize("width", [640, 320, 100])
+def test_the_picture_is_the_polynomial_at_every_pixel(width: int) -> None:
+    """Colours are computed where the surface has its table, not pixel by pixel."""
+    geometry = SensorGeometry(width=width, height=3 * width // 4, pixel_pitch=20e-3 / width)
+    calibrated = model(5, 2)
+    sensor = SensorModel(geometry=geometry, photometric=calibrated, texture=0.0)
+    surface = dent(slide=(0.3e-3, -0.2e-3))
+    seen = Renderer(sensor, GEL)(surface)
+    slopes = sample_surface(surface, image_grid(geometry)).gradient
+    base = np.array([0.42, 0.44, 0.46])
+    change, _ = PhotometricLight(calibrated).change(slopes, *places_in_image(width, 3 * width // 4))
+    wanted = 255.0 * np.clip(base + base * change, 0.0, 1.0)
+    assert np.abs(255.0 * base - wanted).max() > 20.0
+    assert np.abs(seen - wanted).max() < 1.5
+    assert np.abs(seen - wanted).mean() < 0.3  # rounding alone gives 0.25
+
+
+def test_texture_shows_as_on_the_flat_gel() -> None:
+    sensor = SensorModel(photometric=model(3, 1))
+    still = Renderer(sensor, GEL)(flat()).astype(float)
+    smooth = sensor.model_copy(update={"texture": 0.0})
+    assert still.std(axis=(0, 1)).max() > 0.5
+    change = Renderer(smooth, GEL)(dent()).astype(float) - Renderer(smooth, GEL)(flat())
+    textured = Renderer(sensor, GEL)(dent()) - still
+    unclipped = (still + change > 1) & (still + change < 254)
+    np.testing.assert_allclose(textured[unclipped], change[unclipped], atol=1.0)
+
+
+def test_wrong_models_are_refused() -> None:
+    with pytest.raises(ValidationError, match="weights has 3 rows; degree 3 at position 0 has 10"):
+        PhotometricModel(degree=3, position=0, weights=((0.0, 0.0, 0.0),) * 3, steepest=1.0)
+    with pytest.raises(ValidationError, match=r"needs lighting\.background"):
+        SensorModel(photometric=model(1, 0), lighting=Lighting(background=None))

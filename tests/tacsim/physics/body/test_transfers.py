@@ -1,0 +1,79 @@
+"""What the body's transfers keep of a motion, and that what never yields is not looked at for yielding."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.cases.materials import COURANT
+from benchmarks.truth.blocks import BodyBlock
+from tacsim.geometry.sampling import body_points
+from tacsim.models.scene import Body, BodyMaterial, Box
+from tacsim.physics.body.material import ELASTIC
+from tacsim.physics.body.plasticine import BodyParams, body_params
+
+pytestmark = pytest.mark.cpu
+
+BOX = Box(size=(4e-3, 3e-3, 5e-3))
+ELASTIC_BODY = BodyMaterial()
+
+
+def block(params: BodyParams, spacing: float, sampling: str = "lattice") -> BodyBlock:
+    """A free body off the grid's own planes, its grid laid round it."""
+    points = body_points(Body.model_validate({"geometry": BOX, "sampling": sampling}), spacing) * 1e3
+    body = BodyBlock(params, points + [0.013, -0.007, 0.002], COURANT * params.cell)
+    body.fit(2 * params.cell)
+    return body
+
+
+GRADIENT = np.array([[0.02, -0.05, 0.01], [0.03, -0.02, 0.04], [-0.06, 0.05, 0.01]])
+CURVATURE = np.random.default_rng(0).uniform(-0.02, 0.02, (3, 3, 3))  # [component, x, y]
+
+
+def transferred(spacing: float, curvature: np.ndarray, sampling: str = "lattice") -> tuple[float, float]:
+    """Largest error of velocities and of their gradients after particles -> grid -> particles, of an unstressed body
+    whose velocity is 0.01 + G x + x K x."""
+    body = block(body_params(ELASTIC_BODY, spacing), spacing, sampling)
+    x = body.state.x().astype(np.float64)
+    velocity = 0.01 + x @ GRADIENT.T + np.einsum("dij,ni,nj->nd", curvature, x, x)
+    gradient = GRADIENT + np.einsum("dij,nj->ndi", curvature, x) + np.einsum("dij,ni->ndj", curvature, x)
+    body.state.v()[:], body.state.c()[:] = velocity, gradient
+    body.advance(1)
+    return np.abs(body.state.v() - velocity).max(), np.abs(body.state.c() - gradient).max()
+
+
+@pytest.mark.parametrize("sampling", ["lattice", "random"])
+def test_an_affine_motion_comes_back_as_it_went(sampling: str) -> None:
+    """Jiang et al. 2015, section 5.3: APIC keeps affine velocities, at the border and between particles too."""
+    velocity, gradient = transferred(0.5e-3, np.zeros((3, 3, 3)), sampling)
+    assert velocity < 1e-6
+    assert gradient < 1e-5
+
+
+def test_what_bends_comes_back_to_second_order() -> None:
+    """A quadratic field: velocities lose h^2, their gradients h, up to the border."""
+    errors = np.array([transferred(h, CURVATURE) for h in (0.5e-3, 0.25e-3, 0.125e-3)])
+    orders = np.log2(errors[:-1] / errors[1:])
+    assert (orders[:, 0] > 1.9).all()
+    assert (orders[:, 1] > 0.9).all()
+    assert errors[0, 0] < np.abs(CURVATURE).max() * 3 * 1.0**2  # of cells of 1 mm
+
+
+@pytest.mark.parametrize(("limit", "yields"), [(ELASTIC, False), (0.5 * ELASTIC, True)])
+def test_a_body_that_never_yields_runs_no_return_mapping(limit: float, yields: bool) -> None:
+    """Told by a flow that has softened the body to nothing, which the return mapping alone looks at."""
+    params = body_params(ELASTIC_BODY, 0.5e-3)
+    assert params.limit == ELASTIC
+    hardening = 2.0**-10  # a power of two: what is left is 0 to the digit
+    body = block(replace(params, limit=limit, hardening=hardening), 0.5e-3)
+    body.state.flow()[:] = -limit / hardening
+    body.state.c()[:], body.state.v()[:] = GRADIENT, body.state.x() @ GRADIENT.T
+    shear = []
+    for _ in range(3):
+        body.advance(1)
+        shear.append(float(np.abs(body.state.e()[:, 3:]).mean()))
+    assert shear[0] > 5e-3
+    if yields:  # what one substep adds, the return of the next takes away
+        assert shear[2] == pytest.approx(shear[0], rel=0.1)
+    else:
+        assert shear[2] > 2 * shear[0]

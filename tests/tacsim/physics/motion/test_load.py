@@ -1,0 +1,100 @@
+"""Motion at a constant normal load."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tacsim.interface import Pose
+from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere
+from tacsim.physics.motion.controller import Reading, run
+from tacsim.physics.motion.load import LEAST, LoadNotReached, keep_loads
+from tacsim.physics.motion.path import Path, plan
+from tacsim.physics.worlds.press import PressWorld
+from tacsim.physics.worlds.world import World, make_world
+
+
+def press() -> PressWorld:
+    return PressWorld(Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3))))
+
+
+def by(world: World, name: str, shift: tuple[float, float, float]) -> dict[str, Pose]:
+    pose = world.pose(name)
+    return {name: Pose(pose.position + shift, pose.quaternion)}
+
+
+def load(world: World, name: str) -> float:
+    return -float(world.wrench(name)[2])
+
+
+def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
+    world = press()
+    stats = world.move({}, loads={"lower": 0.3})
+    assert stats.settled
+    assert load(world, "lower") == pytest.approx(0.3, rel=0.01)
+    assert stats.load_error == pytest.approx(abs(load(world, "lower") - 0.3), abs=1e-9)
+    pressed = world.pose("lower").position
+    assert pressed[2] > 0.2e-3 and np.abs(pressed[:2]).max() == 0  # came up to the indenter, and only that
+    world.move({}, loads={"lower": 0.0})
+    assert load(world, "lower") == pytest.approx(0.0, abs=1e-2 * LEAST * 0.145 * 4.0**2)  # of what counts as none
+    assert world.pose("lower").position[2] < pressed[2]
+
+
+@pytest.mark.parametrize("physics", ["hybrid", pytest.param("seed", marks=pytest.mark.cpu)])
+def test_the_load_stays_through_a_shear(physics: str) -> None:
+    body = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=BodyMaterial(yield_stress=30e3))
+    world = make_world(Scene(body=body, physics=physics))  # type: ignore[arg-type]
+    world.move({}, loads={"upper": 0.5})
+    pose = world.pose("upper")
+    stats = world.move(by(world, "upper", (0.6e-3, 0, 0)), loads={"upper": 0.5})
+    assert stats.settled and load(world, "upper") == pytest.approx(0.5, rel=0.02)
+    assert world.pose("upper").position[0] == pytest.approx(pose.position[0] + 0.6e-3, abs=1e-9)
+
+
+def test_a_load_out_of_reach_is_an_error_and_nothing_has_moved() -> None:
+    world = press()
+    world.move(by(world, "indenter", (0, 0, 3e-3)))
+    before = world.snapshot()
+    with pytest.raises(LoadNotReached, match=r"'lower' does not reach a load of 0\.3 N: 0 N after \+2\.5 mm"):
+        world.move({}, loads={"lower": 0.3})
+    after = world.snapshot()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+
+
+def test_loads_that_make_no_sense_are_refused() -> None:
+    world = press()
+    with pytest.raises(KeyError, match="no sensor 'indenter' to hold a load"):
+        world.move({}, loads={"indenter": 0.3})
+    with pytest.raises(ValueError, match="load of 'lower' is -1 N"):
+        world.move({}, loads={"lower": -1.0})
+
+
+def test_the_sensor_that_went_too_far_is_named() -> None:
+    """Beside one that is wrong too, but in place: it sticks, and swings about its load."""
+    scene, rest = press().scene, Reading(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0.0, 0)
+    end = {"lower": Pose(), "upper": Pose()}
+
+    class Stuck:
+        def __init__(self) -> None:
+            self.scene, self.sensors = scene, tuple(end)
+
+        def wrench(self, name: str) -> NDArray[np.float64]:
+            force = 0.4 + math.copysign(0.1, end[name].position[2]) if name == "lower" else 0.0
+            return np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0])
+
+        def plan(self, start: Sequence[Pose], goal: Sequence[Pose]) -> Path:
+            return plan(start, goal, 0.03, 0.4, 10.0, 4.0)
+
+    motion = keep_loads(Stuck(), dict(end), end, {"lower": 0.4, "upper": 0.3}, 1, balanced=False)
+    with pytest.raises(LoadNotReached, match=r"'upper' does not reach a load of 0\.3 N: 0 N after \+2\.5 mm"):
+        run(motion, lambda *launch: rest)
+
+
+def test_a_way_that_would_take_for_ever_is_refused_with_a_load_too() -> None:
+    world = press()
+    before = world.snapshot()
+    with pytest.raises(ValueError, match="are the targets in metres"):
+        world.move(by(world, "indenter", (500.0, 0, 0)), loads={"lower": 0.3})
+    assert all(a.tobytes() == before[name].tobytes() for name, a in world.snapshot().items())

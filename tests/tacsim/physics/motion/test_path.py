@@ -1,0 +1,88 @@
+"""Ramped paths: rest to rest, never too fast, never too hard a stop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import Pose
+from tacsim.physics.motion.path import MOST, PEAK, plan, plan_on, ramp
+
+
+@pytest.mark.parametrize("rise", [0.5, 0.1])
+def test_ramp_starts_and_ends_at_rest(rise: float) -> None:
+    t = np.linspace(0, 1, 20001)
+    s = ramp(t, rise)
+    speed = np.gradient(s, t)
+    assert s[0] == 0 and s[-1] == pytest.approx(1, abs=1e-12)
+    assert speed[[0, -1]] == pytest.approx(0, abs=1e-5)
+    assert np.gradient(speed, t)[[0, -1]] == pytest.approx(0, abs=0.05)
+    assert np.abs(np.gradient(speed, t)).max() > 3  # of which that is nothing
+    assert speed.max() == pytest.approx(PEAK, rel=1e-4) and t[speed.argmax()] == pytest.approx(rise, abs=1e-4)
+    assert (np.diff(s) >= -1e-15).all()
+
+
+def test_a_ramp_that_rises_as_long_as_it_falls_is_that_of_minimum_jerk() -> None:
+    t = np.linspace(0, 1, 101)
+    assert ramp(t) == pytest.approx(t**3 * (10 - 15 * t + 6 * t * t), abs=1e-14)
+
+
+def test_path_never_exceeds_its_mach_number_and_ends_on_target() -> None:
+    start = Pose()
+    end = Pose(np.array([0.3e-3, -0.2e-3, 1e-3]), Rotation.from_rotvec([0, 0, 0.2]).as_quat())
+    path = plan([start], [end], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    drive = path.drive(0, path.substeps).astype(float)
+    rim = np.linalg.norm(drive[:, 0, 4], axis=1) + 10.0 * np.linalg.norm(drive[:, 0, 5], axis=1)
+    assert rim.max() <= 0.05 * 1.001
+    assert drive[-1, 0, 3] == pytest.approx(end.position * 1e3, abs=1e-6)
+    assert drive[-1, 0, :3] == pytest.approx(Rotation.from_quat(end.quaternion).as_matrix(), abs=1e-6)
+    assert drive[:, 0, 4].sum(axis=0) * 0.4 == pytest.approx(end.position * 1e3, abs=1e-5)
+
+
+def test_short_ways_of_what_yields_brake_no_harder_than_long_ones() -> None:
+    """Half a gel thickness at full speed, and less the slower, with the same braking; the rest is not held back."""
+
+    def braking(millimetres: float, yields: bool) -> float:
+        end = Pose(np.array([0, 0, millimetres * 1e-3]))
+        path = plan([Pose()], [end], mach=0.05, dt=0.01, lever=10.0, thickness=4.0, yields=yields)
+        speed = path.drive(0, path.substeps)[:, 0, 4, 2].astype(float)
+        assert speed.max() <= 0.05 * 1.001
+        return speed.max() / (path.substeps * path.dt)
+
+    assert braking(2.0, yields=True) == pytest.approx(braking(2.0, yields=False))
+    for short in (0.1, 0.5, 1.0):
+        assert braking(short, yields=True) == pytest.approx(braking(2.0, yields=True), rel=1e-2)
+        assert braking(short, yields=False) > 1.9 * braking(short, yields=True)
+
+
+def test_refining_cuts_the_same_path_finer() -> None:
+    path = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    coarse, fine = path.drive(5, 9), replace(path, refine=4).drive(5, 9)
+    assert len(fine) == 16
+    assert fine[3::4, 0, 3] == pytest.approx(coarse[:, 0, 3], abs=1e-6)
+
+
+def test_no_motion_needs_no_substeps() -> None:
+    assert plan([Pose()], [Pose()], mach=0.05, dt=0.4, lever=10.0, thickness=4.0).substeps == 0
+
+
+def test_the_shortest_motion_lets_the_gel_follow() -> None:
+    """It takes twice as long as the gel's wave needs through it, however short its way."""
+    short = plan([Pose()], [Pose(np.array([0, 0, 1e-6]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    assert short.substeps == 20
+    far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
+    assert far.substeps == 94
+    assert short.rise == 0.5 and far.rise * far.substeps * far.dt == pytest.approx(4.0, rel=0.01)
+
+
+def test_a_way_that_would_take_for_ever_is_refused() -> None:
+    """Millimetres given as metres; but not what is slow and meant: 50 mm at Mach 0.001, in fine steps."""
+    far = [Pose(np.array([0, 0, 500.0]))]
+    words = r"500 m at Mach 0\.03 would take 7\.8e\+07 substeps \(limit 1,000,000\); are the targets in metres\?"
+    with pytest.raises(ValueError, match=words):
+        plan([Pose()], far, mach=0.03, dt=0.4, lever=10.0, thickness=4.0)
+    with pytest.raises(ValueError, match=r"500 m at Mach 0\.01 would take 1\.2e\+08 substeps"):
+        plan_on([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
+    slow = plan([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
+    assert 0.7 * MOST < slow.substeps < MOST

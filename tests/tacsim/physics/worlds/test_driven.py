@@ -1,0 +1,199 @@
+"""Motions that flow into one another: where frames are, what forces are, what stays when something goes wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robot.studies.dump_view import open_world, replay
+from tacsim.interface import Pose
+from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Settling, Sphere
+from tacsim.physics.failure import dump
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.seed.world import SeedWorld
+from tacsim.physics.worlds.batch import Batch
+from tacsim.physics.worlds.driven import DrivenWorld
+from tacsim.physics.worlds.hybrid import HybridWorld
+from tacsim.physics.worlds.press import PressWorld
+
+GEL = Gel(size=(12e-3, 12e-3, 4e-3))
+CUBE = Scene(body=Body(geometry=Box(size=(5e-3,) * 3), material=BodyMaterial(yield_stress=20e3)), gel=GEL)
+BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=GEL)
+STEP = 0.1e-3
+
+
+def nearer(world: DrivenWorld, by: float = STEP) -> dict[str, Pose]:
+    """Targets that bring the driven frames nearer to each other by `by` [m] in all."""
+    first, second = world.snapshot()["poses"]
+    names = list(world.truth().poses) if world.truth() is not None else ["lower", "indenter"]
+    up = np.array([0.0, 0.0, by / 2])
+    return {names[0]: Pose(first[:3] + up, first[3:]), names[1]: Pose(second[:3] - up, second[3:])}
+
+
+def force(world: DrivenWorld) -> float:
+    return -float(world.wrench("lower")[2])
+
+
+def squeezed(scene: Scene = CUBE) -> HybridWorld:
+    """Settled, 0.8 mm into the gap between body and gels and beyond."""
+    world = HybridWorld(scene)
+    world.move(nearer(world, 0.8e-3))
+    return world
+
+
+def test_frames_arrive_at_every_target_and_pass_it_at_speed() -> None:
+    world = PressWorld(BALL)
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.02])
+    for number in range(4):
+        pose = world.pose("indenter")
+        target = Pose(pose.position - [0, 0, STEP], (turn * Rotation.from_quat(pose.quaternion)).as_quat())
+        stats = world.move({"indenter": target}, flow=True)
+        assert not stats.settled and stats.hold == 0, number
+        assert np.array_equal(world.pose("indenter").position, target.position)
+        rates = world.snapshot()["rates"][1]
+        assert -rates[2] + 6.0 * rates[5] == pytest.approx(0.01, rel=0.03)  # of the gel's rim, 6 mm from the axis
+        assert rates[5] / -rates[2] == pytest.approx(0.02 / 0.1)
+
+
+def test_equal_steps_make_a_steady_motion() -> None:
+    """From rest a step takes twice as long as the next; those that follow are all alike, at one speed."""
+    world = PressWorld(BALL)
+    counts = [world.move(nearer(world), flow=True).substeps for _ in range(4)]
+    assert counts[1] == counts[2] == counts[3]
+    assert counts[0] == pytest.approx(2 * counts[1], abs=1)
+    path = world._plan_on(list(world._poses.values()), list(nearer(world).values()))
+    speeds = path.drive(0, path.substeps)[:, :, 4, 2]
+    assert path.substeps == counts[1]
+    steady = STEP / 2 * 1e3 / (path.substeps * path.dt)
+    assert 0.0095 < steady <= 0.01
+    assert speeds == pytest.approx(np.broadcast_to([steady, -steady], speeds.shape), rel=1e-4)
+
+
+def test_forces_of_a_steady_squeeze_are_near_those_of_rest() -> None:
+    """And the body stays in the middle."""
+    flowing, settled = squeezed(), squeezed()
+    for _ in range(8):
+        flowing.move(nearer(flowing), flow=True)
+        settled.move(nearer(settled))
+    assert force(flowing) == pytest.approx(force(settled), rel=0.05)
+    position = flowing.truth().position
+    assert position[:2] == pytest.approx([0.0, 0.0], abs=2e-6)
+
+
+def test_a_body_off_the_axis_is_not_driven_aside() -> None:
+    """It is damped against a widening round its own middle: round the sensors' axis, 1.5 mm away, 1.5 % of the force
+    would push it aside."""
+    world = HybridWorld(CUBE)
+    world.move({n: Pose(world.pose(n).position + [1.5e-3, 0, 0], world.pose(n).quaternion) for n in world.sensors})
+    world.move(nearer(world, 0.8e-3))
+    for _ in range(4):
+        world.move(nearer(world), flow=True)
+        aside = world.wrench("lower")[0] + world.wrench("upper")[0]  # the upper sensor's x axis is the world's too
+        assert abs(aside) < 0.004 * force(world)
+
+
+def test_what_flows_comes_to_rest_once_nothing_is_asked_any_more() -> None:
+    world, settled = PressWorld(BALL), PressWorld(BALL)
+    for _ in range(5):
+        world.move(nearer(world), flow=True)
+        settled.move(nearer(settled))
+    stop = world.move({}, flow=True)
+    assert stop.hold == 0 and not stop.settled and not world.snapshot()["rates"].any()
+    assert world.pose("indenter").position == pytest.approx(settled.pose("indenter").position, abs=1e-12)
+    rest = world.move({}, flow=True)
+    assert rest.settled and rest.hold == rest.substeps > 0
+    assert force(world) == pytest.approx(force(settled), rel=0.005)  # an elastic gel forgets its way
+
+
+def test_other_motions_first_bring_it_to_rest() -> None:
+    world, settled = PressWorld(BALL), PressWorld(BALL)
+    for _ in range(4):
+        world.move(nearer(world), flow=True)
+        settled.move(nearer(settled))
+    still = world.snapshot()
+    stopping = world._plan_on(list(world._poses.values()), list(world._poses.values())).substeps
+    stats = world.move(nearer(world))
+    assert stats.settled and stats.substeps > stopping and not world.snapshot()["rates"].any()
+    settled.move(nearer(settled))
+    assert force(world) == pytest.approx(force(settled), rel=0.005)
+    for order in ({"loads": {"lower": 0.2}}, {"duration": 2e-3}):
+        world.restore(still)
+        world.move({}, **order)
+        assert not world.snapshot()["rates"].any()
+
+
+def test_a_way_without_end_is_refused_before_what_flows_is_stopped() -> None:
+    """Else a batch would be on its way by then, and all of it be lost."""
+    batch = Batch([BALL, BALL])
+    first, second = batch.worlds
+    batch.move([nearer(first), nearer(second)], flow=True)
+    before = [{name: a.tobytes() for name, a in world.snapshot().items()} for world in batch.worlds]
+    with pytest.raises(ValueError, match="are the targets in metres") as refused:
+        batch.move([nearer(first), {"indenter": Pose(np.array([0.0, 0.0, 500.0]))}])
+    assert refused.value.__notes__ == ["in the motion of environment 1"]
+    assert [{name: a.tobytes() for name, a in world.snapshot().items()} for world in batch.worlds] == before
+
+
+def test_a_snapshot_on_the_way_goes_on_to_the_same_bits() -> None:
+    world = squeezed()
+    for _ in range(2):
+        world.move(nearer(world), flow=True)
+    middle = world.snapshot()
+    ends = []
+    for other in (world, HybridWorld(CUBE)):
+        other.restore(middle)
+        other.move(nearer(other), flow=True)
+        ends.append({name: a.tobytes() for name, a in other.snapshot().items()})
+    assert ends[0] == ends[1]
+
+
+def test_worlds_of_a_batch_flow_as_if_alone() -> None:
+    batch, alone = Batch([CUBE, CUBE]), HybridWorld(CUBE)
+    alone.move(nearer(alone, 0.8e-3))
+    batch.move([nearer(world, 0.8e-3) for world in batch.worlds])
+    for _ in range(2):
+        alone.move(nearer(alone), flow=True)
+        batch.move([nearer(batch.worlds[0]), None], flow=True)
+    left, right = batch.worlds[0].snapshot(), alone.snapshot()
+    assert {n: a.tobytes() for n, a in left.items()} == {n: a.tobytes() for n, a in right.items()}
+    assert not batch.worlds[1].snapshot()["rates"].any()
+
+
+def test_a_batch_moves_in_real_time_as_if_alone() -> None:
+    batch, alone = Batch([BALL, BALL]), PressWorld(BALL)
+    alone.move(nearer(alone, 0.2e-3), duration=5e-3)
+    batch.move([nearer(world, 0.2e-3) for world in batch.worlds], duration=5e-3)
+    for world in batch.worlds:
+        assert {n: a.tobytes() for n, a in world.snapshot().items()} == {
+            n: a.tobytes() for n, a in alone.snapshot().items()
+        }
+
+
+def test_a_step_that_diverges_is_taken_back_with_its_speed_and_dumped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(dump.FOLDER, str(tmp_path))
+    scene = BALL.model_copy(update={"settling": Settling(flow_mach=0.3)})
+    world = PressWorld(scene)
+    world.move(nearer(world), flow=True)
+    before = {name: a.tobytes() for name, a in world.snapshot().items()}
+    with pytest.raises(SimulationDiverged) as failure:
+        world.move(nearer(world, 7e-3), flow=True)
+    assert {name: a.tobytes() for name, a in world.snapshot().items()} == before
+    assert failure.value.dump is not None
+    found = dump.read(failure.value.dump)
+    assert found.order.flow
+    assert replay(found, open_world(found)).identical
+
+
+def test_what_excludes_each_other_is_refused() -> None:
+    world = PressWorld(BALL)
+    with pytest.raises(ValueError, match="a motion that flows"):
+        world.move({}, loads={"lower": 1.0}, flow=True)
+    with pytest.raises(ValueError, match="a motion that flows"):
+        world.move({}, duration=0.1, flow=True)
+    with pytest.raises(ValueError, match="'seed' settles every motion"):
+        SeedWorld(CUBE.model_copy(update={"physics": "seed"})).move({}, flow=True)

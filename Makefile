@@ -38,11 +38,14 @@ check: $(DEV)
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
 
+# Two processes: one mostly waits for mock hardware, the other computes (tests/conftest.py says which tests go together).
+PARALLEL := -n 2 --dist loadgroup
+
 test: check
-	@$(BIN)/python -m pytest -q $(ARGS)
+	@$(BIN)/python -m pytest -q $(PARALLEL) $(ARGS)
 
 test-all: test
-	@$(BIN)/python -m pytest -q -m slow $(ARGS)
+	@$(BIN)/python -m pytest -q -m deep $(PARALLEL) $(ARGS)
 
 # Without a device nothing was tested, which must not look like a pass: 77, as automake's tests say "skipped".
 test-gpu: $(DEV)

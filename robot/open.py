@@ -129,7 +129,8 @@ def _check_parts(config: RigConfig) -> None:
             if (shown.width, shown.height) != (sensor.width, sensor.height):
                 raise CannotOpen(
                     f"rig '{config.name}': sensors.{name} delivers {sensor.width} x {sensor.height} px "
-                    f"(width, height), its model '{sensor.model.name}' shows {shown.width} x {shown.height}; make them alike"
+                    f"(width, height), its model '{sensor.model.name}' shows {shown.width} x {shown.height}; "
+                    "make them alike"
                 )
         if isinstance(sensor, ReplaySensorConfig) and sensor.source is None:
             key = f"sensors.{name}.source"

@@ -186,7 +186,7 @@ def test_costs_are_measured_beside_their_error() -> None:
         assert row.error < limit, row.variant
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 def test_presses_of_our_gel_beside_the_same_made_up_ones(
     folder: Path, hidden: balls.BallSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

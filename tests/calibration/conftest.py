@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from tests.robot.bench.conftest import dented
+
+from tests.benchmarks.conftest import dented
 
 
 @pytest.fixture

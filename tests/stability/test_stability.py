@@ -186,7 +186,7 @@ PAIRS = [
     pytest.param(
         name,
         physics,
-        marks=[pytest.mark.slow, pytest.mark.timeout(LONG[name])] if name in LONG else [],
+        marks=[pytest.mark.deep, pytest.mark.timeout(LONG[name])] if name in LONG else [],
         id=f"{name}-{physics}",
     )
     for name, case in CASES.items()

@@ -218,7 +218,7 @@ def test_all_fields_of_a_state_are_of_one_instant(arm: URArm) -> None:
     assert torn == 0
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.timeout(600)
 def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm) -> None:
     """As a policy looks, all the time and in motion: whatever is read is of one package."""
@@ -280,7 +280,7 @@ def test_five_thousand_hostile_targets_leave_no_trace_beyond_the_limits(mock: Mo
         send_hostile(arm, mock, 5_000)
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.timeout(900)
 def test_a_hundred_thousand_hostile_targets(mock: MockUR) -> None:
     with URArm(config(limits={**SLOPED, "speed": 0.5, "acceleration": 5.0}), "left") as arm:

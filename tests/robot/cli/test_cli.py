@@ -402,7 +402,7 @@ def _wait_for_children(process: subprocess.Popen[str]) -> list[int]:
     pytest.fail("no processes were started")
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.timeout(600)
 def test_the_seeds_experiment_comes_out(tmp_path: Path) -> None:
     result = tacsim("reproduce", "--out", "f")

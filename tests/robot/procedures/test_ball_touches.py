@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from tests.robot.ball_on_post import BallOnPost
 from typer.testing import CliRunner
 
 from calibration.poses.records import read_touches, touch_file, write_record
@@ -31,6 +30,7 @@ from tacsim.interface import Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.sensor import SensorModel
 from tests.calibration.touches import BALL_RADIUS, made_touches, posed
+from tests.robot.procedures.ball_on_post import BallOnPost
 
 NARROW = {"COLUMNS": "200"}
 RIG = """

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from tests.calibration.test_handeye import CAMERA, made_sights
 from typer.testing import CliRunner
 
 from calibration.poses.records import sight_file, write_record
@@ -22,6 +21,7 @@ from robot.procedures.board_poses import CannotSee, SightPlan, record_sights, sc
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tests.calibration.boards import CHARUCO, LENS, facing, photograph
+from tests.calibration.poses.test_hand_eye import CAMERA, made_sights
 from tests.calibration.touches import posed
 
 WIDE = {"COLUMNS": "200"}

@@ -158,7 +158,7 @@ def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
     assert written == pytest.approx(found + 100.0, abs=0.11)
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
 def test_the_mock_rig_taps_a_ball_in_closed_form() -> None:
     addresses = [word for override in rig_addresses() for word in ("--set", override)]

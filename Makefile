@@ -14,7 +14,7 @@ CORE := .venv/installed-core-$(VERSION)
 DEV := .venv/installed-dev-$(VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-all test-gpu test-extras lock clean python
+.PHONY: help run test check test-deep test-all test-gpu test-extras lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -22,7 +22,7 @@ help:
 	@echo "make run          install, then squeeze plasticine between two tactile sensors   (ARGS=\"--task reposition\")"
 	@echo "make test         install with dev extras, then lint, types, import contract, tests   (ARGS=\"-k rig\")"
 	@echo "make check        the same without the tests"
-	@echo "make test-all     make test, then the long runs"
+	@echo "make test-all     make test, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
 	@echo "make test-extras  tests that need heavy extras"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
@@ -44,8 +44,10 @@ PARALLEL := -n 2 --dist loadgroup
 test: check
 	@$(BIN)/python -m pytest -q $(PARALLEL) $(ARGS)
 
-test-all: test
+test-deep: $(DEV)
 	@$(BIN)/python -m pytest -q -m deep $(PARALLEL) $(ARGS)
+
+test-all: test test-deep
 
 # Without a device nothing was tested, which must not look like a pass: 77, as automake's tests say "skipped".
 test-gpu: $(DEV)

@@ -25,7 +25,7 @@ from typing import Any
 from benchmarks.harness.cache import fingerprint
 from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
 from benchmarks.harness.schema import Device, Failure, Group, Machine, Metadata, Missing, Report, Row
-from robot.arm.realtime import allowed
+from robot.common.realtime import allowed
 
 EXIT = 10.0  # [s] a process may take to end after its last word
 PACKAGES = ("tacsim", "taichi", "numpy", "scipy")

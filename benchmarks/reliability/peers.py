@@ -138,7 +138,7 @@ def two_arms(speed: float) -> Iterator[tuple[URArm, URArm, Watcher, Watcher, Moc
 EMPTY = """
 import time
 import numpy as np
-from robot.arm.realtime import WORKER, ask_for_realtime
+from robot.common.realtime import WORKER, ask_for_realtime
 ask_for_realtime(WORKER)
 beats = [time.monotonic()]
 deadline = beats[0] + 2e-3

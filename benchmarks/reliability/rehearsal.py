@@ -21,9 +21,9 @@ import numpy as np
 from benchmarks.reliability.repeated import Disturbed
 from robot.arm import shared_ring
 from robot.arm.channel import HISTORY, Link
-from robot.arm.kinematics import Kinematics
 from robot.arm.shared_ring import Record
 from robot.arm.ur import URArm
+from robot.common.kinematics import Kinematics
 from robot.mock import Input, MockState, MockUR
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.wire_client import loopback_host

@@ -34,9 +34,9 @@ from benchmarks.reliability.rehearsal import (
 )
 from benchmarks.reliability.repeated import COUNT, Disturbed, Figure, repeated
 from robot.arm.channel import STATE, ArmStatus, Kind, command
-from robot.arm.kinematics import matrix
 from robot.arm.servo import HARD
 from robot.arm.trajectory import PERIOD
+from robot.common.kinematics import matrix
 from robot.errors import ProtectiveStop, StaleObservationError
 from tacsim import pose as se3
 from tacsim.limits import ROUNDING, finite_targets, ways_inside

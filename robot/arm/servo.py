@@ -20,10 +20,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from robot.arm.channel import ArmStatus, Kind, Orders
-from robot.arm.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
 from robot.arm.shared_ring import Record
-from robot.arm.tcp import ArmFrames, Measured
 from robot.arm.trajectory import PERIOD, Motion, braking, resting, stopping_point, towards
+from robot.common.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
+from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 from tacsim.limits import (
     braking_end,

@@ -15,8 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from robot.arm.kinematics import rotation as turn
-from robot.arm.kinematics import rotation_vector
+from robot.common.kinematics import rotation as turn
+from robot.common.kinematics import rotation_vector
 from tacsim.interface import FloatArray
 
 PERIOD = 2e-3  # of the servo loop [s]

@@ -27,16 +27,16 @@ from robot import errors
 from robot.arm import shared_ring
 from robot.arm.channel import HISTORY, ArmStatus, Kind, Link, Orders, Partner, command, touch
 from robot.arm.dashboard import Dashboard
-from robot.arm.kinematics import Kinematics, pose
 from robot.arm.servo import frames_of, measured
-from robot.arm.tcp import pose_of
+from robot.common import MOCK_SERIAL
+from robot.common.kinematics import Kinematics, pose
+from robot.common.tcp import pose_of
 from robot.errors import (
     DeviceAlreadyConnectedError,
     DeviceError,
     DeviceNotConnectedError,
     StaleObservationError,
 )
-from robot.mock import MOCK_SERIAL
 from tacsim import pose as se3
 from tacsim.control.gel_monitor import Touch
 from tacsim.interface import Action, ArmState, Pose

@@ -26,10 +26,10 @@ import numpy as np
 from robot.arm import shared_ring
 from robot.arm.channel import STATE, ArmStatus, Link, Orders
 from robot.arm.dashboard import Dashboard
-from robot.arm.kinematics import Kinematics, motion
-from robot.arm.realtime import WORKER, ask_for_realtime
 from robot.arm.servo import Servo, frames_of, measured, well
 from robot.arm.trajectory import PERIOD
+from robot.common.kinematics import Kinematics, motion
+from robot.common.realtime import WORKER, ask_for_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 
 PORTS = {30004: "RTDE", 30003: "script"}

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
 
-from robot.camera import stamp as strip
 from robot.camera.capture import Capture, open_capture, source_kind
 from robot.camera.picture import DamagedFrame, Picture, WrongSource
+from robot.common import stamp as strip
 from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
 from tacsim.interface import EndOfEpisode, SensorSpec, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.camera import stamp
+from robot.common import stamp
 from robot.errors import DeviceError
 from tacsim.models.hardware import CameraSensorConfig
 

@@ -35,7 +35,7 @@ def mock(
 
     Example: tacsim mock --arms 2 --cameras 2
     """
-    from robot.arm.kinematics import MODELS
+    from robot.common.kinematics import MODELS
     from robot.mock import MockArms, MockCamera
     from robot.mock.ur.fault_client import DOOR_PORT
     from robot.mock.ur.wire.controller import PORTS

@@ -160,7 +160,7 @@ def processors() -> list[Check]:
 
 def realtime() -> list[Check]:
     """Whether the processes that talk to arms may run before all others."""
-    from robot.arm.realtime import allowed
+    from robot.common.realtime import allowed
 
     if allowed():
         return [Check("real-time priority", "ok", "allowed")]

@@ -16,12 +16,13 @@ import numpy as np
 
 from robot.arm.dashboard import PORT as DASHBOARD
 from robot.arm.dashboard import Dashboard
-from robot.arm.kinematics import Kinematics
 from robot.camera.camera import Camera
+from robot.common import MOCK_SERIAL
+from robot.common.kinematics import Kinematics
+from robot.common.tcp import ArmFrames
 from robot.doctor.machine import Check
 from robot.errors import DeviceError
-from robot.mock import MOCK_SERIAL
-from robot.mock.cell.cell import MockBench, frames_of
+from robot.mock.cell.cell import MockBench
 from tacsim import pose as se3
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig
@@ -148,7 +149,7 @@ def _start(name: str, config: UrArmConfig) -> Check:
     if (place < config.limits.workspace.lower).any() or (place > config.limits.workspace.upper).any():
         return Check(label, "fail", f"{place.tolist()} m is outside the workspace", "correct start or limits.workspace")
     kinematics = Kinematics(config.model)
-    postures = kinematics.solutions(frames_of(config).flange(se3.to_matrix(config.start.pose)), np.zeros(6))
+    postures = kinematics.solutions(ArmFrames.of(config).flange(se3.to_matrix(config.start.pose)), np.zeros(6))
     if not postures:
         return Check(
             label, "fail", f"{place.tolist()} m is out of reach", "correct start, world_from_base, or the mount"

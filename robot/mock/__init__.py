@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from robot.common import MOCK_SERIAL
 from robot.mock.ur.fault_client import Door, DoorError, Input, Inputs, MockState
 from robot.mock.ur.handle import MockArms, MockError, MockUR
-from robot.mock.ur.wire.controller import SERIAL as MOCK_SERIAL
 
 if TYPE_CHECKING:
     from robot.mock.camera.camera import MockCamera, MockCameraState

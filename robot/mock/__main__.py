@@ -16,13 +16,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, cast
 
-from robot.arm.kinematics import MODELS
-from robot.arm.realtime import CONTROLLER, ask_for_realtime
+from robot.common import MOCK_SERIAL
+from robot.common.kinematics import MODELS
+from robot.common.realtime import CONTROLLER, ask_for_realtime
 from robot.mock.ur.fault_client import DOOR_PORT
 from robot.mock.ur.fault_server import FaultDoor
 from robot.mock.ur.handle import VERSION, check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
-from robot.mock.ur.wire.controller import SERIAL, Controller, ControllerConfig
+from robot.mock.ur.wire.controller import Controller, ControllerConfig
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model
@@ -114,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--joints", action="append", help=f"six angles [rad], with commas; {each}")
     parser.add_argument("--version", default=".".join(map(str, VERSION)))
     parser.add_argument("--door-port", type=int, default=DOOR_PORT)
-    parser.add_argument("--serial", default=SERIAL)
+    parser.add_argument("--serial", default=MOCK_SERIAL)
     parser.add_argument("--allow-network", action="store_true")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input ends")
     parser.add_argument("--realtime", action="store_true", help="ask for real-time priority, to measure timing")

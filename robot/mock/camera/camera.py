@@ -65,7 +65,7 @@ class MockCamera:
         allow_network: bool = False,
     ) -> None:
         """`width`, `height` of the picture of the gel [px]; with `stamped` each frame has the strip of
-        `robot.camera.stamp` below it. Port 0: any free one. Raises ValueError for a host that is not loopback unless
+        `robot.common.stamp` below it. Port 0: any free one. Raises ValueError for a host that is not loopback unless
         `allow_network`, DeviceError when the process does not start (the port is taken, say)."""
         self.width, self.height = width, height
         self._lock = threading.Lock()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from robot.camera import stamp
+from robot.common import stamp
 
 BOUNDARY = "boundarydonotcross"
 MAX_CLIENTS = 16

@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.arm.kinematics import Kinematics, matrix
-from robot.arm.tcp import ArmFrames, pose_of
+from robot.common.kinematics import Kinematics, matrix
+from robot.common.tcp import ArmFrames, pose_of
 from robot.errors import DeviceError
 from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.sim_server import Scenery, Twin
@@ -60,7 +60,7 @@ class MockBench:
         self._mocked = {
             name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
         }
-        self._frames = {name: frames_of(arm) for name, arm in self._mocked.items()}
+        self._frames = {name: ArmFrames.of(arm) for name, arm in self._mocked.items()}
         with ExitStack() as stack:
             stack.callback(self.close)
             models = self._models()
@@ -249,12 +249,6 @@ class MockBench:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-def frames_of(arm: UrArmConfig) -> ArmFrames:
-    return ArmFrames(
-        *(se3.to_matrix(p.pose) for p in (arm.world_from_base, arm.flange_from_tool, arm.tool_from_sensor))
-    )
 
 
 def _camera(name: str, config: CameraSensorConfig) -> MockCamera:

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from robot.common import MOCK_SERIAL
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import DOOR_PORT, Door
 from robot.mock.ur.machine.machine import Version
-from robot.mock.ur.wire.controller import SERIAL
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
@@ -45,7 +45,7 @@ class MockArms:
         joints: Sequence[float] | Sequence[Sequence[float]] | None = None,
         version: Version = VERSION,
         door_port: int = DOOR_PORT,
-        serial: str = SERIAL,
+        serial: str = MOCK_SERIAL,
         ready_timeout: float = 10.0,
         allow_network: bool = False,
         realtime: bool = False,
@@ -136,7 +136,7 @@ class MockUR(MockArms):
         joints: Sequence[float] | None = None,
         version: Version = VERSION,
         door_port: int = DOOR_PORT,
-        serial: str = SERIAL,
+        serial: str = MOCK_SERIAL,
         ready_timeout: float = 10.0,
         allow_network: bool = False,
         realtime: bool = False,

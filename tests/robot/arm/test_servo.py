@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import STATE, ArmStatus, Kind, Orders, Partner, command, touch
-from robot.arm.kinematics import Kinematics, pose, rotation
 from robot.arm.servo import HARD, STEEPEST, Servo, measured
 from robot.arm.shared_ring import Record
-from robot.arm.tcp import pose_of
 from robot.arm.trajectory import PERIOD
+from robot.common.kinematics import Kinematics, pose, rotation
+from robot.common.tcp import pose_of
 from tacsim.interface import FloatArray, Pose
 from tacsim.limits import region
 

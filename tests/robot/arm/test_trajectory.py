@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.arm.kinematics import rotation, rotation_vector
 from robot.arm.trajectory import (
     PERIOD,
     Motion,
@@ -21,6 +20,7 @@ from robot.arm.trajectory import (
     stopping_way,
     towards,
 )
+from robot.common.kinematics import rotation, rotation_vector
 from tacsim.limits import region
 
 BOX = region([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1], planes=[([0, 0, 0.12], [-1.0, 0.0, -1.0])])

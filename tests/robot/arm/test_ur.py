@@ -21,9 +21,9 @@ import pytest
 
 from robot.arm import shared_ring, ur
 from robot.arm.channel import HISTORY, ArmStatus, Kind, command
-from robot.arm.kinematics import Kinematics, matrix
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
+from robot.common.kinematics import Kinematics, matrix
 from robot.errors import (
     DeviceAlreadyConnectedError,
     DeviceBusyError,

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot.camera import stamp
 from robot.camera.camera import BACK_OFF, Camera, StaleFrame
 from robot.camera.picture import WrongSource
+from robot.common import stamp
 from robot.errors import DeviceNotConnectedError, StaleObservationError
 from robot.mock.camera.camera import MockCamera
 from tacsim.interface import EndOfEpisode, TactileFrame, TactileSource

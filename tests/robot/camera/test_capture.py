@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot.camera import capture, stamp
+from robot.camera import capture
 from robot.camera.camera import Camera
 from robot.camera.capture import PlayedCapture, UvcCapture, source_kind
 from robot.camera.mjpeg import MjpegCapture
 from robot.camera.picture import WrongSource
+from robot.common import stamp
 from robot.errors import DeviceNotConnectedError
 from tacsim.models.hardware import CameraSensorConfig
 

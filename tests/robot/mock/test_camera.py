@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot.camera import stamp
+from robot.common import stamp
 from robot.errors import DeviceError, DeviceNotConnectedError
 from robot.mock.camera.camera import MockCamera
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from robot.arm.kinematics import matrix, motion, pose
+from robot.common.kinematics import matrix, motion, pose
 from robot.mock.ur.machine.arm import PERIOD, Arm
 from robot.mock.ur.machine.commands import REALTIME
 from robot.mock.ur.machine.load import GRAVITY, Wall

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.arm.kinematics import Kinematics, matrix, motion
+from robot.common.kinematics import Kinematics, matrix, motion
 from robot.mock import MOCK_SERIAL, MockUR
 from robot.mock.ur.machine.arm import HOME
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.arm.kinematics import Kinematics, matrix
+from robot.common.kinematics import Kinematics, matrix
 from robot.mock import MOCK_SERIAL, Door, MockUR
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.arm.kinematics import pose
+from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
 from tacsim.interface import FloatArray
 

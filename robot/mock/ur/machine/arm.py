@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.arm.kinematics import JOINT_RANGE, Kinematics, pose
+from robot.common.kinematics import JOINT_RANGE, Kinematics, pose
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:

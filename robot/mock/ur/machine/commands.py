@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.arm.kinematics import matrix
+from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.answers import ANSWERS, joints
 from robot.mock.ur.machine.arm import PERIOD, Motion, ProgramError

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robot.arm.kinematics import inverse_frame
+from robot.common.kinematics import inverse_frame
 from robot.mock.ur.machine.arm import HISTORY, Arm
 from tacsim.interface import FloatArray
 

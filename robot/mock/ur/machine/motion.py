@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from robot.arm.kinematics import motion, rotation, rotation_vector
+from robot.common.kinematics import motion, rotation, rotation_vector
 from robot.mock.ur.machine.arm import JOINT_ACCELERATION, PERIOD, Arm, Motion, ProgramError, slowed
 from tacsim.interface import FloatArray
 

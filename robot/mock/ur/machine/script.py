@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.arm.kinematics import matrix
+from robot.common.kinematics import matrix
 from robot.mock.ur.machine.arm import Arm, Motion, ProgramError
 from robot.mock.ur.machine.commands import COMMANDS, NEEDS, NOT_MODELLED, REALTIME
 from tacsim.interface import FloatArray

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robot.common import MOCK_SERIAL
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.machine import Machine, Version
 from robot.mock.ur.wire import dashboard
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)
-SERIAL = "00000000001"  # no real arm has it: whoever must not talk to a mock can tell
 MAX_CLIENTS = 256  # of one controller; more are closed at once
 MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
 KEPT = 200_000  # input packages that are remembered
@@ -39,7 +39,7 @@ class ControllerConfig:
     model: Model = "ur5e"
     joints: tuple[float, ...] = HOME
     version: Version = (5, 11, 0, 108150)
-    serial: str = SERIAL
+    serial: str = MOCK_SERIAL
 
 
 @dataclass

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.arm.kinematics import pose
+from robot.common.kinematics import pose
 from robot.mock.ur.machine.load import GRAVITY
 from robot.mock.ur.machine.machine import REGISTERS, Machine, Mode
 

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.arm.kinematics import inverse_frame, matrix, rotation_vector
+from robot.common.kinematics import inverse_frame, matrix, rotation_vector
 from tacsim.interface import FloatArray, Pose
+
+if TYPE_CHECKING:
+    from tacsim.models.hardware import UrArmConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +41,14 @@ class ArmFrames:
         self._tool_from_flange = inverse_frame(self.flange_from_tool)
         self._base_from_world = inverse_frame(self.world_from_base)
         self._sensor_from_flange = inverse_frame(self.flange_from_tool @ self.tool_from_sensor)
+
+    @classmethod
+    def of(cls, config: UrArmConfig) -> ArmFrames:
+        """Those of a rig file."""
+        from tacsim.pose import to_matrix  # SciPy takes half a second to load; the worker of an arm needs none of it
+
+        fixed = (config.world_from_base, config.flange_from_tool, config.tool_from_sensor)
+        return cls(*(to_matrix(frame.pose) for frame in fixed))
 
     def flange(self, world_from_sensor: FloatArray) -> FloatArray:
         """base_from_flange (4, 4) that brings the sensor to a pose (4, 4)."""

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robot.arm.kinematics import JOINT_RANGE, MODELS, Kinematics, inverse_frame, matrix, motion, pose, rotation_vector
+from robot.common.kinematics import (
+    JOINT_RANGE,
+    MODELS,
+    Kinematics,
+    inverse_frame,
+    matrix,
+    motion,
+    pose,
+    rotation_vector,
+)
 from tacsim.interface import FloatArray
 from tacsim.models.hardware import Model
 

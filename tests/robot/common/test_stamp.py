@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot.camera import stamp
+from robot.common import stamp
 
 MARK = stamp.Stamp(frame=0xDEADBEEF, image=17, clock=123_456_789_012_345)
 

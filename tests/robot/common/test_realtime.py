@@ -8,12 +8,12 @@ import sys
 
 import pytest
 
-from robot.arm import realtime
+from robot.common import realtime
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="this system has no such thing")
 
 ASK = (
-    "import os\nfrom robot.arm.realtime import ask_for_realtime, WORKER\n"
+    "import os\nfrom robot.common.realtime import ask_for_realtime, WORKER\n"
     "granted = ask_for_realtime(WORKER)\n"
     "print(granted, os.sched_getscheduler(0) == os.SCHED_RR, os.sched_getparam(0).sched_priority)"
 )

@@ -1,0 +1,31 @@
+"""A mock controller for each module of tests, as at power-on for each test; and the driver on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from robot.arm.ur import URArm
+from robot.mock import MockUR
+from tests.robot.arm.mocked import HOST, config
+
+
+@pytest.fixture(scope="module")
+def controller() -> Iterator[MockUR]:
+    pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this Python")
+    with MockUR(HOST) as mock:
+        yield mock
+
+
+@pytest.fixture
+def mock(controller: MockUR) -> MockUR:
+    """One as at power-on."""
+    controller.door.reset()
+    return controller
+
+
+@pytest.fixture
+def arm(mock: MockUR) -> Iterator[URArm]:
+    with URArm(config(), "left") as opened:
+        yield opened

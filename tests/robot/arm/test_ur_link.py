@@ -1,0 +1,179 @@
+"""The driver of a UR arm: links that are silent, cut, late or never there."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from robot.arm import ur
+from robot.arm.channel import ArmStatus
+from robot.arm.ur import URArm
+from robot.errors import (
+    DeviceError,
+    DeviceNotConnectedError,
+    LinkLost,
+    StaleObservationError,
+)
+from robot.mock import MOCK_SERIAL, MockUR
+from tests.robot.arm.mocked import (
+    HOST,
+    OTHER,
+    PATIENCE,
+    config,
+    go,
+    in_motion,
+    leftovers,
+    moved,
+    servo_targets,
+    until,
+)
+
+
+def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR) -> None:
+    with URArm(config(link_timeout=0.5), "left") as arm:
+        start = arm.state().pose
+        in_motion(arm, moved(start, x=0.1))
+        mock.door.silence(True)
+        until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
+        with pytest.raises(StaleObservationError, match="more than link_timeout = 500 ms"):
+            arm.state()
+        with pytest.raises(LinkLost, match="sends no packages"):
+            arm.command(start)
+        until(lambda: mock.door.state().rests, "rest by the controller's watchdog")
+        assert len(arm.history()) > 5  # what was known stays known
+        mock.door.silence(False)
+        mark = mock.door.received().last
+        arm.recover()
+        time.sleep(0.2)
+        assert len(servo_targets(mock.door.received(mark).entries)) == 0  # nothing old is asked again
+        go(arm, start)
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, reset: bool) -> None:
+    with URArm(config(link_timeout=0.5), "left") as arm:
+        start = arm.state().pose
+        in_motion(arm, moved(start, x=0.1))
+        mock.door.cut([30004], reset=reset)
+        until(lambda: arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD), "lost link")
+        time.sleep(0.3)
+        assert arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD)
+        until(lambda: mock.door.state().rests, "rest")
+        arm.recover()
+        go(arm, start)
+
+
+def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
+    with URArm(config(link_timeout=0.5), "left") as arm:
+        start = arm.state().pose
+        os.kill(mock.pid, signal.SIGSTOP)
+        try:
+            until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
+            begun = time.monotonic()
+            with pytest.raises(DeviceError):
+                URArm(config(OTHER), "nobody", timeout=2.0).close()
+            assert time.monotonic() - begun < PATIENCE
+        finally:
+            os.kill(mock.pid, signal.SIGCONT)
+        until(lambda: mock.door.state().rests, "rest")
+        arm.recover()
+        go(arm, moved(start, x=0.01))
+
+
+def test_numbers_that_are_none_are_no_package(mock: MockUR) -> None:
+    with URArm(config(link_timeout=0.5), "left") as arm:
+        in_motion(arm, moved(arm.state().pose, x=0.1))
+        mock.door.nan_state(True)
+        until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
+        until(lambda: mock.door.state().rests, "rest")
+        mock.door.nan_state(False)
+        arm.recover()
+        assert np.isfinite(arm.state().pose.position).all()
+
+
+@pytest.mark.parametrize("jump", [100.0, -100.0])
+def test_a_clock_that_jumps_loses_nothing(arm: URArm, mock: MockUR, jump: float) -> None:
+    start = arm.state().pose
+    in_motion(arm, moved(start, x=0.05))
+    mock.door.clock_jump(jump)
+    go(arm, start)
+    assert arm.status() == ArmStatus.OK
+
+
+def test_late_and_lost_packages_are_lived_with(arm: URArm, mock: MockUR) -> None:
+    start = arm.state().pose
+    mock.door.drop(0.3, seed=1)
+    mock.door.delay(0.02)
+    go(arm, moved(start, x=0.02))
+    mock.door.delay(0.0)
+    mock.door.drop(0.0)
+    go(arm, start)
+
+
+# -- connecting ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def longest_gap() -> Iterator[Callable[[], float]]:
+    """How long another thread of this process had to wait for its turn [s]."""
+    gaps, over = [0.0], threading.Event()
+
+    def beat() -> None:
+        last = time.monotonic()
+        while not over.wait(0.005):
+            now = time.monotonic()
+            gaps.append(now - last)
+            last = now
+
+    thread = threading.Thread(target=beat)
+    thread.start()
+    yield lambda: max(gaps)
+    over.set()
+    thread.join()
+
+
+@pytest.mark.parametrize("fault", ["refusing", "black hole", "mute dashboard", "silent"])
+def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
+    mock: MockUR, longest_gap: Callable[[], float], fault: str
+) -> None:
+    door, host = mock.door, HOST
+    if fault == "black hole":
+        door.black_hole(True)
+    elif fault == "mute dashboard":
+        door.dashboard_mute(True)
+    elif fault == "silent":
+        door.silence(True)
+    else:
+        host = OTHER  # nobody listens there
+    begun = time.monotonic()
+    with pytest.raises(DeviceNotConnectedError):
+        URArm(config(host), "left", timeout=3.0).close()
+    assert time.monotonic() - begun < 3.0 + PATIENCE
+    assert longest_gap() < 1.0  # the library would have blocked them until the end
+    assert leftovers("left") == []
+    door.reset()
+    with URArm(config(), "left") as arm:
+        assert arm.status() == ArmStatus.HOLD
+
+
+def test_the_wrong_model_does_not_connect(mock: MockUR) -> None:
+    with pytest.raises(DeviceNotConnectedError, match="arm 'left' is a UR5, but its file says model: ur10e"):
+        URArm(config().model_copy(update={"model": "ur10e"}), "left").close()
+
+
+def test_mock_and_real_are_never_mistaken(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DeviceNotConnectedError, match="outside this machine"):
+        URArm(config("192.0.2.7"), "left").close()
+    for host in (HOST, "localhost", "127.0.0.1", "::1"):
+        with pytest.raises(DeviceNotConnectedError, match="is this machine"):
+            URArm(config(host, mock=None), "left").close()
+    assert MOCK_SERIAL  # a mock that is reached under another address gives itself away
+    monkeypatch.setattr(ur, "_check_host", lambda *_: None)
+    with pytest.raises(DeviceNotConnectedError, match="is a mock controller"):
+        URArm(config(mock=None), "left").close()

@@ -29,7 +29,7 @@ from benchmarks.reliability.repeated import COUNT, Figure, repeated
 from robot.arm.channel import ArmStatus
 from robot.arm.ur import URArm
 from robot.errors import DeviceBusyError, DeviceError
-from robot.mock import Door, MockUR
+from robot.mock import FaultClient, MockUR
 
 WINDOW = 1.02  # the worker's statistics are of 500 periods [s]
 KEEP_OUT = 0.04  # of two arms that begin 60 mm apart [m]
@@ -93,10 +93,10 @@ def connecting(repeat: int) -> list[Measurement]:
     """Connecting to a peer that refuses, swallows everything, or never sends a package, while a thread beats time."""
     timeout = 0.6
 
-    def once(peer: str, fault: Callable[[Door], None] | None) -> dict[str, float]:
-        mock.door.reset()
+    def once(peer: str, fault: Callable[[FaultClient], None] | None) -> dict[str, float]:
+        mock.faults.reset()
         if fault is not None:
-            fault(mock.door)
+            fault(mock.faults)
         with heartbeat() as gap:
             asked = time.monotonic()
             try:
@@ -106,10 +106,10 @@ def connecting(repeat: int) -> list[Measurement]:
                 ended = time.monotonic()
             return {f"{peer}: blocked": 1e3 * gap(), f"{peer}: told": 1e3 * max(0.0, ended - asked - timeout)}
 
-    peers: dict[str, Callable[[Door], None] | None] = {
-        "silent": lambda door: door.silence(True),
+    peers: dict[str, Callable[[FaultClient], None] | None] = {
+        "silent": lambda faults: faults.silence(True),
         "refusing": None,
-        "black hole": lambda door: door.black_hole(True),
+        "black hole": lambda faults: faults.black_hole(True),
     }
     rows = []
     with mock_arm() as mock:
@@ -194,13 +194,13 @@ def keep_out(repeat: int) -> list[Measurement]:
         until(lambda: left.at_rest() and right.at_rest(), "rest before each other")
         right.command(moved(b, x=0.1))
         under_way(left, moved(a, x=-0.1))
-        right_mock.door.protective_stop()
+        right_mock.faults.protective_stop()
         until(lambda: left.status().is_fault and right.status().is_fault, "both stops")
         faults = []
         for watcher, status in ((left_watcher, ArmStatus.PARTNER_STOPPED), (right_watcher, ArmStatus.PROTECTIVE_STOP)):
             records = watcher.records()
             faults.append(float(records[records["status"] == status][0]["beat"]))
-        until(lambda: still(left_mock.door.state()) and right_mock.door.state().rests, "rest")
+        until(lambda: still(left_mock.faults.state()) and right_mock.faults.state().rests, "rest")
         right.recover()
         left.recover()
         until(lambda: left.status() == right.status() == ArmStatus.HOLD, "each arm to see the other")

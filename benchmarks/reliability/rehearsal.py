@@ -128,7 +128,7 @@ class Watcher:
 @contextmanager
 def driven(mock: MockUR, given: UrArmConfig | None = None, name: str = "bench") -> Iterator[tuple[URArm, Watcher]]:
     """The driver on a mock that is as at power-on."""
-    mock.door.reset()
+    mock.faults.reset()
     with URArm(config(mock.host) if given is None else given, name) as arm, Watcher(name) as watcher:
         yield arm, watcher
 

@@ -68,13 +68,13 @@ def box_wire(repeat: int) -> list[Measurement]:
         given = config(mock.host, {"planes": (SLOPE,), "speed": 0.5, "acceleration": 5.0})
         with driven(mock, given) as (arm, watcher):
             assert watcher.link is not None
-            since = mock.door.received().last
+            since = mock.faults.received().last
             for row in hostile(np.random.default_rng(7), WIRED, bad=0.02, run=500):
                 watcher.link.commands.write(command(time.monotonic(), Kind.TARGET, row))
                 time.sleep(5e-4)
             watcher.link.commands.write(command(time.monotonic(), Kind.HOLD))
             until(lambda: sound(arm) and arm.at_rest(), "rest")
-            page = mock.door.received(since)
+            page = mock.faults.received(since)
         if page.lost:
             raise Disturbed(f"the mock forgot {page.lost} packages before they were looked at")
         _, joints = servo_targets(page.entries)
@@ -127,15 +127,15 @@ def force(repeat: int) -> list[Measurement]:
 
     def once() -> dict[str, float]:
         with driven(mock, config(mock.host, {"force": limit, "speed": speed})) as (arm, watcher):
-            start, state = arm.state().pose, mock.door.state()
+            start, state = arm.state().pose, mock.faults.state()
             ahead = state.tick - round(state.time / PERIOD)  # the mock's count of periods, against its clock
-            mock.door.wall(state.pose[2] - 0.02, stiffness)
-            since = mock.door.received().last
+            mock.faults.wall(state.pose[2] - 0.02, stiffness)
+            since = mock.faults.received().last
             arm.command(moved(start, z=-0.1))
             until(lambda: arm.status() == ArmStatus.FORCE_LIMIT, "force limit")
             until(lambda: bool(np.linalg.norm(watcher.newest()["tcp_speed"][:3]) < STILL), "standstill")
             records = watcher.records()
-            ticks, joints = servo_targets(mock.door.received(since).entries)
+            ticks, joints = servo_targets(mock.faults.received(since).entries)
         felt = np.linalg.norm(records["tcp_force"][:, :3], axis=1)
         first = records[felt > limit][0]
         told = records[records["status"] == ArmStatus.FORCE_LIMIT][0]
@@ -171,7 +171,7 @@ def silent_link(repeat: int) -> list[Measurement]:
     def once() -> dict[str, float]:
         with driven(mock, config(mock.host, link_timeout=0.05)) as (arm, watcher):
             under_way(arm, moved(arm.state().pose, x=0.12))
-            mock.door.silence(True)
+            mock.faults.silence(True)
             told = until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link", pause=2e-4)
             last = float(watcher.newest()["time"])
             try:
@@ -206,10 +206,10 @@ def late_policy(repeat: int) -> list[Measurement]:
             holds = records[(records["status"] == ArmStatus.HOLD) & (records["beat"] > asked + 0.1)]
             until(arm.at_rest, "rest")
             time.sleep(0.1)
-            mark = mock.door.received().last
+            mark = mock.faults.received().last
             arm.command(far)
-            until(lambda: sound(arm) and len(servo_targets(mock.door.received(mark).entries)[0]) > 60, "new targets")
-            _, joints = servo_targets(mock.door.received(mark).entries)
+            until(lambda: sound(arm) and len(servo_targets(mock.faults.received(mark).entries)[0]) > 60, "new targets")
+            _, joints = servo_targets(mock.faults.received(mark).entries)
         steps = np.linalg.norm(np.diff(sensor_path(joints), axis=0), axis=1)
         return {
             "hold": 1e3 * (float(holds[0]["beat"]) - asked),
@@ -235,10 +235,10 @@ def protective_stop(repeat: int) -> list[Measurement]:
             start = arm.state().pose
             under_way(arm, moved(start, x=0.12))
             asked = time.monotonic()
-            mock.door.protective_stop()
+            mock.faults.protective_stop()
             told = until(lambda: arm.status() == ArmStatus.PROTECTIVE_STOP, "protective stop", pause=2e-4)
-            until(lambda: mock.door.state().rests, "rest")
-            before, mark = mock.door.state(), mock.door.received().last
+            until(lambda: mock.faults.state().rests, "rest")
+            before, mark = mock.faults.state(), mock.faults.received().last
             for _ in range(20):
                 try:
                     arm.command(start)
@@ -246,7 +246,7 @@ def protective_stop(repeat: int) -> list[Measurement]:
                     time.sleep(0.01)
             arm.recover()
             time.sleep(0.1)
-            after, (ticks, _) = mock.door.state(), servo_targets(mock.door.received(mark).entries)
+            after, (ticks, _) = mock.faults.state(), servo_targets(mock.faults.received(mark).entries)
         way = np.subtract(after.pose[:3], before.pose[:3])
         return {"status": 1e3 * (told - asked), "motion": 1e3 * float(np.linalg.norm(way)), "replayed": len(ticks)}
 

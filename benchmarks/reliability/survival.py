@@ -49,14 +49,14 @@ time.sleep(60)
 
 def _rest(mock: MockUR) -> tuple[float, MockState]:
     """When the tool of a mock stood [s], and the mock once nothing in it moves any more."""
-    stood = until(lambda: still(mock.door.state()), "standstill", pause=5e-4)
-    until(lambda: mock.door.state().rests, "rest")
-    return stood, mock.door.state()
+    stood = until(lambda: still(mock.faults.state()), "standstill", pause=5e-4)
+    until(lambda: mock.faults.state().rests, "rest")
+    return stood, mock.faults.state()
 
 
 def _clients(mock: MockUR) -> int:
-    """Connections to a mock, without those of its door."""
-    return sum(port != mock.doors[0].port for port in mock.door.state().clients)
+    """Connections to a mock, without those of its fault client."""
+    return sum(port != mock.fault_clients[0].port for port in mock.faults.state().clients)
 
 
 def _gone(number: int) -> bool:
@@ -71,7 +71,7 @@ def policy_death(repeat: int) -> list[Measurement]:
     """SIGKILL to the process of a policy that drives the arm at 0.1 m/s; nobody is left to clean up."""
 
     def once() -> dict[str, float]:
-        mock.door.reset()
+        mock.faults.reset()
         words = [sys.executable, "-c", POLICY, config(mock.host, watchdog=10.0).model_dump_json()]
         root = str(Path(shared_ring.__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
@@ -81,7 +81,7 @@ def policy_death(repeat: int) -> list[Measurement]:
                 if policy.stdout.readline() != b"under way\n":
                     raise Disturbed("the policy that was to be killed did not come under way")
                 (worker,) = workers(policy.pid)
-                before = mock.door.state()
+                before = mock.faults.state()
             finally:
                 killed = time.monotonic()
                 policy.kill()

@@ -37,7 +37,7 @@ def mock(
     """
     from robot.common.kinematics import MODELS
     from robot.mock import MockArms, MockCamera
-    from robot.mock.ur.fault_client import DOOR_PORT
+    from robot.mock.ur.fault_client import FAULT_PORT
     from robot.mock.ur.wire.controller import PORTS
 
     if model not in MODELS:
@@ -51,7 +51,7 @@ def mock(
         eyes = [stack.enter_context(MockCamera(each, camera_port, allow_network=allow_network)) for each in seen_from]
         ports = ", ".join(map(str, sorted(PORTS)))
         for each in hosts:
-            results.print(f"{model} at {each}: ports {ports}; fault door {DOOR_PORT}")
+            results.print(f"{model} at {each}: ports {ports}; faults {FAULT_PORT}")
         for eye in eyes:
             results.print(f"camera at {eye.url}", markup=False)
         results.print("Ctrl-C ends them.")

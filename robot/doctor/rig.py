@@ -22,7 +22,7 @@ from robot.common.kinematics import Kinematics
 from robot.common.tcp import ArmFrames
 from robot.doctor.machine import Check
 from robot.errors import DeviceError
-from robot.mock.cell.cell import MockBench
+from robot.mock.cell.cell import MockCell
 from tacsim import pose as se3
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig
@@ -41,7 +41,7 @@ def examine_rig(config: RigConfig) -> list[Check]:
     ):
         return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
     try:
-        with MockBench(config):
+        with MockCell(config):
             checks = [
                 check for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) for check in _arm(name, arm)
             ]

@@ -2,7 +2,7 @@
 
 with MockUR("127.0.0.2") as mock:
     ...  # connect ur_rtde to mock.host
-    mock.door.protective_stop()
+    mock.faults.protective_stop()
 """
 
 from __future__ import annotations
@@ -10,16 +10,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from robot.common import MOCK_SERIAL
-from robot.mock.ur.fault_client import Door, DoorError, Input, Inputs, MockState
+from robot.mock.ur.fault_client import FaultClient, FaultError, Input, Inputs, MockState
 from robot.mock.ur.handle import MockArms, MockError, MockUR
 
 if TYPE_CHECKING:
     from robot.mock.camera.camera import MockCamera, MockCameraState
 
+Door, DoorError = FaultClient, FaultError  # their names before 0.1, in users' tests
+
 __all__ = [
     "MOCK_SERIAL",
     "Door",
     "DoorError",
+    "FaultClient",
+    "FaultError",
     "Input",
     "Inputs",
     "MockArms",

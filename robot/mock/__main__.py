@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, cast
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import MODELS
 from robot.common.realtime import CONTROLLER, ask_for_realtime
-from robot.mock.ur.fault_client import DOOR_PORT
-from robot.mock.ur.fault_server import FaultDoor
+from robot.mock.ur.fault_client import FAULT_PORT
+from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import VERSION, check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.wire.controller import Controller, ControllerConfig
@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
 
 
-def serve(all_facts: Sequence[ControllerConfig], door_port: int, *, with_parent: bool) -> None:
+def serve(all_facts: Sequence[ControllerConfig], fault_port: int, *, with_parent: bool) -> None:
     """Runs controllers until the input ends (`with_parent`) or SIGTERM or SIGINT comes. Raises OSError for ports."""
     ended: list[str] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.append("signal"))
     with selectors.DefaultSelector() as selector:
         controllers: list[Controller] = []
-        doors: list[FaultDoor] = []
+        fault_servers: list[FaultServer] = []
         try:
             for config in all_facts:
                 controllers.append(Controller(config, selector))
-                doors.append(FaultDoor(controllers[-1], selector, door_port))
+                fault_servers.append(FaultServer(controllers[-1], selector, fault_port))
             if with_parent:
                 _watch_input(selector, lambda: ended.append("input"))
             sys.stdout.write(json.dumps({"ready": [config.host for config in all_facts]}) + "\n")
             sys.stdout.flush()
-            _loop(selector, controllers, doors, ended, os.getppid() if with_parent else None)
+            _loop(selector, controllers, fault_servers, ended, os.getppid() if with_parent else None)
         finally:
-            for door in doors:
-                door.close()
+            for server in fault_servers:
+                server.close()
             for controller in controllers:
                 controller.close()
 
@@ -65,7 +65,7 @@ def _watch_input(selector: selectors.BaseSelector, work: Callable[[], None]) -> 
 def _loop(
     selector: selectors.BaseSelector,
     controllers: list[Controller],
-    doors: list[FaultDoor],
+    fault_servers: list[FaultServer],
     ended: list[str],
     parent: int | None,
 ) -> None:
@@ -86,8 +86,8 @@ def _loop(
         deadline += PERIOD
         for controller in controllers:
             controller.tick()
-        for door in doors:
-            door.flush()
+        for server in fault_servers:
+            server.flush()
         if parent is not None and os.getppid() != parent:
             return
 
@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--model", choices=list(MODELS), action="append", help=each)
     parser.add_argument("--joints", action="append", help=f"six angles [rad], with commas; {each}")
     parser.add_argument("--version", default=".".join(map(str, VERSION)))
-    parser.add_argument("--door-port", type=int, default=DOOR_PORT)
+    parser.add_argument("--fault-port", "--door-port", type=int, default=FAULT_PORT)
     parser.add_argument("--serial", default=MOCK_SERIAL)
     parser.add_argument("--allow-network", action="store_true")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input ends")
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ControllerConfig(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial)
             for host, model, joints in zip(given.hosts, models, postures, strict=True)
         ]
-        serve(config, given.door_port, with_parent=given.with_parent)
+        serve(config, given.fault_port, with_parent=given.with_parent)
     except (OSError, ValueError) as error:
         message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         sys.stdout.write(json.dumps({"error": message}) + "\n")

@@ -38,7 +38,7 @@ def rig_addresses() -> list[str]:
 
 @pytest.fixture
 def mock_ur() -> Iterator[MockUR]:
-    """One mock UR5e controller: connect to `mock_ur.host`, break it by `mock_ur.door`."""
+    """One mock UR5e controller: connect to `mock_ur.host`, break it by `mock_ur.faults`."""
     with MockUR(mock_host(1)) as running:
         yield running
 
@@ -52,7 +52,7 @@ def mock_camera() -> Iterator[MockCamera]:
 
 @pytest.fixture
 def mock_rig() -> Iterator[Callable[..., Rig]]:
-    """Opens the whole mock bench: `mock_rig("task=reposition", ...)` takes overrides of configs/rigs/mock.yaml."""
+    """Opens the whole mock cell: `mock_rig("task=reposition", ...)` takes overrides of configs/rigs/mock.yaml."""
     from robot.open import open_rig
 
     with ExitStack() as stack:

@@ -24,7 +24,7 @@ from calibration.poses.hand_eye import LEAST_SWING, Sight
 from calibration.poses.robust_fit import swing
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
-from robot.mock.cell.cell import MockBench
+from robot.mock.cell.cell import MockCell
 from robot.procedures.ball_touches import GOLDEN, LOOK, SETTLE, TRAVEL, Shortened, go
 from tacsim import pose as se3
 from tacsim.interface import Pose
@@ -88,7 +88,7 @@ def opened(config: RigConfig, arm: str) -> Iterator[URArm]:
             apart[other] = max(rule.distance, apart.get(other, 0.0))
     with ExitStack() as stack:
         # neither gels nor bodies: only arms
-        stack.enter_context(MockBench(config.model_copy(update={"sensors": {}, "scene": None, "task": None})))
+        stack.enter_context(MockCell(config.model_copy(update={"sensors": {}, "scene": None, "task": None})))
         arms = {}
         for name in (arm, *apart):
             there = config.arms[name]

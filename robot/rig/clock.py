@@ -10,7 +10,7 @@ import numpy as np
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
 from robot.errors import DeviceError
-from robot.mock.cell.cell import MockBench
+from robot.mock.cell.cell import MockCell
 from tacsim.interface import Pose
 
 ARRIVE = 10.0  # longest way of a control period in lock step [s]
@@ -98,12 +98,12 @@ class WallClock:
 
 
 class LockStep:
-    """A period ends when the arms rest at their targets and the bench has drawn the pictures of just that pose."""
+    """A period ends when the arms rest at their targets and the cell has drawn the pictures of just that pose."""
 
     def __init__(
-        self, period: float, arms: Mapping[str, Driven], cameras: Mapping[str, Camera], bench: MockBench
+        self, period: float, arms: Mapping[str, Driven], cameras: Mapping[str, Camera], cell: MockCell
     ) -> None:
-        self._period, self._arms, self._cameras, self._bench = period, arms, cameras, bench
+        self._period, self._arms, self._cameras, self._cell = period, arms, cameras, cell
 
     @property
     def period(self) -> float:
@@ -113,13 +113,13 @@ class LockStep:
         return time.monotonic()
 
     def tick(self) -> None:
-        """Raises DeviceError: an arm does not arrive or is stopped, the bench fails, a picture does not come."""
+        """Raises DeviceError: an arm does not arrive or is stopped, the cell fails, a picture does not come."""
         drive(self._arms, ARRIVE)
         self.look()
 
     def look(self) -> None:
-        """Lets the bench follow, and waits until forces and pictures have arrived over the wire."""
-        for name, number in self._bench.step(pause=SETTLED).items():
+        """Lets the cell follow, and waits until forces and pictures have arrived over the wire."""
+        for name, number in self._cell.step(pause=SETTLED).items():
             self._cameras[name].wait_for(number, timeout=5.0)
 
     def restart(self) -> None:

@@ -15,7 +15,7 @@ from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
 from robot.errors import DeviceError, SafetyViolation
-from robot.mock.cell.cell import MockBench
+from robot.mock.cell.cell import MockCell
 from robot.rig.clock import Driven, LockStep, WallClock
 from robot.rig.reset import GuidedStart
 from robot.rig.twin_sensor import TwinSensor
@@ -107,10 +107,10 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
     # first, because a wrong calibration is known before anything is connected
     normalisers = {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()}
     with ExitStack() as stack:
-        bench = stack.enter_context(MockBench(config))
+        cell = stack.enter_context(MockCell(config))
         sensors: dict[str, TactileSource] = {}
         for name, sensor in config.sensors.items():
-            sensors[name] = _sensor(name, sensor, bench)
+            sensors[name] = _sensor(name, sensor, cell)
             stack.callback(sensors[name].close)
         arms: dict[str, Driven] = {}
         for name, arm in config.arms.items():
@@ -119,14 +119,14 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
             stack.callback(opened.close)
             arms[name] = Driven(opened)
         cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
-        fed = {name: camera for name, camera in cameras.items() if name in bench.cameras}
-        lock_step = config.lock_step and not real and bench.simulated
+        fed = {name: camera for name, camera in cameras.items() if name in cell.cameras}
+        lock_step = config.lock_step and not real and cell.simulated
         clock: LockStep | WallClock
         if lock_step:
-            clock = LockStep(config.period, arms, fed, bench)
-        elif bench.simulated:
-            bench.run_free()
-            clock = WallClock(config.period, bench.catch_up)
+            clock = LockStep(config.period, arms, fed, cell)
+        elif cell.simulated:
+            cell.run_free()
+            clock = WallClock(config.period, cell.catch_up)
         else:
             clock = WallClock(config.period)
         for name, camera in cameras.items():  # what the normaliser finds in the picture is delivered too
@@ -136,18 +136,18 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
         start = GuidedStart(
             arms={} if dry_run else arms,
             sensors=sensors,
-            start=_starts(config, bench),
+            start=_starts(config, cell),
             clock=clock,
             config=config.start,
             feel=None if dry_run else _feel(config, arms, sensors, normalisers),
-            confirm=_confirmed(config, bench, confirm, real=bool(real) and not dry_run),
+            confirm=_confirmed(config, cell, confirm, real=bool(real) and not dry_run),
             placement=0.0 if task is None else task.placement,
         )
 
         behind = {name: RigArm(driven, still=dry_run) for name, driven in arms.items()}
 
         def diagnostics() -> Mapping[str, float]:
-            found = {**bench.diagnostics(), **clock.diagnostics()}
+            found = {**cell.diagnostics(), **clock.diagnostics()}
             for name, arm in behind.items():
                 found |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
             return found
@@ -159,9 +159,9 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
             clock=clock,
             normalisers=normalisers,
             start=start,
-            truth=bench.truth if bench.knows_truth else None,
+            truth=cell.truth if cell.knows_truth else None,
             diagnostics=diagnostics,
-            beside=bench.close,
+            beside=cell.close,
             watch=_watch(config, sensors, arms),
             held=held_loads(config.task),
         )
@@ -169,15 +169,15 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
         return rig
 
 
-def _sensor(name: str, config: object, bench: MockBench) -> TactileSource:
+def _sensor(name: str, config: object, cell: MockCell) -> TactileSource:
     if isinstance(config, CameraSensorConfig):
         return Camera(config, name)
     assert isinstance(config, SimSensorConfig)
-    return TwinSensor(bench, name, config)
+    return TwinSensor(cell, name, config)
 
 
-def _starts(config: RigConfig, bench: MockBench) -> dict[str, Pose]:
-    starts = dict(bench.start)
+def _starts(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
+    starts = dict(cell.start)
     for name, arm in config.arms.items():
         assert isinstance(arm, UrArmConfig)
         if arm.start is not None:
@@ -224,11 +224,11 @@ def _watch(config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mappin
         raise DeviceError(str(failure)) from None
 
 
-def _confirmed(config: RigConfig, bench: MockBench, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
+def _confirmed(config: RigConfig, cell: MockCell, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
     def ask() -> bool:
         if real:
             return confirm is not None and confirm(f"Rig '{config.name}': {QUESTION}")
-        bench.place()
+        cell.place()
         return True
 
     return ask

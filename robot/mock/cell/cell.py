@@ -1,4 +1,4 @@
-"""A whole mock bench: controllers, cameras, and the simulated gels and body that they hold and look at.
+"""A whole mock cell: controllers, cameras, and the simulated gels and body that they hold and look at.
 
 Poses of the mock arms go to the simulator, contact forces come back into the arms and tactile pictures into the
 cameras. Where nothing is simulated (a rig without scene), the controllers stand alone.
@@ -20,8 +20,8 @@ from robot.common.kinematics import Kinematics, matrix
 from robot.common.tcp import ArmFrames, pose_of
 from robot.errors import DeviceError
 from robot.mock.camera.camera import MockCamera
-from robot.mock.cell.sim_server import Scenery, Twin
-from robot.mock.ur.fault_client import Door
+from robot.mock.cell.sim_server import SceneFrame, SimServer
+from robot.mock.ur.fault_client import FaultClient
 from robot.mock.ur.handle import MockArms
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose, Truth
@@ -33,24 +33,24 @@ POSTURE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: e
 FREE_RUN = 5e-3  # shortest time between two looks at the arms while running free [s]
 
 
-class MockBench:
+class MockCell:
     """Starts the mocks that a rig file asks for. A context manager; `close` ends every process.
 
     Attributes:
-        doors: of the controllers, by arm.
+        faults: fault client of each controller, by arm.
         cameras: by sensor.
         start: world_from_sensor of each mock arm where an episode begins.
     """
 
     def __init__(self, config: RigConfig) -> None:
-        """Raises DeviceError (MockError, TwinError) when a mock cannot be started."""
+        """Raises DeviceError (MockError, SimServerError) when a mock cannot be started."""
         self._facts = config
-        self.doors: dict[str, Door] = {}
+        self.faults: dict[str, FaultClient] = {}
         self._controllers: MockArms | None = None
         self.cameras: dict[str, MockCamera] = {}
         self.start: dict[str, Pose] = {}
-        self._twin: Twin | None = None
-        self._scenery: Scenery | None = None
+        self._sim_server: SimServer | None = None
+        self._scene_frame: SceneFrame | None = None
         self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
         self._lock = threading.Lock()  # of the twin
         self._stop = threading.Event()
@@ -65,7 +65,7 @@ class MockBench:
             stack.callback(self.close)
             models = self._models()
             if config.scene is not None and models:
-                self._twin = Twin(config.scene, models, config.canonical, config.contact)
+                self._sim_server = SimServer(config.scene, models, config.canonical, config.contact)
             for name, sensor in config.sensors.items():
                 if isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
                     self.cameras[name] = _camera(name, sensor)
@@ -77,7 +77,7 @@ class MockBench:
                     joints=[self._joints(name, arm) for name, arm in self._mocked.items()],
                     realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._mocked.values()),
                 )
-                self.doors = dict(zip(self._mocked, self._controllers.doors, strict=True))
+                self.faults = dict(zip(self._mocked, self._controllers.fault_clients, strict=True))
             stack.pop_all()
 
     def _models(self) -> dict[str, SensorModel]:
@@ -100,11 +100,11 @@ class MockBench:
         if arm.start is not None:
             return arm.start.pose
         sensor = self._carried(name)
-        if self._twin is None or sensor is None or sensor not in self._twin.initial:
+        if self._sim_server is None or sensor is None or sensor not in self._sim_server.initial:
             raise DeviceError(
                 f"arms.{name}.start: where does an episode begin? No scene says it; give the sensor's pose"
             )
-        return self._twin.initial[sensor]
+        return self._sim_server.initial[sensor]
 
     def _joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
         """Joints at power-on: those of the rig file, else such that the sensor is at its start: of all postures the one
@@ -122,61 +122,61 @@ class MockBench:
         chosen: list[float] = max(postures, key=lambda q: round(kinematics.singularity(q), 6)).tolist()
         return chosen
 
-    # -------------------------------------------------------------- the bench
+    # -------------------------------------------------------------- the cell
 
     @property
     def simulated(self) -> bool:
-        return self._twin is not None
+        return self._sim_server is not None
 
     @property
     def knows_truth(self) -> bool:
         """True if there is a simulated body."""
         scene = self._facts.scene
-        simulated = self._twin is not None and self._facts.contact == "simulated"
+        simulated = self._sim_server is not None and self._facts.contact == "simulated"
         return simulated and scene is not None and scene.body is not None
 
     @property
-    def scenery(self) -> Scenery | None:
-        """What the bench looked like last; None before the first look. Raises DeviceError if it follows no more."""
+    def scene_frame(self) -> SceneFrame | None:
+        """What the cell looked like last; None before the first look. Raises DeviceError if it follows no more."""
         self.check()
-        return self._scenery
+        return self._scene_frame
 
     def poses(self) -> dict[str, Pose]:
         """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
         found = {}
-        for name, door in self.doors.items():
+        for name, faults in self.faults.items():
             sensor = self._carried(name)
             if sensor is not None:
-                tool = matrix(np.array(door.state().pose))
+                tool = matrix(np.array(faults.state().pose))
                 frames = self._frames[name]
                 found[sensor] = pose_of(frames.world_from_base @ tool @ frames.tool_from_sensor)
         return found
 
     def place(self) -> None:
         """A person's part: puts a fresh body between the sensors."""
-        if self._twin is not None:
+        if self._sim_server is not None:
             with self._lock:
-                self._show(self._twin.place(self.poses()))
+                self._show(self._sim_server.place(self.poses()))
 
     def step(self, pause: float = 0.0) -> Mapping[str, int]:
         """Follows the arms once: forces into the controllers and, after a `pause` [s], pictures into the cameras.
 
-        Returns the number of each camera's newest picture. Raises TwinError.
+        Returns the number of each camera's newest picture. Raises SimServerError.
         """
-        if self._twin is None:
+        if self._sim_server is None:
             return {}
         with self._lock:
-            return self._show(self._twin.move(self.poses()), pause)
+            return self._show(self._sim_server.move(self.poses()), pause)
 
-    def _show(self, scenery: Scenery, pause: float = 0.0) -> Mapping[str, int]:
-        self._scenery = scenery
-        for name, door in self.doors.items():
+    def _show(self, scene_frame: SceneFrame, pause: float = 0.0) -> Mapping[str, int]:
+        self._scene_frame = scene_frame
+        for name, faults in self.faults.items():
             sensor = self._carried(name)
-            if sensor is not None and sensor in scenery.wrenches:
-                door.wrench(self._at_tool(name, scenery.wrenches[sensor]).tolist())
+            if sensor is not None and sensor in scene_frame.wrenches:
+                faults.wrench(self._at_tool(name, scene_frame.wrenches[sensor]).tolist())
         time.sleep(pause)
         for name, camera in self.cameras.items():  # which go on showing their last picture
-            picture = scenery.images[name]
+            picture = scene_frame.images[name]
             if name not in self._pushed or not np.array_equal(self._pushed[name][0], picture):
                 self._pushed[name] = picture, camera.push(picture)
         return {name: number for name, (_, number) in self._pushed.items()}
@@ -186,28 +186,28 @@ class MockBench:
         frames = self._frames[name]
         tool = se3.from_matrix(frames.tool_from_sensor)
         at_tool = se3.transform_wrench(tool, wrench)
-        turn = matrix(np.array(self.doors[name].state().pose))[:3, :3]
+        turn = matrix(np.array(self.faults[name].state().pose))[:3, :3]
         return np.concatenate([turn @ at_tool[:3], turn @ at_tool[3:]])
 
     def truth(self) -> Truth | None:
-        return None if self._scenery is None else self._scenery.truth
+        return None if self._scene_frame is None else self._scene_frame.truth
 
     def diagnostics(self) -> Mapping[str, float]:
         """How the last simulated motion went, and how long it took [s]."""
-        if self._scenery is None:
+        if self._scene_frame is None:
             return {}
-        return {**self._scenery.stats, "twin_seconds": self._scenery.seconds}
+        return {**self._scene_frame.stats, "twin_seconds": self._scene_frame.seconds}
 
     # ---------------------------------------------------------- running free
 
     def run_free(self) -> None:
         """From now on follows the arms as fast as it can, in a thread."""
-        if self._twin is not None and self._free is None:
-            self._free = threading.Thread(target=self._follow, name="mock bench", daemon=True)
+        if self._sim_server is not None and self._free is None:
+            self._free = threading.Thread(target=self._follow, name="mock cell", daemon=True)
             self._free.start()
 
     def catch_up(self) -> None:
-        """While running free: waits until the bench has looked at the arms anew, from now on. An approach that did not
+        """While running free: waits until the cell has looked at the arms anew, from now on. An approach that did not
         wait would go on while the simulator is still busy with the first touch.
 
         Raises DeviceError if it follows no more.
@@ -220,7 +220,7 @@ class MockBench:
     def check(self) -> None:
         """Raises DeviceError if the thread that follows the arms has failed."""
         if self._failure is not None:
-            raise DeviceError(f"the mock bench follows the arms no more: {self._failure}") from self._failure
+            raise DeviceError(f"the mock cell follows the arms no more: {self._failure}") from self._failure
 
     def _follow(self) -> None:
         try:
@@ -241,8 +241,8 @@ class MockBench:
                 stack.callback(camera.close)
             if self._controllers is not None:
                 stack.callback(self._controllers.close)
-            if self._twin is not None:
-                stack.callback(self._twin.close)
+            if self._sim_server is not None:
+                stack.callback(self._sim_server.close)
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""In place of the simulated bench: in front of each sensor a rigid ball, and its contact with the gel in closed form.
+"""In place of the simulated cell: in front of each sensor a rigid ball, and its contact with the gel in closed form.
 
 Quick enough for real time, where the simulator is not: for tests of timing (`tacsim calibrate latency` on mocks).
 Hertz's contact of a ball with an elastic half-space (Johnson, Contact Mechanics, 1985, 3.4 and 4.2): radius a with
@@ -35,7 +35,7 @@ GRAIN = 10e-6  # places that are nearer than this to each other show one picture
 KEPT = 512  # pictures
 
 
-class HertzBench:
+class HertzCell:
     """What the simulator's process holds instead of a world: the places of the sensors, the balls, and the pictures.
 
     Raises ValueError for a sensor that the scene has not.

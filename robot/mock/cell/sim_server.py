@@ -1,4 +1,4 @@
-"""The simulated bench in a process of its own: sensor poses go in, tactile images and contact forces come out.
+"""The simulated cell in a process of its own: sensor poses go in, tactile images and contact forces come out.
 
 Materials are rate independent, so only the path of the poses counts, not how long a simulated motion takes. The process
 knows nothing of arms and cameras; robot.mock.cell.cell joins them. It runs at low priority and on one thread, so that
@@ -43,13 +43,13 @@ _HEAD = struct.Struct(">II")  # length of the JSON, length of the arrays
 LARGEST = 256 * 2**20  # bytes of a message
 
 
-class TwinError(DeviceError):
-    """The simulated bench failed: its motion diverged, or its process ended."""
+class SimServerError(DeviceError):
+    """The simulated cell failed: its motion diverged, or its process ended."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scenery:
-    """What the bench looks like after a motion."""
+class SceneFrame:
+    """What the cell looks like after a motion."""
 
     index: int  # counts the motions
     time: float  # when it was ready, monotonic [s]
@@ -61,7 +61,7 @@ class Scenery:
     seconds: float  # that it took
 
 
-class Twin:
+class SimServer:
     """Starts the process for a scene and talks to it. One request at a time; not for several threads.
 
     Args:
@@ -89,22 +89,22 @@ class Twin:
         self.pid = self._process.pid
         try:
             config = {name: model.model_dump(mode="json") for name, model in models.items()}
-            scenery = {"scene": scene.model_dump(mode="json"), "models": config, "grid": grid.model_dump()}
-            said, _ = self._ask({"do": "open", "contact": contact, **scenery})
+            scene_frame = {"scene": scene.model_dump(mode="json"), "models": config, "grid": grid.model_dump()}
+            said, _ = self._ask({"do": "open", "contact": contact, **scene_frame})
         except BaseException:
             self.close()
             raise
         self.initial = {name: _pose(numbers) for name, numbers in said["poses"].items()}  # of the sensors
 
-    def place(self, poses: Mapping[str, Pose]) -> Scenery:
-        """Puts a fresh body on the bench, with the sensors at `poses`, clear of it. Raises TwinError."""
+    def place(self, poses: Mapping[str, Pose]) -> SceneFrame:
+        """Puts a fresh body on the cell, with the sensors at `poses`, clear of it. Raises SimServerError."""
         return self._move("place", poses)
 
-    def move(self, poses: Mapping[str, Pose]) -> Scenery:
-        """Drives the sensors to `poses`. Raises TwinError when the motion diverges; the bench is as before then."""
+    def move(self, poses: Mapping[str, Pose]) -> SceneFrame:
+        """Drives the sensors to `poses`. Raises SimServerError when the motion diverges; the cell is as before then."""
         return self._move("move", poses)
 
-    def _move(self, what: str, poses: Mapping[str, Pose]) -> Scenery:
+    def _move(self, what: str, poses: Mapping[str, Pose]) -> SceneFrame:
         said, arrays = self._ask({"do": what, "poses": {name: _numbers(pose) for name, pose in poses.items()}})
         truth = None
         if said["truth"] is not None:
@@ -112,7 +112,7 @@ class Twin:
             there = {name: _pose(numbers) for name, numbers in body["poses"].items()}
             truth = Truth(body["height"], np.array(body["position"]), arrays["points"], there)
         self._index += 1
-        return Scenery(
+        return SceneFrame(
             index=self._index,
             time=time.monotonic(),
             images={name.removeprefix("image."): a for name, a in arrays.items() if name.startswith("image.")},
@@ -131,27 +131,27 @@ class Twin:
         pipe_in, pipe_out = self._process.stdin, self._process.stdout
         assert pipe_in is not None and pipe_out is not None
         if pipe_in.closed:
-            raise TwinError(f"the simulated bench (process {self.pid}) is closed; open the rig anew")
+            raise SimServerError(f"the simulated cell (process {self.pid}) is closed; open the rig anew")
         try:
             write_message(pipe_in, request)
             with selectors.DefaultSelector() as ready:
                 ready.register(pipe_out, selectors.EVENT_READ)
                 if not ready.select(PATIENCE):
-                    raise TwinError(f"the simulated bench gave no answer within {PATIENCE:g} s and was ended")
+                    raise SimServerError(f"the simulated cell gave no answer within {PATIENCE:g} s and was ended")
             message = read_message(pipe_out)
             if message is None:
                 raise OSError("it has ended")
         except BaseException as failure:  # also Ctrl-C: an answer left in the pipe would be taken for the next one
             self.close()
             if isinstance(failure, (OSError, ValueError)):
-                raise TwinError(
-                    f"the simulated bench (process {self.pid}, ended with {self._process.returncode}) cannot be asked: "
+                raise SimServerError(
+                    f"the simulated cell (process {self.pid}, ended with {self._process.returncode}) cannot be asked: "
                     f"{failure}; open the rig anew"
                 ) from failure
             raise
         said, arrays = message
         if "error" in said:
-            raise TwinError(f"simulated bench: {said['error']}")
+            raise SimServerError(f"simulated cell: {said['error']}")
         return said, arrays
 
     def close(self) -> None:
@@ -220,8 +220,8 @@ def _pose(numbers: list[float]) -> Pose:
 # ------------------------------------------------------------------- process
 
 
-class Bench(Protocol):
-    """What the process holds: simulated (:class:`WorldBench`), or in closed form (robot.mock.cell.hertz)."""
+class CellModel(Protocol):
+    """What the process holds: simulated (:class:`WorldCell`), or in closed form (robot.mock.cell.hertz)."""
 
     @property
     def stats(self) -> Mapping[str, float]: ...
@@ -233,7 +233,7 @@ class Bench(Protocol):
     def truth(self) -> Truth | None: ...
 
 
-class WorldBench:
+class WorldCell:
     """The simulated world and its renderers."""
 
     def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
@@ -283,34 +283,34 @@ class WorldBench:
         return self.world.truth()
 
 
-def _open(request: Mapping[str, Any]) -> tuple[Bench, list[str]]:
-    """The bench that is asked for, and the sensors that are looked at."""
-    from robot.mock.cell.hertz import HertzBench
+def _open(request: Mapping[str, Any]) -> tuple[CellModel, list[str]]:
+    """The cell that is asked for, and the sensors that are looked at."""
+    from robot.mock.cell.hertz import HertzCell
     from tacsim.models.scene import Scene
     from tacsim.models.sensor import CanonicalGrid, SensorModel
 
     scene = Scene.model_validate_json(json.dumps(request["scene"]))
     models = {name: SensorModel.model_validate_json(json.dumps(model)) for name, model in request["models"].items()}
-    kind: Callable[..., Bench] = HertzBench if request["contact"] == "hertz" else WorldBench
-    if kind is WorldBench:
+    kind: Callable[..., CellModel] = HertzCell if request["contact"] == "hertz" else WorldCell
+    if kind is WorldCell:
         os.nice(NICENESS)
     return kind(scene, models, CanonicalGrid.model_validate(request["grid"])), list(models)
 
 
-def _scenery(bench: Bench, seen: list[str], seconds: float) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def _scene_frame(cell: CellModel, seen: list[str], seconds: float) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     arrays: dict[str, NDArray[Any]] = {}
     for name in seen:
-        arrays[f"image.{name}"], surface = bench.look(name)
+        arrays[f"image.{name}"], surface = cell.look(name)
         arrays |= {f"height.{name}": surface.height, f"gradient.{name}": surface.gradient}
         if surface.flow is not None:
             arrays[f"flow.{name}"] = surface.flow
     said: dict[str, Any] = {
-        "wrenches": {name: bench.wrench(name).tolist() for name in bench.poses()},
-        "stats": dict(bench.stats),
+        "wrenches": {name: cell.wrench(name).tolist() for name in cell.poses()},
+        "stats": dict(cell.stats),
         "seconds": seconds,
         "truth": None,
     }
-    truth = bench.truth()
+    truth = cell.truth()
     if truth is not None:
         poses = {name: _numbers(pose) for name, pose in truth.poses.items()}
         said["truth"] = {"height": truth.height, "position": truth.position.tolist(), "poses": poses}
@@ -324,20 +324,20 @@ def main() -> None:
     answers = io.BufferedWriter(io.FileIO(os.dup(1), "wb"))
     os.dup2(2, 1)  # whoever prints shall not break a message
     requests = sys.stdin.buffer
-    bench: Bench | None = None
+    cell: CellModel | None = None
     seen: list[str] = []
     while (message := read_message(requests)) is not None:
         request, _ = message
         try:
             began = time.perf_counter()
             if request["do"] == "open":
-                bench, seen = _open(request)
-                write_message(answers, {"poses": {name: _numbers(pose) for name, pose in bench.poses().items()}})
+                cell, seen = _open(request)
+                write_message(answers, {"poses": {name: _numbers(pose) for name, pose in cell.poses().items()}})
                 continue
-            assert bench is not None
+            assert cell is not None
             poses = {name: _pose(numbers) for name, numbers in request["poses"].items()}
-            (bench.place if request["do"] == "place" else bench.move)(poses)
-            write_message(answers, *_scenery(bench, seen, time.perf_counter() - began))
+            (cell.place if request["do"] == "place" else cell.move)(poses)
+            write_message(answers, *_scene_frame(cell, seen, time.perf_counter() - began))
         except Exception as failure:  # whatever it is, the other side says it
             write_message(answers, {"error": f"{type(failure).__name__}: {failure}"})
 

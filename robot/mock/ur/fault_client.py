@@ -1,4 +1,4 @@
-"""The fault door of a mock controller, its outer side: what tests and twins hold in their hands."""
+"""Client of a mock controller's fault server: breaks the mock, pushes on its tool, and tells its state."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-DOOR_PORT = 30020
+FAULT_PORT = 30020
 TIMEOUT = 5.0  # of every call [s]
 
 
-class DoorError(RuntimeError):
+class FaultError(RuntimeError):
     """The mock did not answer in time, or refused."""
 
 
@@ -62,10 +62,10 @@ class Inputs:
     lost: int
 
 
-class Door:
-    """Talks to the door of one mock. Every call has a time-out and raises DoorError; threads may share one."""
+class FaultClient:
+    """Breaks one mock and tells its state. Every call has a time-out and raises FaultError; threads may share one."""
 
-    def __init__(self, host: str, port: int = DOOR_PORT, timeout: float = TIMEOUT) -> None:
+    def __init__(self, host: str, port: int = FAULT_PORT, timeout: float = TIMEOUT) -> None:
         self.host, self.port, self.timeout = host, port, timeout
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None
@@ -139,7 +139,7 @@ class Door:
         self._ask("silence", on=on)
 
     def cut(self, ports: Iterable[int] | None = None, reset: bool = False) -> int:
-        """Closes connections to these ports (None: all but the door), with FIN or RST; returns how many."""
+        """Closes connections to these ports (None: all but fault clients'), with FIN or RST; returns how many."""
         return int(self._ask("cut", ports=None if ports is None else list(ports), reset=reset))
 
     def delay(self, seconds: float) -> None:
@@ -226,9 +226,9 @@ class Door:
             except (OSError, ValueError) as error:
                 self._hang_up()
                 reason = "no answer in time" if isinstance(error, TimeoutError) else str(error)
-                raise DoorError(f"mock {self.host}:{self.port}, {action}: {reason}") from error
+                raise FaultError(f"mock {self.host}:{self.port}, {action}: {reason}") from error
         if not answer["ok"]:
-            raise DoorError(f"mock {self.host}:{self.port}, {action}: {answer['error']}")
+            raise FaultError(f"mock {self.host}:{self.port}, {action}: {answer['error']}")
         return answer["result"]
 
     def _exchange(self, request: dict[str, Any], limit: float) -> Any:

@@ -1,8 +1,7 @@
-"""The fault door of a mock controller, its inner side: one JSON object a line in, one out. Tests and twins use it.
+"""The fault server of a mock controller: one JSON object a line in, one out (client: `robot.mock.ur.fault_client`).
 
-A request is {"do": name, ...arguments}; the reply {"ok": true, "result": ...} or {"ok": false, "error": text}. It is no
-part of any real protocol, and it stays open whatever happens to the others. `robot.mock.ur.fault_client` is its outer
-side.
+A request is {"do": name, ...arguments}; the reply {"ok": true, "result": ...} or {"ok": false, "error": text}. It is
+no part of any real protocol, and its port stays open whatever happens to the others.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ PAGE = 500  # input packages in one reply
 MAX_REQUEST = 1 << 16  # bytes
 
 
-class FaultDoor:
+class FaultServer:
     """Listens on one port and acts on one controller."""
 
     def __init__(self, controller: Controller, selector: selectors.BaseSelector, port: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from robot.common import MOCK_SERIAL
 from robot.errors import DeviceError
-from robot.mock.ur.fault_client import DOOR_PORT, Door
+from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
 from robot.mock.ur.machine.machine import Version
 
 if TYPE_CHECKING:
@@ -44,14 +44,14 @@ class MockArms:
         model: Model | Sequence[Model] = "ur5e",
         joints: Sequence[float] | Sequence[Sequence[float]] | None = None,
         version: Version = VERSION,
-        door_port: int = DOOR_PORT,
+        fault_port: int = FAULT_PORT,
         serial: str = MOCK_SERIAL,
         ready_timeout: float = 10.0,
         allow_network: bool = False,
         realtime: bool = False,
     ) -> None:
         self.hosts = tuple(hosts)
-        arguments = [*self.hosts, "--door-port", str(door_port), "--serial", serial]
+        arguments = [*self.hosts, "--fault-port", str(fault_port), "--serial", serial]
         arguments += [f"--model={each}" for each in ([model] if isinstance(model, str) else model)]
         arguments += ["--version", ".".join(map(str, version)), "--with-parent"]
         for posture in () if joints is None else np.atleast_2d(np.array(joints, dtype=np.float64)):
@@ -70,7 +70,7 @@ class MockArms:
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))},
         )
         self.pid = self._process.pid
-        self.doors = tuple(Door(host, door_port) for host in self.hosts)
+        self.fault_clients = tuple(FaultClient(host, fault_port) for host in self.hosts)
         try:
             self._wait(ready_timeout)
         except BaseException:
@@ -84,8 +84,8 @@ class MockArms:
 
     def close(self) -> None:
         """Ends the process; again does nothing."""
-        for door in self.doors:
-            door.close()
+        for faults in self.fault_clients:
+            faults.close()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
@@ -135,7 +135,7 @@ class MockUR(MockArms):
         model: Model = "ur5e",
         joints: Sequence[float] | None = None,
         version: Version = VERSION,
-        door_port: int = DOOR_PORT,
+        fault_port: int = FAULT_PORT,
         serial: str = MOCK_SERIAL,
         ready_timeout: float = 10.0,
         allow_network: bool = False,
@@ -146,14 +146,19 @@ class MockUR(MockArms):
             model=model,
             joints=joints,
             version=version,
-            door_port=door_port,
+            fault_port=fault_port,
             serial=serial,
             ready_timeout=ready_timeout,
             allow_network=allow_network,
             realtime=realtime,
         )
         self.host = host
-        self.door = self.doors[0]
+        self.faults = self.fault_clients[0]
+
+    @property
+    def door(self) -> FaultClient:
+        """The same as `faults`, by its old name."""
+        return self.faults
 
 
 def check_hosts(hosts: Sequence[str], allow_network: bool) -> None:

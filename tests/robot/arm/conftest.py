@@ -21,7 +21,7 @@ def controller() -> Iterator[MockUR]:
 @pytest.fixture
 def mock(controller: MockUR) -> MockUR:
     """One as at power-on."""
-    controller.door.reset()
+    controller.faults.reset()
     return controller
 
 

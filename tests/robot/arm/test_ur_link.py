@@ -39,19 +39,19 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR) ->
     with URArm(config(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.1))
-        mock.door.silence(True)
+        mock.faults.silence(True)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
         with pytest.raises(StaleObservationError, match="more than link_timeout = 500 ms"):
             arm.state()
         with pytest.raises(LinkLost, match="sends no packages"):
             arm.command(start)
-        until(lambda: mock.door.state().rests, "rest by the controller's watchdog")
+        until(lambda: mock.faults.state().rests, "rest by the controller's watchdog")
         assert len(arm.history()) > 5  # what was known stays known
-        mock.door.silence(False)
-        mark = mock.door.received().last
+        mock.faults.silence(False)
+        mark = mock.faults.received().last
         arm.recover()
         time.sleep(0.2)
-        assert len(servo_targets(mock.door.received(mark).entries)) == 0  # nothing old is asked again
+        assert len(servo_targets(mock.faults.received(mark).entries)) == 0  # nothing old is asked again
         go(arm, start)
 
 
@@ -60,11 +60,11 @@ def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, reset: bool) ->
     with URArm(config(link_timeout=0.5), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.1))
-        mock.door.cut([30004], reset=reset)
+        mock.faults.cut([30004], reset=reset)
         until(lambda: arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD), "lost link")
         time.sleep(0.3)
         assert arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD)
-        until(lambda: mock.door.state().rests, "rest")
+        until(lambda: mock.faults.state().rests, "rest")
         arm.recover()
         go(arm, start)
 
@@ -81,7 +81,7 @@ def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
             assert time.monotonic() - begun < PATIENCE
         finally:
             os.kill(mock.pid, signal.SIGCONT)
-        until(lambda: mock.door.state().rests, "rest")
+        until(lambda: mock.faults.state().rests, "rest")
         arm.recover()
         go(arm, moved(start, x=0.01))
 
@@ -89,10 +89,10 @@ def test_a_stopped_controller_is_a_lost_link(mock: MockUR) -> None:
 def test_numbers_that_are_none_are_no_package(mock: MockUR) -> None:
     with URArm(config(link_timeout=0.5), "left") as arm:
         in_motion(arm, moved(arm.state().pose, x=0.1))
-        mock.door.nan_state(True)
+        mock.faults.nan_state(True)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
-        until(lambda: mock.door.state().rests, "rest")
-        mock.door.nan_state(False)
+        until(lambda: mock.faults.state().rests, "rest")
+        mock.faults.nan_state(False)
         arm.recover()
         assert np.isfinite(arm.state().pose.position).all()
 
@@ -101,18 +101,18 @@ def test_numbers_that_are_none_are_no_package(mock: MockUR) -> None:
 def test_a_clock_that_jumps_loses_nothing(arm: URArm, mock: MockUR, jump: float) -> None:
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.05))
-    mock.door.clock_jump(jump)
+    mock.faults.clock_jump(jump)
     go(arm, start)
     assert arm.status() == ArmStatus.OK
 
 
 def test_late_and_lost_packages_are_lived_with(arm: URArm, mock: MockUR) -> None:
     start = arm.state().pose
-    mock.door.drop(0.3, seed=1)
-    mock.door.delay(0.02)
+    mock.faults.drop(0.3, seed=1)
+    mock.faults.delay(0.02)
     go(arm, moved(start, x=0.02))
-    mock.door.delay(0.0)
-    mock.door.drop(0.0)
+    mock.faults.delay(0.0)
+    mock.faults.drop(0.0)
     go(arm, start)
 
 
@@ -142,13 +142,13 @@ def longest_gap() -> Iterator[Callable[[], float]]:
 def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
     mock: MockUR, longest_gap: Callable[[], float], fault: str
 ) -> None:
-    door, host = mock.door, HOST
+    faults, host = mock.faults, HOST
     if fault == "black hole":
-        door.black_hole(True)
+        faults.black_hole(True)
     elif fault == "mute dashboard":
-        door.dashboard_mute(True)
+        faults.dashboard_mute(True)
     elif fault == "silent":
-        door.silence(True)
+        faults.silence(True)
     else:
         host = OTHER  # nobody listens there
     begun = time.monotonic()
@@ -157,7 +157,7 @@ def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
     assert time.monotonic() - begun < 3.0 + PATIENCE
     assert longest_gap() < 1.0  # the library would have blocked them until the end
     assert leftovers("left") == []
-    door.reset()
+    faults.reset()
     with URArm(config(), "left") as arm:
         assert arm.status() == ArmStatus.HOLD
 

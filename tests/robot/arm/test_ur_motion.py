@@ -37,7 +37,7 @@ from tests.robot.arm.mocked import (
 
 
 def test_state_speaks_of_the_sensor_in_the_world(arm: URArm, mock: MockUR) -> None:
-    there = mock.door.state()
+    there = mock.faults.state()
     expected = se3.compose(
         arm.config.world_from_base.pose, se3.compose(se3.from_matrix(matrix(there.pose)), TOOL_FROM_SENSOR.pose)
     )
@@ -52,10 +52,10 @@ def test_state_speaks_of_the_sensor_in_the_world(arm: URArm, mock: MockUR) -> No
 
 def test_wrench_is_what_the_object_does_to_the_sensor(arm: URArm, mock: MockUR) -> None:
     force, torque = np.array([3.0, -2.0, 12.0]), np.array([0.1, 0.2, -0.05])
-    mock.door.wrench([*force, *torque])
+    mock.faults.wrench([*force, *torque])
     until(lambda: abs(float(np.linalg.norm(arm.state().wrench[:3])) - np.linalg.norm(force)) < 1e-6, "force")
     state = arm.state()
-    base_from_tool = se3.from_matrix(matrix(mock.door.state().pose))
+    base_from_tool = se3.from_matrix(matrix(mock.faults.state().pose))
     at_tool = np.concatenate([se3.rotate(se3.inverse(base_from_tool), v) for v in (force, torque)])
     assert np.allclose(state.wrench, se3.transform_wrench(se3.inverse(TOOL_FROM_SENSOR.pose), at_tool), atol=1e-6)
     # The sensor looks down at what pushes up: pressing is a negative force along its z.
@@ -132,27 +132,27 @@ def hostile(rng: np.random.Generator, start: Pose) -> np.ndarray:
 def send_hostile(arm: URArm, mock: MockUR, number: int) -> None:
     start = arm.state().pose
     rng = np.random.default_rng(5)
-    since = mock.door.received().last
+    since = mock.faults.received().last
     joints = []
     for k in range(number):
         # Past the guards of the driver: the worker must stand alone.
         arm._link.commands.write(command(time.monotonic(), Kind.TARGET, hostile(rng, start)))
         time.sleep(0.0005)
         if k % 2000 == 1999:
-            page = mock.door.received(since)
+            page = mock.faults.received(since)
             assert page.lost == 0
             since = page.last
             joints.append(servo_targets(page.entries))
     arm.stop()
     until(arm.at_rest, "rest")
-    sent = np.concatenate([*joints, servo_targets(mock.door.received(since).entries)])
+    sent = np.concatenate([*joints, servo_targets(mock.faults.received(since).entries)])
     assert len(sent) > number / 100
     assert np.isfinite(sent).all()
     check_path(arm, sent)
     record = arm._link.states.latest()
     assert record is not None and record["rejected"] > 0 and record["shortened"] > 0
     assert not arm.status().is_fault
-    assert mock.door.state().program
+    assert mock.faults.state().program
 
 
 SLOPED = {"planes": (Plane(point=tuple(START - [0.0, 0.0, 0.05]), normal=(0.3, 0.0, 1.0)),)}
@@ -212,12 +212,12 @@ def test_a_target_out_of_reach_is_refused_and_the_program_lives(mock: MockUR) ->
             arm.command(moved(arm.state().pose, z=2.0))
         # Past the driver's look: the worker stops where the joints, their speed or a singularity say so.
         far = moved(arm.state().pose, z=2.0)
-        since = mock.door.received().last
+        since = mock.faults.received().last
         arm._link.commands.write(command(time.monotonic(), Kind.TARGET, np.array([*far.position, *far.quaternion])))
         until(lambda: arm.status() == ArmStatus.OUT_OF_REACH, "out of reach")
         time.sleep(0.5)
-        assert mock.door.state().program
-        sent = servo_targets(mock.door.received(since).entries)
+        assert mock.faults.state().program
+        sent = servo_targets(mock.faults.received(since).entries)
         assert np.abs(np.diff(sent, axis=0)).max() <= arm.config.limits.joint_speed * PERIOD * (1 + 1e-9)
         go(arm, moved(arm.state().pose, z=-0.02))
 

@@ -52,8 +52,8 @@ def test_a_killed_worker_is_told_and_replaced(mock: MockUR) -> None:
             arm.command(start)
         with pytest.raises(DeviceNotConnectedError):
             arm.state()
-        until(lambda: mock.door.state().rests and not mock.door.state().program, "the watchdog's stop")
-        assert "watchdog" in mock.door.state().stop_reason.lower()
+        until(lambda: mock.faults.state().rests and not mock.faults.state().program, "the watchdog's stop")
+        assert "watchdog" in mock.faults.state().stop_reason.lower()
         arm.recover()
         assert arm.status() == ArmStatus.HOLD
         go(arm, start)
@@ -110,16 +110,16 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(mock: MockUR,
     )
     assert policy.stdout is not None
     segment, worker = policy.stdout.readline().split()
-    before = mock.door.state()
+    before = mock.faults.state()
     assert not before.rests
     policy.send_signal(number)
     policy.communicate(timeout=PATIENCE)
-    until(lambda: mock.door.state().rests, "rest")
-    after = mock.door.state()
+    until(lambda: mock.faults.state().rests, "rest")
+    after = mock.faults.state()
     if number == signal.SIGKILL:  # an interrupted program ends as fast as the machine lets it
         assert np.linalg.norm(np.array(after.pose[:3]) - before.pose[:3]) < 0.05  # ten times 5 mm
-    until(lambda: not mock.door.state().program, "end of the program")
-    until(lambda: 30004 not in mock.door.state().clients, "closed sockets")
+    until(lambda: not mock.faults.state().program, "end of the program")
+    until(lambda: 30004 not in mock.faults.state().clients, "closed sockets")
     until(lambda: not (shared_ring.FOLDER / segment).exists(), "removed memory")
     until(lambda: not running(int(worker)), "end of the worker")
 
@@ -141,7 +141,7 @@ def test_a_second_driver_is_refused_and_the_first_goes_on(arm: URArm, mock: Mock
 
 
 def test_a_field_bus_that_holds_the_registers_is_busy_too(mock: MockUR) -> None:
-    mock.door.claim(["input_int_register_0"])
+    mock.faults.claim(["input_int_register_0"])
     with pytest.raises(DeviceBusyError):
         URArm(config(), "left").close()
 
@@ -166,9 +166,9 @@ def test_nothing_is_left_after_close(mock: MockUR) -> None:
     assert worker.returncode == 0  # it ended by itself
     assert leftovers("left") == []
     assert open_files() == before
-    until(lambda: mock.door.state().rests, "rest")
-    assert not mock.door.state().program
-    until(lambda: set(mock.door.state().clients) <= {30020}, "closed sockets")
+    until(lambda: mock.faults.state().rests, "rest")
+    assert not mock.faults.state().program
+    until(lambda: set(mock.faults.state().clients) <= {30020}, "closed sockets")
     assert arm.status() == ArmStatus.CLOSED
     for call in (arm.state, lambda: arm.command(None), arm.recover, arm.history, arm.zero_wrench, arm.timing):
         with pytest.raises(DeviceNotConnectedError, match="is closed"):
@@ -189,8 +189,8 @@ def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
     assert worker.returncode == -signal.SIGKILL  # reaped, no zombie
     assert leftovers("left") == []
     assert open_files() == before
-    until(lambda: not mock.door.state().program, "the watchdog's stop")
-    until(lambda: set(mock.door.state().clients) <= {30020}, "closed sockets")
+    until(lambda: not mock.faults.state().program, "the watchdog's stop")
+    until(lambda: set(mock.faults.state().clients) <= {30020}, "closed sockets")
 
 
 def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
@@ -207,7 +207,7 @@ def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
 
 def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle of connecting: no worker and no memory stay behind."""
-    mock.door.black_hole(True)
+    mock.faults.black_hole(True)
     workers: list[subprocess.Popen[bytes]] = []
     true_start = URArm._start
 
@@ -272,7 +272,7 @@ def test_both_arms_stop_when_one_does(pair: tuple[URArm, URArm, MockUR]) -> None
     left, right, other = pair
     a, b = left.state().pose, right.state().pose
     in_motion(left, moved(a, x=-0.1))
-    other.door.protective_stop()
+    other.faults.protective_stop()
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "the other arm's stop")
     until(lambda: right.status() == ArmStatus.PROTECTIVE_STOP, "protective stop")
     with pytest.raises(SafetyViolation, match="stopped because the other arm did"):

@@ -13,8 +13,8 @@ import robot.doctor.rig
 from robot.cli import app
 from robot.doctor.machine import Check
 from robot.doctor.rig import examine_rig
-from robot.mock import Door, MockCamera, MockUR
-from robot.mock.cell.cell import MockBench
+from robot.mock import FaultClient, MockCamera, MockUR
+from robot.mock.cell.cell import MockCell
 from robot.mock.fixtures import mock_host
 from tacsim.config import load_rig
 from tacsim.models.rig import RigConfig
@@ -52,37 +52,40 @@ def file(camera: MockCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def looked(
-    monkeypatch: pytest.MonkeyPatch, file: Path, *overrides: str, fault: Callable[[Door], object] = lambda door: None,
+    monkeypatch: pytest.MonkeyPatch,
+    file: Path,
+    *overrides: str,
+    fault: Callable[[FaultClient], object] = lambda faults: None,
     **started: object,
-) -> dict[str, Check]:  # fmt: skip
+) -> dict[str, Check]:
     """The checks by name, after `fault` was done to the controller; it was started with other facts if `started`."""
     commanded = []
 
-    class Faulty(MockBench):
+    class Faulty(MockCell):
         def __init__(self, config: RigConfig) -> None:
             arms = {name: arm.model_copy(update=started) for name, arm in config.arms.items()}
             super().__init__(config.model_copy(update={"arms": arms}))
-            for door in self.doors.values():
-                fault(door)
+            for faults in self.faults.values():
+                fault(faults)
 
         def close(self) -> None:
-            commanded.extend(entry for door in self.doors.values() for entry in door.received().entries)
+            commanded.extend(entry for faults in self.faults.values() for entry in faults.received().entries)
             super().close()
 
-    monkeypatch.setattr(robot.doctor.rig, "MockBench", Faulty)
+    monkeypatch.setattr(robot.doctor.rig, "MockCell", Faulty)
     checks = examine_rig(load_rig(file, overrides=overrides).config)
     assert commanded == []  # it only looks
     return {check.name: check for check in checks}
 
 
-def unpowered(door: Door) -> None:
+def unpowered(faults: FaultClient) -> None:
     """After an emergency stop that a person has released already."""
-    door.estop()
+    faults.estop()
     deadline = time.monotonic() + 10.0
-    while door.state().mode == "RUNNING":
+    while faults.state().mode == "RUNNING":
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    door.release()
+    faults.release()
 
 
 def bad(checks: dict[str, Check]) -> dict[str, str]:
@@ -102,17 +105,17 @@ def test_a_sound_rig_passes_every_check(monkeypatch: pytest.MonkeyPatch, file: P
 @pytest.mark.parametrize(
     ("fault", "check", "words"),
     [
-        (Door.protective_stop, "ready", "protective stop"),
-        (Door.estop, "ready", "emergency stop; a person must release it"),
-        (lambda door: door.remote_control(False), "ready", "switch it to remote control"),
+        (FaultClient.protective_stop, "ready", "protective stop"),
+        (FaultClient.estop, "ready", "emergency stop; a person must release it"),
+        (lambda faults: faults.remote_control(False), "ready", "switch it to remote control"),
         (unpowered, "ready", "power it on"),
-        (Door.dashboard_mute, "dashboard", "does not answer"),
-        (Door.refuse, "network", "no answer at 29999 (dashboard), 30003 (script), 30004 (RTDE)"),
-        (Door.black_hole, "dashboard", "does not answer"),
+        (FaultClient.dashboard_mute, "dashboard", "does not answer"),
+        (FaultClient.refuse, "network", "no answer at 29999 (dashboard), 30003 (script), 30004 (RTDE)"),
+        (FaultClient.black_hole, "dashboard", "does not answer"),
     ],
 )
 def test_what_is_wrong_with_a_controller_is_named(
-    monkeypatch: pytest.MonkeyPatch, file: Path, fault: Callable[[Door], object], check: str, words: str
+    monkeypatch: pytest.MonkeyPatch, file: Path, fault: Callable[[FaultClient], object], check: str, words: str
 ) -> None:
     found = looked(monkeypatch, file, fault=fault)
     one = found[f"left: {check}"]
@@ -121,7 +124,7 @@ def test_what_is_wrong_with_a_controller_is_named(
 
 
 def test_an_old_controller_is_a_warning(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
-    found = looked(monkeypatch, file, fault=lambda door: door.version(5, 4, 3, 1))
+    found = looked(monkeypatch, file, fault=lambda faults: faults.version(5, 4, 3, 1))
     assert found["left: PolyScope"].state == "warn" and "5.6" in found["left: PolyScope"].advice
 
 

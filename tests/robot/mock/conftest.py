@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from robot.mock import Door, MockUR
+from robot.mock import FaultClient, MockUR
 from robot.mock.wire_client import loopback_host
 
 
@@ -18,11 +18,11 @@ def running() -> Iterator[MockUR]:
 
 @pytest.fixture
 def mock(running: MockUR) -> Iterator[MockUR]:
-    running.door.reset()
+    running.faults.reset()
     yield running
     assert running.running, "the process of the mock has ended"
 
 
 @pytest.fixture
-def door(mock: MockUR) -> Door:
-    return mock.door
+def faults(mock: MockUR) -> FaultClient:
+    return mock.faults

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from robot.camera.camera import Camera
-from robot.mock import Door
+from robot.mock import FaultClient
 from robot.mock.wire_client import TIMEOUT, loopback_host
 from tacsim.models.hardware import CameraSensorConfig
 
@@ -25,9 +25,9 @@ def test_it_serves_until_ctrl_c() -> None:
         said = [process.stdout.readline() for _ in range(3)]
         assert all(host in line for host, line in zip(hosts, said, strict=False))
         for host in hosts:
-            door = Door(host)
-            assert door.state().mode == "RUNNING"
-            door.close()
+            faults = FaultClient(host)
+            assert faults.state().mode == "RUNNING"
+            faults.close()
         process.send_signal(signal.SIGINT)
         assert process.wait(TIMEOUT) == 128 + signal.SIGINT
 

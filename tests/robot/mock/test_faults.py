@@ -1,4 +1,4 @@
-"""Every fault of the door, seen from the wire."""
+"""Every fault, seen from the wire."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.mock import Door, DoorError, MockUR
+from robot.mock import FaultClient, FaultError, MockUR
 from robot.mock.ur.wire.controller import PORTS
 from robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, loopback_host
 
@@ -40,76 +40,79 @@ def moving(mock: MockUR, speed: float = 0.05) -> ControlClient:
     """A client whose arm goes down."""
     client = ControlClient(mock.host)
     client.call(10, [0, 0, -speed, 0, 0, 0, 0.5, 0])
-    until(lambda: mock.door.state().tcp_speed[2] < -0.99 * speed, "it moves")
+    until(lambda: mock.faults.state().tcp_speed[2] < -0.99 * speed, "it moves")
     return client
 
 
-def test_state_tells_what_the_wire_tells(mock: MockUR, door: Door) -> None:
+def test_state_tells_what_the_wire_tells(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock, "actual_q", "actual_TCP_pose") as client:
-        state, package = door.state(), client.receive()
+        state, package = faults.state(), client.receive()
         assert state.joints == pytest.approx(package["actual_q"], abs=1e-12)
         assert state.pose == pytest.approx(package["actual_TCP_pose"], abs=1e-12)
         assert state.clients == (30004,) and state.safety == "NORMAL" and state.mode == "RUNNING" and state.rests
-    begun = door.state()
-    until(lambda: door.state().tick >= begun.tick + 1000, "1000 ticks")
-    assert door.state().tick_rate > 0
+    begun = faults.state()
+    until(lambda: faults.state().tick >= begun.tick + 1000, "1000 ticks")
+    assert faults.state().tick_rate > 0
 
 
 @pytest.mark.parametrize(
     ("press", "safety", "bits"),
-    [(Door.protective_stop, "PROTECTIVE_STOP", 1 << 2 | 1 << 10), (Door.estop, "ROBOT_EMERGENCY_STOP", 0b10011 << 6)],
+    [
+        (FaultClient.protective_stop, "PROTECTIVE_STOP", 1 << 2 | 1 << 10),
+        (FaultClient.estop, "ROBOT_EMERGENCY_STOP", 0b10011 << 6),
+    ],
 )
-def test_stops(mock: MockUR, door: Door, press: Callable[[Door], None], safety: str, bits: int) -> None:
+def test_stops(mock: MockUR, faults: FaultClient, press: Callable[[FaultClient], None], safety: str, bits: int) -> None:
     with moving(mock) as client, streaming(mock, "safety_status_bits", "runtime_state") as watch:
-        press(door)
-        state = door.state()
+        press(faults)
+        state = faults.state()
         assert state.safety == safety and not state.program
-        until(lambda: door.state().rests, "it rests")
+        until(lambda: faults.state().rests, "it rests")
         package = watch.newest()
         while package["safety_status_bits"] != (bits,):
             package = watch.receive()
         assert package["runtime_state"] == (1,)
-        door.recover()
-        assert door.state().safety == "NORMAL" and not door.state().program
+        faults.recover()
+        assert faults.state().safety == "NORMAL" and not faults.state().program
         client.upload(control_script())
 
 
-def test_protective_stop_through_the_dashboard(mock: MockUR, door: Door) -> None:
-    door.unlock_delay(3600)
-    door.protective_stop()
+def test_protective_stop_through_the_dashboard(mock: MockUR, faults: FaultClient) -> None:
+    faults.unlock_delay(3600)
+    faults.protective_stop()
     assert "Cannot unlock" in dashboard(mock.host, "unlock protective stop")[0]
-    door.unlock_delay(0)
+    faults.unlock_delay(0)
     assert dashboard(mock.host, "unlock protective stop") == ["Protective stop releasing"]
-    assert door.state().safety == "NORMAL"
+    assert faults.state().safety == "NORMAL"
 
 
-def test_release_leaves_the_arm_without_power(mock: MockUR, door: Door) -> None:
-    door.estop()
-    until(lambda: door.state().mode == "POWER_OFF", "power off")
-    door.release()
-    assert (door.state().safety, door.state().mode) == ("NORMAL", "POWER_OFF")
+def test_release_leaves_the_arm_without_power(mock: MockUR, faults: FaultClient) -> None:
+    faults.estop()
+    until(lambda: faults.state().mode == "POWER_OFF", "power off")
+    faults.release()
+    assert (faults.state().safety, faults.state().mode) == ("NORMAL", "POWER_OFF")
 
 
-def test_safeguard_stop_and_on_again(mock: MockUR, door: Door) -> None:
+def test_safeguard_stop_and_on_again(mock: MockUR, faults: FaultClient) -> None:
     with moving(mock) as client:
-        door.safeguard_stop(True)
+        faults.safeguard_stop(True)
         client.wait(lambda state: state["runtime_state"][0] == 4)
-        door.safeguard_stop(False)
-        until(lambda: door.state().tcp_speed[2] < -0.049, "it moves again")
+        faults.safeguard_stop(False)
+        until(lambda: faults.state().tcp_speed[2] < -0.049, "it moves again")
 
 
-def test_power_cycle(mock: MockUR, door: Door) -> None:
+def test_power_cycle(mock: MockUR, faults: FaultClient) -> None:
     with moving(mock) as client:
-        door.power_cycle(0.2)
+        faults.power_cycle(0.2)
         with pytest.raises(OSError):
             client.wait(lambda state: False)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((mock.host, 30004), TIMEOUT)
     until(lambda: dashboard_answers(mock), "the dashboard is back")
-    state = door.state()
+    state = faults.state()
     assert state.mode == "POWER_OFF" and not state.program
     dashboard(mock.host, "brake release")
-    until(lambda: door.state().mode == "RUNNING", "running")
+    until(lambda: faults.state().mode == "RUNNING", "running")
 
 
 def dashboard_answers(mock: MockUR) -> bool:
@@ -119,57 +122,57 @@ def dashboard_answers(mock: MockUR) -> bool:
         return False
 
 
-def test_silence_stops_the_stream_only(mock: MockUR, door: Door) -> None:
+def test_silence_stops_the_stream_only(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         client.receive()
-        door.silence()
-        sent = door.state().packages_sent
+        faults.silence()
+        sent = faults.state().packages_sent
         assert dashboard(mock.host, "running") == ["Program running: false"]
         with streaming(mock):
             pass  # set-up is answered
-        assert door.state().packages_sent == sent
+        assert faults.state().packages_sent == sent
         client.socket.settimeout(0.1)
         with pytest.raises(TimeoutError):
             drain(client)
         client.socket.settimeout(TIMEOUT)
-        door.silence(False)
+        faults.silence(False)
         client.receive()
 
 
 @pytest.mark.parametrize("reset", [False, True])
-def test_cut(mock: MockUR, door: Door, reset: bool) -> None:
+def test_cut(mock: MockUR, faults: FaultClient, reset: bool) -> None:
     with streaming(mock) as client, socket.create_connection((mock.host, 29999), TIMEOUT) as other:
-        until(lambda: len(door.state().clients) == 2, "two clients")
-        assert door.cut([30004], reset=reset) == 1
+        until(lambda: len(faults.state().clients) == 2, "two clients")
+        assert faults.cut([30004], reset=reset) == 1
         with pytest.raises(ConnectionError):
             drain(client)
         assert other.recv(100).startswith(b"Connected")
-        assert door.cut() == 1
+        assert faults.cut() == 1
 
 
-def test_refuse(mock: MockUR, door: Door) -> None:
+def test_refuse(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
-        door.refuse()
+        faults.refuse()
         for port in PORTS:
             with pytest.raises(ConnectionRefusedError):
                 socket.create_connection((mock.host, port), TIMEOUT)
         client.receive()
-        door.refuse(False)
+        faults.refuse(False)
         with streaming(mock) as other:
             other.receive()
 
 
-def test_black_hole(mock: MockUR, door: Door) -> None:
+def test_black_hole(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         client.receive()
-        door.black_hole()
-        sent = door.state().packages_sent
+        faults.black_hole()
+        sent = faults.state().packages_sent
         with socket.create_connection((mock.host, 29999), TIMEOUT) as other:
             other.settimeout(0.1)
             with pytest.raises(TimeoutError):
                 other.recv(1)
-            assert door.state().packages_sent == sent
-            door.black_hole(False)
+            assert faults.state().packages_sent == sent
+            faults.black_hole(False)
             other.settimeout(TIMEOUT)
             assert other.recv(100).startswith(b"Connected")
         client.receive()
@@ -177,12 +180,12 @@ def test_black_hole(mock: MockUR, door: Door) -> None:
 
 def test_a_black_hole_ends_as_quietly_as_any_mock() -> None:
     with MockUR(loopback_host(8), ready_timeout=60) as mock:
-        mock.door.black_hole(True)
+        mock.faults.black_hole(True)
     assert mock._process.returncode == 0
 
 
-def test_delay_is_at_least_what_was_asked(mock: MockUR, door: Door) -> None:
-    door.delay(0.1)
+def test_delay_is_at_least_what_was_asked(mock: MockUR, faults: FaultClient) -> None:
+    faults.delay(0.1)
     begun = time.monotonic()
     assert dashboard(mock.host, "running") == ["Program running: false"]
     assert time.monotonic() - begun > 0.2  # the greeting, and the answer
@@ -191,23 +194,23 @@ def test_delay_is_at_least_what_was_asked(mock: MockUR, door: Door) -> None:
         np.testing.assert_allclose(steps, 0.002, atol=1e-9)
 
 
-def test_drop_is_seeded_and_drops_its_share(mock: MockUR, door: Door) -> None:
+def test_drop_is_seeded_and_drops_its_share(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
-        begun = door.state()
-        door.drop(0.5, seed=3)
+        begun = faults.state()
+        faults.drop(0.5, seed=3)
         times = np.array([client.receive()["timestamp"][0] for _ in range(1000)])
-        ended = door.state()
+        ended = faults.state()
     share = (ended.packages_dropped - begun.packages_dropped) / (
         ended.packages_sent + ended.packages_dropped - begun.packages_sent - begun.packages_dropped
     )
     assert 0.4 < share < 0.6
     assert np.diff(times).max() > 0.005
-    with pytest.raises(DoorError, match="probability"):
-        door.drop(1.5)
+    with pytest.raises(FaultError, match="probability"):
+        faults.drop(1.5)
 
 
-def test_partial_packages_are_still_whole(mock: MockUR, door: Door) -> None:
-    door.partial_packages()
+def test_partial_packages_are_still_whole(mock: MockUR, faults: FaultClient) -> None:
+    faults.partial_packages()
     with streaming(mock, "actual_q") as client:
         steps = np.diff([client.receive()["timestamp"][0] for _ in range(100)])
         assert client.ask(118)[:4] == b"\0\0\0\5"  # a reply does not come between the halves
@@ -215,9 +218,9 @@ def test_partial_packages_are_still_whole(mock: MockUR, door: Door) -> None:
     np.testing.assert_allclose(steps, 0.002, atol=1e-9)
 
 
-def test_nan_state(mock: MockUR, door: Door) -> None:
+def test_nan_state(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock, "actual_q", "target_q", "actual_tool_accelerometer") as client:
-        door.nan_state()
+        faults.nan_state()
         state = client.receive()
         while not math.isnan(state["actual_q"][0]):
             state = client.receive()
@@ -225,11 +228,11 @@ def test_nan_state(mock: MockUR, door: Door) -> None:
         assert math.isfinite(state["timestamp"][0])
 
 
-def test_clock_jump(mock: MockUR, door: Door) -> None:
+def test_clock_jump(mock: MockUR, faults: FaultClient) -> None:
     with streaming(mock) as client:
         for jump in (3.0, -5.0):
             before = client.receive()["timestamp"][0]
-            door.clock_jump(jump)
+            faults.clock_jump(jump)
             steps = [0.0]
             while abs(steps[-1]) < 1:
                 after = client.receive()["timestamp"][0]
@@ -238,91 +241,91 @@ def test_clock_jump(mock: MockUR, door: Door) -> None:
             assert steps[-1] == pytest.approx(jump + 0.002, abs=1e-9)
 
 
-def test_tick_overrun_is_counted_and_not_made_up_for(mock: MockUR, door: Door) -> None:
-    before = door.state()
-    door.tick_overrun(0.3)
-    after = door.state()
+def test_tick_overrun_is_counted_and_not_made_up_for(mock: MockUR, faults: FaultClient) -> None:
+    before = faults.state()
+    faults.tick_overrun(0.3)
+    after = faults.state()
     assert after.overruns - before.overruns > 100
     assert after.tick - before.tick < 100
 
 
-def test_remote_control_off(mock: MockUR, door: Door) -> None:
-    door.remote_control(False)
+def test_remote_control_off(mock: MockUR, faults: FaultClient) -> None:
+    faults.remote_control(False)
     assert dashboard(mock.host, "is in remote control") == ["false"]
     with socket.create_connection((mock.host, 30002), TIMEOUT) as line:
         line.sendall(control_script().encode())
-        until(lambda: any("not in remote control" in text for _, text in door.log()), "it says so")
-    assert not door.state().program
+        until(lambda: any("not in remote control" in text for _, text in faults.log()), "it says so")
+    assert not faults.state().program
 
 
-def test_dashboard_mute(mock: MockUR, door: Door) -> None:
-    door.dashboard_mute()
+def test_dashboard_mute(mock: MockUR, faults: FaultClient) -> None:
+    faults.dashboard_mute()
     with socket.create_connection((mock.host, 29999), 0.1) as line:
         line.sendall(b"running\n")
         with pytest.raises(TimeoutError):
             line.recv(1)
-        door.dashboard_mute(False)
+        faults.dashboard_mute(False)
         line.settimeout(TIMEOUT)
         line.sendall(b"running\n")
         assert line.recv(100) == b"Program running: false\n"
 
 
-def test_claim(mock: MockUR, door: Door) -> None:
-    door.claim(["input_int_register_0"])
+def test_claim(mock: MockUR, faults: FaultClient) -> None:
+    faults.claim(["input_int_register_0"])
     with RtdeClient(mock.host) as client:
         assert client.inputs("input_int_register_0") == (0, ["IN_USE"])
-        door.claim([])
+        faults.claim([])
         assert client.inputs("input_int_register_0") == (1, ["INT32"])
-    with pytest.raises(DoorError, match="no such inputs: nonsense"):
-        door.claim(["nonsense"])
+    with pytest.raises(FaultError, match="no such inputs: nonsense"):
+        faults.claim(["nonsense"])
 
 
-def test_version(mock: MockUR, door: Door) -> None:
-    door.version(3, 9, 1)
+def test_version(mock: MockUR, faults: FaultClient) -> None:
+    faults.version(3, 9, 1)
     assert dashboard(mock.host, "PolyscopeVersion")[0].startswith("URSoftware 3.9.1.0")
     with RtdeClient(mock.host) as client:
         assert client.outputs("timestamp", "payload") == (0, ["DOUBLE", "NOT_FOUND"])
 
 
-def test_wrench_wall_and_force_limit(mock: MockUR, door: Door) -> None:
-    door.wrench([1, 2, 3, 0.1, 0.2, 0.3])
+def test_wrench_wall_and_force_limit(mock: MockUR, faults: FaultClient) -> None:
+    faults.wrench([1, 2, 3, 0.1, 0.2, 0.3])
     with streaming(mock, "actual_TCP_force", "ft_raw_wrench") as client:
         state = client.receive()
         while state["actual_TCP_force"] != (1, 2, 3, 0.1, 0.2, 0.3):
             state = client.receive()
         assert np.linalg.norm(state["ft_raw_wrench"][:3]) == pytest.approx(math.sqrt(14))
-    door.wrench([0] * 6)
-    top = door.state().pose[2] - 0.01
-    door.wall(top, 1000.0)
-    door.force_limit(20.0)
+    faults.wrench([0] * 6)
+    top = faults.state().pose[2] - 0.01
+    faults.wall(top, 1000.0)
+    faults.force_limit(20.0)
     with moving(mock):
-        until(lambda: door.state().safety == "PROTECTIVE_STOP", "the wall stops it")
-        until(lambda: door.state().rests, "it rests")
-        state = door.state()
+        until(lambda: faults.state().safety == "PROTECTIVE_STOP", "the wall stops it")
+        until(lambda: faults.state().rests, "it rests")
+        state = faults.state()
         assert state.wrench[2] == pytest.approx(1000 * (top - state.pose[2]), abs=1e-6)
         assert 20 < state.wrench[2] < 25 and "limit 20 N" in state.stop_reason
-    door.no_wall()
-    until(lambda: door.state().wrench == (0,) * 6, "no force")
-    with pytest.raises(DoorError, match="6 finite"):
-        door.wrench([1, 2])
+    faults.no_wall()
+    until(lambda: faults.state().wrench == (0,) * 6, "no force")
+    with pytest.raises(FaultError, match="6 finite"):
+        faults.wrench([1, 2])
 
 
-def test_payload_mismatch(mock: MockUR, door: Door) -> None:
-    door.payload_mismatch(1.0, (0, 0, 0.1))
-    until(lambda: door.state().wrench[2] < 0, "it weighs")
-    assert door.state().wrench[2] == pytest.approx(-9.82)
+def test_payload_mismatch(mock: MockUR, faults: FaultClient) -> None:
+    faults.payload_mismatch(1.0, (0, 0, 0.1))
+    until(lambda: faults.state().wrench[2] < 0, "it weighs")
+    assert faults.state().wrench[2] == pytest.approx(-9.82)
 
 
-def test_reset_makes_it_as_new(mock: MockUR, door: Door) -> None:
-    begun = door.state()
+def test_reset_makes_it_as_new(mock: MockUR, faults: FaultClient) -> None:
+    begun = faults.state()
     with moving(mock) as client:
-        door.silence()
-        door.wall(1.0, 10.0)
-        door.refuse()
-        door.reset()
+        faults.silence()
+        faults.wall(1.0, 10.0)
+        faults.refuse()
+        faults.reset()
         with pytest.raises(OSError):
             client.wait(lambda state: False)
-    state = door.state()
+    state = faults.state()
     assert state.joints == begun.joints and state.wrench == (0,) * 6 and not state.program and state.clients == ()
     assert state.tick > begun.tick
     with streaming(mock) as other:
@@ -332,5 +335,5 @@ def test_reset_makes_it_as_new(mock: MockUR, door: Door) -> None:
 def test_calls_to_a_door_that_is_not_there() -> None:
     from robot.mock.wire_client import loopback_host
 
-    with pytest.raises(DoorError, match=r"127\.21\..*:30020, state: .*refused"):
-        Door(loopback_host(200)).state()
+    with pytest.raises(FaultError, match=r"127\.21\..*:30020, state: .*refused"):
+        FaultClient(loopback_host(200)).state()

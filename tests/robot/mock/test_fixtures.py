@@ -18,23 +18,26 @@ import numpy as np
 import pytest
 from robot.camera.camera import Camera
 from tacsim.config import load_rig
-from tacsim.models.hardware import CameraSensorFacts
+from tacsim.models.hardware import CameraSensorConfig
 
 
 def test_the_controller_is_there_and_can_be_broken(mock_ur):
-    assert mock_ur.door.state().mode == "RUNNING"
-    mock_ur.door.protective_stop()
-    assert mock_ur.door.state().safety == "PROTECTIVE_STOP"
+    assert mock_ur.faults.state().mode == "RUNNING"
+    mock_ur.faults.protective_stop()
+    assert mock_ur.faults.state().safety == "PROTECTIVE_STOP"
 
 
 def test_it_is_whole_again_in_the_next_test(mock_ur):
-    assert mock_ur.door.state().safety == "NORMAL"
+    assert mock_ur.faults.state().safety == "NORMAL"
+    assert mock_ur.door is mock_ur.faults  # its name of before, in tests of users
 
 
 def test_the_camera_shows_what_is_pushed(mock_camera):
     mock_camera.push(np.full((240, 320, 3), 77, np.uint8))
-    facts = CameraSensorFacts(driver="camera", source=mock_camera.url, width=320, height=240, stamped=True, max_age=10)
-    with Camera(facts, "finger") as camera:
+    config = CameraSensorConfig(
+        driver="camera", source=mock_camera.url, width=320, height=240, stamped=True, max_age=10
+    )
+    with Camera(config, "finger") as camera:
         assert abs(int(camera.wait_for(1, 10.0).image.mean()) - 77) < 3
 
 

@@ -1,12 +1,12 @@
-"""The bench in closed form: Hertz's numbers, and pictures that show them."""
+"""The cell in closed form: Hertz's numbers, and pictures that show them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from robot.mock.cell.hertz import GAP, RADIUS, HertzBench, dent
-from robot.mock.cell.sim_server import Twin, TwinError
+from robot.mock.cell.hertz import GAP, RADIUS, HertzCell, dent
+from robot.mock.cell.sim_server import SimServer, SimServerError
 from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import Pose
@@ -17,10 +17,10 @@ START: dict[str, Pose] = {}  # of the sensors
 
 
 @pytest.fixture(scope="module")
-def bench() -> HertzBench:
+def cell() -> HertzCell:
     scene = load_rig("mock").config.scene
     assert scene is not None
-    made = HertzBench(scene, {"lower": SensorModel(), "upper": SensorModel()}, CanonicalGrid())
+    made = HertzCell(scene, {"lower": SensorModel(), "upper": SensorModel()}, CanonicalGrid())
     START.update(made.poses())
     return made
 
@@ -31,15 +31,15 @@ def pressed(depth: float, x: float = 0.0) -> dict[str, Pose]:
     return {name: se3.compose(pose, ahead) for name, pose in START.items()}
 
 
-def test_force_is_that_of_hertz_and_pushes_the_sensor_back(bench: HertzBench) -> None:
-    material = bench._gel.material
+def test_force_is_that_of_hertz_and_pushes_the_sensor_back(cell: HertzCell) -> None:
+    material = cell._gel.material
     modulus = material.youngs_modulus / (1 - material.poisson_ratio**2)
-    bench.move(pressed(0.4e-3, x=1e-3))
-    for wrench in map(bench.wrench, ("lower", "upper")):
+    cell.move(pressed(0.4e-3, x=1e-3))
+    for wrench in map(cell.wrench, ("lower", "upper")):
         assert wrench[2] == pytest.approx(-4 / 3 * modulus * np.sqrt(RADIUS) * 0.4e-3**1.5, rel=1e-6)
         assert wrench[3:] == pytest.approx(np.cross([1e-3, 0, 0], wrench[:3]), abs=1e-9)
-    bench.move(pressed(-0.1e-3))
-    assert not bench.wrench("upper").any()
+    cell.move(pressed(-0.1e-3))
+    assert not cell.wrench("upper").any()
 
 
 def test_the_dent_is_that_of_hertz() -> None:
@@ -56,11 +56,11 @@ def test_the_dent_is_that_of_hertz() -> None:
     assert surface.height[far] == pytest.approx(point[far], rel=0.03)
 
 
-def test_pictures_change_where_the_ball_touches_and_only_there(bench: HertzBench) -> None:
+def test_pictures_change_where_the_ball_touches_and_only_there(cell: HertzCell) -> None:
 
     def picture(depth: float, x: float) -> np.ndarray:
-        bench.move(pressed(depth, x))
-        return bench.look("lower")[0].astype(int)
+        cell.move(pressed(depth, x))
+        return cell.look("lower")[0].astype(int)
 
     calm = picture(-0.2e-3, 0.0)
     assert np.array_equal(calm, picture(-0.3e-3, 1e-3))
@@ -71,31 +71,31 @@ def test_pictures_change_where_the_ball_touches_and_only_there(bench: HertzBench
     assert middle > len(columns) / 2 + 10
 
 
-def test_a_ball_does_not_go_through_the_gel(bench: HertzBench) -> None:
+def test_a_ball_does_not_go_through_the_gel(cell: HertzCell) -> None:
     with pytest.raises(ValueError, match=r"sensor 'lower' is pressed 4\.00 mm into a ball, its gel is 4 mm thick"):
-        bench.move(pressed(4e-3))
+        cell.move(pressed(4e-3))
 
 
 def test_its_process_says_what_is_wrong() -> None:
     scene = load_rig("mock").config.scene
     assert scene is not None
-    with pytest.raises(TwinError, match="has no sensor 'left'; it has lower, upper"):
-        Twin(scene, {"left": SensorModel()}, CanonicalGrid(), "hertz")
-    with Twin(scene, {"upper": SensorModel()}, CanonicalGrid(), "hertz") as twin:
+    with pytest.raises(SimServerError, match="has no sensor 'left'; it has lower, upper"):
+        SimServer(scene, {"left": SensorModel()}, CanonicalGrid(), "hertz")
+    with SimServer(scene, {"upper": SensorModel()}, CanonicalGrid(), "hertz") as sim_server:
         ahead = Pose(np.array([0.0, 0.0, GAP + 0.3e-3]))
-        scenery = twin.move({"upper": se3.compose(twin.initial["upper"], ahead)})
-        assert scenery.wrenches["upper"][2] < 0.0
-        assert scenery.surfaces["upper"].height.max() == pytest.approx(0.3e-3, rel=0.05)
-        assert scenery.truth is None
+        scene_frame = sim_server.move({"upper": se3.compose(sim_server.initial["upper"], ahead)})
+        assert scene_frame.wrenches["upper"][2] < 0.0
+        assert scene_frame.surfaces["upper"].height.max() == pytest.approx(0.3e-3, rel=0.05)
+        assert scene_frame.truth is None
 
 
-def test_a_camera_with_noise_shows_another_picture_each_time_and_the_same_surface(bench: HertzBench) -> None:
+def test_a_camera_with_noise_shows_another_picture_each_time_and_the_same_surface(cell: HertzCell) -> None:
     scene = load_rig("mock").config.scene
     assert scene is not None
     noisy = SensorModel(noise=CameraNoise(deviation=(2, 2, 2)))
-    made = HertzBench(scene, {"lower": SensorModel(), "upper": noisy}, CanonicalGrid())
-    bench.place(made.poses())
-    plain = bench.look("upper")[0].astype(float)
+    made = HertzCell(scene, {"lower": SensorModel(), "upper": noisy}, CanonicalGrid())
+    cell.place(made.poses())
+    plain = cell.look("upper")[0].astype(float)
     first, second = made.look("upper"), made.look("upper")
     assert (first[0] - plain).std() == pytest.approx(2.0, rel=0.05)
     assert np.corrcoef((first[0] - plain).ravel(), (second[0] - plain).ravel())[0, 1] < 0.1

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import pytest
 
-from robot.mock import DoorError, MockArms, MockError, MockUR
+from robot.mock import FaultError, MockArms, MockError, MockUR
 from robot.mock.wire_client import TIMEOUT, ControlClient, loopback_host
 
 
@@ -33,31 +33,31 @@ def alive(pid: int) -> bool:
 
 def test_close_leaves_nothing_and_may_be_repeated() -> None:
     mock = MockUR(loopback_host(10), ready_timeout=60)
-    assert mock.running and mock.door.state().tick >= 0
+    assert mock.running and mock.faults.state().tick >= 0
     mock.close()
     mock.close()
     assert not alive(mock.pid) and not mock.running
-    with pytest.raises(DoorError):
-        mock.door.state()
+    with pytest.raises(FaultError):
+        mock.faults.state()
     with MockUR(loopback_host(10), ready_timeout=60):
         pass  # the ports are free again at once
 
 
 def test_options_arrive() -> None:
     joints = [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
-    with MockUR(loopback_host(11), model="ur3e", joints=joints, door_port=30555, ready_timeout=60) as mock:
-        assert mock.door.port == 30555
-        assert mock.door.state().joints == pytest.approx(joints)
+    with MockUR(loopback_host(11), model="ur3e", joints=joints, fault_port=30555, ready_timeout=60) as mock:
+        assert mock.faults.port == 30555
+        assert mock.faults.state().joints == pytest.approx(joints)
 
 
 def test_two_arms_in_one_process_do_not_touch() -> None:
     hosts = [loopback_host(12), loopback_host(13)]
     with MockArms(hosts, ready_timeout=60) as arms, ControlClient(hosts[0]) as client:
         client.call(9, [0, 0, 0, 0, 0, 0.5, 2.0, 0])
-        until(lambda: arms.doors[0].state().joint_speeds[5] > 0.4, "the first moves")
-        arms.doors[1].protective_stop()
-        assert arms.doors[0].state().safety == "NORMAL" and arms.doors[0].state().program
-        assert arms.doors[1].state().rests and arms.doors[1].state().safety == "PROTECTIVE_STOP"
+        until(lambda: arms.fault_clients[0].state().joint_speeds[5] > 0.4, "the first moves")
+        arms.fault_clients[1].protective_stop()
+        assert arms.fault_clients[0].state().safety == "NORMAL" and arms.fault_clients[0].state().program
+        assert arms.fault_clients[1].state().rests and arms.fault_clients[1].state().safety == "PROTECTIVE_STOP"
 
 
 def test_a_port_in_use_is_named() -> None:
@@ -65,7 +65,7 @@ def test_a_port_in_use_is_named() -> None:
     with MockUR(host, ready_timeout=60) as first:
         with pytest.raises(MockError, match=rf"cannot listen on {host}:\d+: .*in use"):
             MockUR(host, ready_timeout=60)
-        assert first.door.state().safety == "NORMAL"
+        assert first.faults.state().safety == "NORMAL"
 
 
 @pytest.mark.parametrize(
@@ -108,22 +108,22 @@ def test_it_dies_with_its_parent(end: signal.Signals) -> None:
 
 def test_a_stopped_process_is_ended_too() -> None:
     with MockUR(loopback_host(17), ready_timeout=60) as mock:
-        mock.door.timeout = 0.2
+        mock.faults.timeout = 0.2
         os.kill(mock.pid, signal.SIGSTOP)
-        with pytest.raises(DoorError, match="no answer in time"):
-            mock.door.state()
+        with pytest.raises(FaultError, match="no answer in time"):
+            mock.faults.state()
     assert not alive(mock.pid)
 
 
 def test_it_goes_on_after_a_pause_of_its_process() -> None:
     with MockUR(loopback_host(18), ready_timeout=60) as mock:
-        before = mock.door.state()
+        before = mock.faults.state()
         os.kill(mock.pid, signal.SIGSTOP)
         time.sleep(0.3)
         os.kill(mock.pid, signal.SIGCONT)
-        until(lambda: mock.door.state().overruns > before.overruns + 50, "it counts what it missed")
-        after = mock.door.state()
-        until(lambda: mock.door.state().tick > after.tick + 100, "it ticks")
+        until(lambda: mock.faults.state().overruns > before.overruns + 50, "it counts what it missed")
+        after = mock.faults.state()
+        until(lambda: mock.faults.state().tick > after.tick + 100, "it ticks")
 
 
 def test_without_a_parent_it_runs_until_it_is_told() -> None:
@@ -151,13 +151,13 @@ def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
             assert client.stdout is not None
             with client, client.stdout:
                 assert client.stdout.readline() == "moves\n"
-                until(lambda: mock.door.state().tcp_speed[2] < -0.0099, "it moves")
+                until(lambda: mock.faults.state().tcp_speed[2] < -0.0099, "it moves")
                 client.kill()
             if watchdog:
-                until(lambda: mock.door.state().rests, "it rests")
-                assert "watchdog" in mock.door.state().stop_reason
+                until(lambda: mock.faults.state().rests, "it rests")
+                assert "watchdog" in mock.faults.state().stop_reason
             else:
-                end = mock.door.state().tick + 500
-                until(lambda end=end: mock.door.state().tick > end, "a second has passed")
-                assert mock.door.state().tcp_speed[2] < -0.0099
-                mock.door.reset()
+                end = mock.faults.state().tick + 500
+                until(lambda end=end: mock.faults.state().tick > end, "a second has passed")
+                assert mock.faults.state().tcp_speed[2] < -0.0099
+                mock.faults.reset()

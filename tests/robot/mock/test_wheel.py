@@ -50,7 +50,7 @@ def client(mock: MockUR, code: str) -> dict[str, Any]:
 
 
 def test_receive_reads_every_field_of_its_default_recipe(mock: MockUR) -> None:
-    mock.door.wrench([1, 2, 3, 0.1, 0.2, 0.3])
+    mock.faults.wrench([1, 2, 3, 0.1, 0.2, 0.3])
     found = client(
         mock,
         """
@@ -163,7 +163,7 @@ def test_control_servo_speed_force_jog_and_paths(mock: MockUR) -> None:
 
 
 def test_jacobian_of_a_newer_controller(mock: MockUR) -> None:
-    mock.door.version(5, 25, 1)
+    mock.faults.version(5, 25, 1)
     found = client(mock, "c = RTDEControlInterface(host); found['jacobian'] = c.getJacobian()")
     np.testing.assert_allclose(np.reshape(found["jacobian"], (6, 6)).T, Kinematics().jacobian(HOME), atol=1e-12)
 
@@ -196,9 +196,9 @@ def test_io_and_dashboard(mock: MockUR) -> None:
 def test_protective_stop_in_motion_and_back(mock: MockUR) -> None:
     def press() -> None:
         end = time.monotonic() + 60
-        while time.monotonic() < end and mock.door.state().tcp_speed[2] > -0.019:
+        while time.monotonic() < end and mock.faults.state().tcp_speed[2] > -0.019:
             time.sleep(0.01)
-        mock.door.protective_stop()
+        mock.faults.protective_stop()
 
     presser = threading.Thread(target=press)
     presser.start()
@@ -229,12 +229,12 @@ def test_refusals_that_the_wheel_turns_into_errors(mock: MockUR) -> None:
         except RuntimeError as error:
             found["error"] = str(error)
         """
-    mock.door.remote_control(False)
+    mock.faults.remote_control(False)
     assert "remote control" in client(mock, refused)["error"]
-    mock.door.remote_control(True)
-    mock.door.claim(["input_int_register_0"])
+    mock.faults.remote_control(True)
+    mock.faults.claim(["input_int_register_0"])
     assert "already in use" in client(mock, refused)["error"]
-    mock.door.claim([])
+    mock.faults.claim([])
     found = client(
         mock, "c = RTDEControlInterface(host)\n" + textwrap.dedent(refused) + "\nfound['first'] = c.isSteady()"
     )
@@ -242,7 +242,7 @@ def test_refusals_that_the_wheel_turns_into_errors(mock: MockUR) -> None:
 
 
 def test_command_without_a_model_is_refused_not_pretended(mock: MockUR) -> None:
-    mock.door.version(5, 25, 1)
+    mock.faults.version(5, 25, 1)
     client(
         mock,
         """
@@ -253,4 +253,4 @@ def test_command_without_a_model_is_refused_not_pretended(mock: MockUR) -> None:
             pass
         """,
     )
-    assert "get_mass_matrix is not modelled" in mock.door.state().stop_reason
+    assert "get_mass_matrix is not modelled" in mock.faults.state().stop_reason

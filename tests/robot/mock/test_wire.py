@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from robot.common.kinematics import Kinematics, matrix
-from robot.mock import MOCK_SERIAL, Door, MockUR
+from robot.mock import MOCK_SERIAL, FaultClient, MockUR
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
 from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
@@ -77,7 +77,7 @@ def test_output_recipe_types_and_unknown_names(mock: MockUR) -> None:
 
 
 def test_every_field_is_packed_and_finite(mock: MockUR) -> None:
-    mock.door.version(5, 25)
+    mock.faults.version(5, 25)
     with RtdeClient(mock.host) as client:
         state = streaming(client, *OUTPUTS).receive()
     assert set(state) == set(OUTPUTS)
@@ -90,15 +90,15 @@ def test_every_field_is_packed_and_finite(mock: MockUR) -> None:
 def test_no_data_before_start_and_none_after_pause(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         client.outputs("timestamp")
-        sent = mock.door.state().packages_sent
+        sent = mock.faults.state().packages_sent
         time.sleep(0.05)
-        assert mock.door.state().packages_sent == sent
+        assert mock.faults.state().packages_sent == sent
         assert client.start()
         client.receive()
         assert client.pause()
-        sent = mock.door.state().packages_sent
+        sent = mock.faults.state().packages_sent
         time.sleep(0.05)
-        assert mock.door.state().packages_sent == sent
+        assert mock.faults.state().packages_sent == sent
 
 
 def test_the_stream_is_in_order_without_gaps_and_at_its_frequency(mock: MockUR) -> None:
@@ -124,36 +124,36 @@ def test_inputs_have_one_owner_until_it_goes(mock: MockUR) -> None:
         assert second.inputs("input_int_register_1", "input_int_register_0") == (0, ["INT32", "IN_USE"])
         assert second.inputs("input_int_register_1") == (1, ["INT32"])
         first.socket.close()
-        until(lambda: mock.door.state().clients.count(30004) == 1, "the first client is gone")
+        until(lambda: mock.faults.state().clients.count(30004) == 1, "the first client is gone")
         assert second.inputs("input_int_register_0")[0] == 2
 
 
 def test_inputs_are_kept_and_told_through_the_door(mock: MockUR) -> None:
-    since = mock.door.received().last
+    since = mock.faults.received().last
     with RtdeClient(mock.host) as client:
         client.inputs("input_int_register_5", "input_double_register_7")
-        for value in range(1200):  # more than a page of the door
+        for value in range(1200):  # more than a page of the fault server
             client.send(1, value, value / 8)
-        until(lambda: mock.door.state().packages_received == since + 1200, "1200 packages")
-        found = mock.door.received(since)
+        until(lambda: mock.faults.state().packages_received == since + 1200, "1200 packages")
+        found = mock.faults.received(since)
     assert found.lost == 0 and found.last == since + 1200
     assert [entry.values["input_int_register_5"] for entry in found.entries] == list(range(1200))
     assert found.entries[8].values["input_double_register_7"] == 1.0
     assert all(a.tick <= b.tick for a, b in zip(found.entries, found.entries[1:], strict=False))
-    assert mock.door.received(found.last).entries == ()
+    assert mock.faults.received(found.last).entries == ()
 
 
 def test_packages_of_wrong_size_or_recipe_are_ignored(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         client.inputs("input_int_register_5")
-        since = mock.door.received().last
+        since = mock.faults.received().last
         for payload in (b"\1\0\0", b"\7" + bytes(4), b"", b"\1\0\0\0\2too long"):
             client.socket.sendall(package(85, payload))
         client.send(1, 3)
-        until(lambda: mock.door.state().packages_received == since + 2, "the good ones")
-        entries = mock.door.received(since).entries
+        until(lambda: mock.faults.state().packages_received == since + 2, "the good ones")
+        entries = mock.faults.received(since).entries
     assert [entry.values for entry in entries] == [{"input_int_register_5": 2}, {"input_int_register_5": 3}]
-    texts = [text for _, text in mock.door.log()]
+    texts = [text for _, text in mock.faults.log()]
     assert len([text for text in texts if "ignored" in text]) == 3 and any("cut: 12 bytes" in text for text in texts)
 
 
@@ -213,9 +213,9 @@ def test_a_program_in_small_pieces_and_two_in_one(mock: MockUR) -> None:
         for start in range(0, len(text), 100):
             line.sendall(text[start : start + 100])
             time.sleep(0.001)
-        until(lambda: mock.door.state().program, "the program runs")
+        until(lambda: mock.faults.state().program, "the program runs")
         line.sendall(text + text)
-        until(lambda: len([t for _, t in mock.door.log() if "started" in t]) == 3, "two more started")
+        until(lambda: len([t for _, t in mock.faults.log() if "started" in t]) == 3, "two more started")
 
 
 def test_dashboard(mock: MockUR) -> None:
@@ -237,9 +237,9 @@ def test_dashboard(mock: MockUR) -> None:
 def test_dashboard_power(mock: MockUR) -> None:
     assert dashboard(mock.host, "power off", "robotmode") == ["Powering off", "Robotmode: POWER_OFF"]
     dashboard(mock.host, "power on")
-    until(lambda: mock.door.state().mode == "IDLE", "idle")
+    until(lambda: mock.faults.state().mode == "IDLE", "idle")
     dashboard(mock.host, "brake release")
-    until(lambda: mock.door.state().mode == "RUNNING", "running")
+    until(lambda: mock.faults.state().mode == "RUNNING", "running")
 
 
 def test_dashboard_pauses_and_plays(mock: MockUR) -> None:
@@ -263,7 +263,7 @@ def test_garbage_on_every_port(mock: MockUR, port: int) -> None:
     for size in (1, 2, 3, 100, 5000, 200_000):
         with contextlib.suppress(OSError), socket.create_connection((mock.host, port), TIMEOUT) as line:
             line.sendall(generator.randbytes(size))  # it may cut the line
-    assert answers(mock) and mock.door.state().safety == "NORMAL"
+    assert answers(mock) and mock.faults.state().safety == "NORMAL"
 
 
 def test_truncated_package_then_silence_and_oversize_package(mock: MockUR) -> None:
@@ -272,7 +272,7 @@ def test_truncated_package_then_silence_and_oversize_package(mock: MockUR) -> No
         big.socket.sendall(struct.pack(">HB", 65535, 90) + bytes(65532))
         assert struct.unpack(">4I", big.ask(118))[0] == 5
         assert answers(mock)
-        assert mock.door.state().clients.count(30004) == 2
+        assert mock.faults.state().clients.count(30004) == 2
 
 
 def test_a_package_shorter_than_its_header_cuts_the_line(mock: MockUR) -> None:
@@ -299,7 +299,7 @@ def test_slow_reader_loses_whole_packages_only(mock: MockUR) -> None:
         slow.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         streaming(slow, *OUTPUTS_WIDE)
         streaming(quick, "timestamp")
-        until(lambda: mock.door.state().packages_dropped > 100, "packages are dropped")
+        until(lambda: mock.faults.state().packages_dropped > 100, "packages are dropped")
         times = [slow.receive()["timestamp"][0] for _ in range(2)]
         while times[-1] - times[-2] < 0.1:  # what waited is whole and in order; then some are missing
             times.append(slow.receive()["timestamp"][0])
@@ -316,15 +316,15 @@ OUTPUTS_WIDE = ("timestamp", *(f"output_double_register_{i}" for i in range(48))
 def test_a_hundred_connections_and_too_many(mock: MockUR) -> None:
     lines = [socket.create_connection((mock.host, PORTS[i % len(PORTS)]), TIMEOUT) for i in range(100)]
     try:
-        until(lambda: len(mock.door.state().clients) == 100, "100 clients")
+        until(lambda: len(mock.faults.state().clients) == 100, "100 clients")
         assert answers(mock)
         lines += [socket.create_connection((mock.host, PORTS[0]), TIMEOUT) for _ in range(MAX_CLIENTS - 90)]
-        until(lambda: any("are connected already" in text for _, text in mock.door.log()), "some are turned away")
-        assert len(mock.door.state().clients) <= MAX_CLIENTS
+        until(lambda: any("are connected already" in text for _, text in mock.faults.log()), "some are turned away")
+        assert len(mock.faults.state().clients) <= MAX_CLIENTS
     finally:
         for line in lines:
             line.close()
-    until(lambda: not mock.door.state().clients, "all gone")
+    until(lambda: not mock.faults.state().clients, "all gone")
     assert answers(mock)
 
 
@@ -333,17 +333,17 @@ def test_half_open_lines(mock: MockUR) -> None:
     with RtdeClient(mock.host) as client:
         streaming(client, "timestamp").receive()
         client.socket.shutdown(socket.SHUT_WR)
-        until(lambda: not mock.door.state().clients, "gone")
+        until(lambda: not mock.faults.state().clients, "gone")
     with RtdeClient(mock.host) as client:
         streaming(client, "timestamp").receive()
         client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    until(lambda: not mock.door.state().clients, "gone")
+    until(lambda: not mock.faults.state().clients, "gone")
 
 
-def test_door_refuses_nonsense(door: Door, mock: MockUR) -> None:
+def test_door_refuses_nonsense(faults: FaultClient, mock: MockUR) -> None:
     with socket.create_connection((mock.host, 30020), TIMEOUT) as line, line.makefile("rw") as file:
         for request in ("nonsense", "[]", "{}", '{"do": "fly"}', '{"do": "drop"}', '{"do": "wall", "z": 0, "k": 1}'):
             file.write(request + "\n")
             file.flush()
             assert '"ok": false' in file.readline()
-    assert door.state().safety == "NORMAL"
+    assert faults.state().safety == "NORMAL"

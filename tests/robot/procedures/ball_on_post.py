@@ -7,7 +7,7 @@ import threading
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robot.mock import Door, MockCamera
+from robot.mock import FaultClient, MockCamera
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
@@ -58,10 +58,10 @@ class BallOnPost:
         return self._render(GelSurface(values, SPACING, (-GEL[0] / 2, -GEL[1] / 2)))
 
     def _draw(self) -> None:
-        door, last = Door(self._host), None
+        faults, last = FaultClient(self._host), None
         while not self._over.is_set():
             try:
-                pose = door.state().pose
+                pose = faults.state().pose
             except RuntimeError:  # the controller comes and goes with the rig
                 self._over.wait(0.02)
                 continue
@@ -74,7 +74,7 @@ class BallOnPost:
                 self._camera.push(self.picture(x, y, depth))
                 last = seen
             self._over.wait(2e-3)
-        door.close()
+        faults.close()
 
     def __enter__(self) -> BallOnPost:
         self._thread.start()

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from calibration.poses.records import sight_file, write_record
 from robot.cli import app
-from robot.mock import Door, MockCamera
+from robot.mock import FaultClient, MockCamera
 from robot.mock.fixtures import mock_host
 from robot.procedures.board_poses import CannotSee, SightPlan, record_sights, schedule
 from tacsim import pose as se3
@@ -99,11 +99,11 @@ class Eye:
         self._thread = threading.Thread(target=self._draw)
 
     def _draw(self) -> None:
-        door, shown = Door(self._host), None
+        faults, shown = FaultClient(self._host), None
         self._camera.stall(True)  # nothing is seen before the arm is there
         while not self._over.is_set():
             try:
-                state = door.state()
+                state = faults.state()
             except RuntimeError:  # the controller comes and goes with the rig
                 self._over.wait(0.02)
                 continue
@@ -117,7 +117,7 @@ class Eye:
                 self._camera.stall(False)
                 shown = flange
             self._over.wait(4e-3)
-        door.close()
+        faults.close()
 
     def __enter__(self) -> Eye:
         self._thread.start()

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from calibration.poses.latency import Latency
 from robot.cli import app
-from robot.mock import Door, MockCamera
+from robot.mock import FaultClient, MockCamera
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.procedures.taps import AWAY, PAUSE, STAY, CannotTap, TapPlan, entries, schedule, untimed
 from tacsim.config import load_rig
@@ -116,7 +116,7 @@ class Hand:
     """Draws what a camera in the gel would see: the deeper the arm, the brighter the picture."""
 
     def __init__(self, host: str, camera: MockCamera) -> None:
-        self._door, self._camera, self._over = Door(host), camera, threading.Event()
+        self._door, self._camera, self._over = FaultClient(host), camera, threading.Event()
         self._thread = threading.Thread(target=self._draw)
 
     def _draw(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.errors import DeviceError, ProtectiveStop
-from robot.mock.cell.cell import MockBench
+from robot.mock.cell.cell import MockCell
 from robot.rig import clock as clocks
 from robot.rig.clock import Driven, LockStep, WallClock, drive
 from tacsim.interface import Pose
@@ -162,17 +162,17 @@ def test_a_look_waits_for_the_simulator_first() -> None:
 
 
 def test_catching_up_needs_a_look_that_began_afterwards_and_tells_of_a_failure() -> None:
-    bench = object.__new__(MockBench)
-    bench._looks, bench._failure = 5, None
+    cell = object.__new__(MockCell)
+    cell._looks, cell._failure = 5, None
 
     def look() -> None:
-        bench._looks += 1
+        cell._looks += 1
 
     timers = [threading.Timer(0.05 * k, look) for k in (1, 2)]
     for timer in timers:
         timer.start()
-    bench.catch_up()
-    assert bench._looks == 7
-    bench._failure = RuntimeError("no more")
+    cell.catch_up()
+    assert cell._looks == 7
+    cell._failure = RuntimeError("no more")
     with pytest.raises(DeviceError, match="no more"):
-        bench.catch_up()
+        cell.catch_up()

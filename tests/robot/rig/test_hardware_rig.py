@@ -29,7 +29,7 @@ from robot.camera.camera import StaleFrame
 from robot.deploy.control_loop import EpisodeFailed, run_episode
 from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, LinkLost, ProtectiveStop, SafetyViolation
 from robot.mock.camera.camera import MockCamera
-from robot.mock.cell.cell import MockBench
+from robot.mock.cell.cell import MockCell
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.open import open_rig
 from robot.rig.hardware_rig import RigArm
@@ -86,21 +86,21 @@ GREY = np.full((60, 80, 3), 120, np.uint8)
 
 
 class Opened:
-    """A rig, the bench behind it, and the cameras that stand beside the bench."""
+    """A rig, the cell behind it, and the cameras that stand beside the cell."""
 
-    def __init__(self, rig: Rig, bench: MockBench, cameras: dict[str, MockCamera]) -> None:
-        self.rig, self.bench, self.cameras = rig, bench, cameras
+    def __init__(self, rig: Rig, cell: MockCell, cameras: dict[str, MockCamera]) -> None:
+        self.rig, self.cell, self.cameras = rig, cell, cameras
 
     def received(self, since: dict[str, int] | None = None) -> dict[str, list[int]]:
         """Numbers of the commands that reached each controller."""
-        since = dict.fromkeys(self.bench.doors, 0) if since is None else since
+        since = dict.fromkeys(self.cell.faults, 0) if since is None else since
         return {
-            name: [int(each.values.get("input_int_register_0", 0)) for each in door.received(since[name]).entries]  # type: ignore[arg-type]
-            for name, door in self.bench.doors.items()
+            name: [int(each.values.get("input_int_register_0", 0)) for each in faults.received(since[name]).entries]  # type: ignore[arg-type]
+            for name, faults in self.cell.faults.items()
         }
 
     def now(self) -> dict[str, int]:
-        return {name: door.received().last for name, door in self.bench.doors.items()}
+        return {name: faults.received().last for name, faults in self.cell.faults.items()}
 
 
 @contextlib.contextmanager
@@ -125,19 +125,19 @@ def opened(rig: Path | str, *overrides: str, dry_run: bool = False, link_timeout
     config = config.model_copy(
         update={"arms": {name: arm.model_copy(update=slow) for name, arm in config.arms.items()}}
     )
-    benches: list[MockBench] = []
+    cells: list[MockCell] = []
 
-    class Kept(MockBench):
+    class Kept(MockCell):
         def __init__(self, config: RigConfig) -> None:
             super().__init__(config)
-            benches.append(self)
+            cells.append(self)
 
     with cameras_of(config) as cameras:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(robot.rig.hardware_rig, "MockBench", Kept)
+            patch.setattr(robot.rig.hardware_rig, "MockCell", Kept)
             made = open_rig(config, dry_run=dry_run)
         with made:
-            yield Opened(made, benches[0], cameras)
+            yield Opened(made, cells[0], cameras)
 
 
 def bare_file(folder: Path, first: int = 41) -> Path:
@@ -293,8 +293,8 @@ def test_a_stop_ends_the_episode_keeps_it_and_waits_for_recover(
     shared: Opened, stop: str, error: type[DeviceError], words: str
 ) -> None:
     upper, lower = shared.rig.arms["right"], shared.rig.arms["left"]
-    door = shared.bench.doors["right"]
-    failed = failing(shared.rig, getattr(door, stop))
+    faults = shared.cell.faults["right"]
+    failed = failing(shared.rig, getattr(faults, stop))
     try:
         # Either arm may be asked first: the one that stopped, or the one that stopped because the other did.
         assert isinstance(failed.__cause__, error | SafetyViolation)
@@ -308,7 +308,7 @@ def test_a_stop_ends_the_episode_keeps_it_and_waits_for_recover(
             with pytest.raises(EmergencyStop, match="must release it"):
                 upper.recover()  # type: ignore[attr-defined]
     finally:
-        door.recover()
+        faults.recover()
         upper.recover()  # type: ignore[attr-defined]
         lower.recover()  # type: ignore[attr-defined]
     shared.rig.reset()
@@ -342,7 +342,7 @@ def test_ctrl_c_in_a_reset_leaves_arms_that_rest(shared: Opened) -> None:
     with pytest.raises(KeyboardInterrupt):
         shared.rig.reset()
     hit.join()
-    until(lambda: all(door.state().rests for door in shared.bench.doors.values()), "rest")
+    until(lambda: all(faults.state().rests for faults in shared.cell.faults.values()), "rest")
     shared.rig.reset()
 
 
@@ -461,7 +461,7 @@ def one_killed(folder: Path, first: int, victim: Callable[[Opened], int]) -> Epi
 @pytest.mark.parametrize(
     ("victim", "errors", "words"),
     [
-        (lambda found: found.bench._controllers.pid, (LinkLost, DeviceNotConnectedError, DeviceError), "arm '"),
+        (lambda found: found.cell._controllers.pid, (LinkLost, DeviceNotConnectedError, DeviceError), "arm '"),
         (lambda found: found.rig.arms["east"]._driven.arm._process.pid, (DeviceError,), "worker|the other arm did"),
         (lambda found: found.cameras["west"].pid, (StaleFrame,), "sensor 'west'"),
     ],
@@ -506,7 +506,7 @@ def test_mocks_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     until(lambda: not any(runs(pid) for pid in family), "all mocks and workers have ended")
 
 
-# -- with the simulated bench ----------------------------------------------------------------------------------------
+# -- with the simulated cell ----------------------------------------------------------------------------------------
 
 SMALL = [f"canonical.{key}={value}" for key, value in (("rows", 32), ("columns", 32), ("pitch", "0.5 mm"))]
 for _name in ("lower", "upper"):
@@ -567,15 +567,15 @@ def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
             simulated.rig.reset()
     finally:
         start._facts = config  # type: ignore[attr-defined]
-    for name, pose in simulated.bench.start.items():
+    for name, pose in simulated.cell.start.items():
         assert simulated.rig.arms[name].state().pose.position == pytest.approx(pose.position, abs=50e-6)
 
 
 def test_a_killed_simulator_ends_the_episode(simulated: Opened) -> None:
     """The last test of this rig."""
-    twin = simulated.bench._twin
-    assert twin is not None
-    failed = failing(simulated.rig, lambda: os.kill(twin.pid, signal.SIGKILL))
-    assert "the simulated bench" in str(failed) and "open the rig anew" in str(failed)
+    sim_server = simulated.cell._sim_server
+    assert sim_server is not None
+    failed = failing(simulated.rig, lambda: os.kill(sim_server.pid, signal.SIGKILL))
+    assert "the simulated cell" in str(failed) and "open the rig anew" in str(failed)
     assert len(failed.episode.steps) >= 3
-    until(lambda: all(door.state().rests for door in simulated.bench.doors.values()), "rest")
+    until(lambda: all(faults.state().rests for faults in simulated.cell.faults.values()), "rest")

@@ -78,7 +78,7 @@ def protective_stop(p: Program) -> None:
 
 def external_sensor(p: Program) -> None:
     if p.integer(1) == 1:
-        raise ProgramError("external force sensors are not modelled by the mock: push through its door")
+        raise ProgramError("external force sensors are not modelled by the mock: give the wrench by its fault client")
 
 
 # -- questions -------------------------------------------------------------------------------------------------------

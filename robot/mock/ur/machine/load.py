@@ -1,4 +1,4 @@
-"""What pushes on the tool: wrenches given through the door, a spring wall, a payload nobody told the controller of."""
+"""What pushes on the tool: wrenches given from outside, a spring wall, a payload nobody told the controller of."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Load:
     """Wrenches (6,) [N, N m] on the tool. Signs as UR has them: what the surroundings do to the robot, about the TCP,
     in base axes; pressing down on a table gives a positive z force."""
 
-    wrench: FloatArray = field(default_factory=lambda: np.zeros(6))  # given through the door
+    wrench: FloatArray = field(default_factory=lambda: np.zeros(6))  # given from outside
     wall: Wall | None = None
     hidden_mass: float = 0.0  # hangs on the flange, and the controller does not know of it [kg]
     hidden_centre: FloatArray = field(default_factory=lambda: np.zeros(3))  # its centre, flange axes [m]

@@ -1,4 +1,4 @@
-"""The simulated bench's process: what goes over the wire, and how it fails."""
+"""The simulated cell's process: what goes over the wire, and how it fails."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from robot.mock.cell import sim_server as twins
-from robot.mock.cell.sim_server import LARGEST, Twin, TwinError, read_message, write_message
+from robot.mock.cell.sim_server import LARGEST, SimServer, SimServerError, read_message, write_message
 from tacsim.config import load_rig
 from tacsim.interface import Pose
 from tacsim.models.rig import RigConfig, SimSensorConfig
@@ -107,7 +107,7 @@ while (message := read_message(sys.stdin.buffer)) is not None:
 """
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, act: str) -> Twin:
+def stand_in(monkeypatch: pytest.MonkeyPatch, act: str) -> SimServer:
     """A twin whose process does `act` when it is asked to move."""
     code = STAND_IN.replace("    act()", f"    {act}")
     start = subprocess.Popen
@@ -118,7 +118,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, act: str) -> Twin:
     monkeypatch.setattr(twins.subprocess, "Popen", other)
     config = load_rig("mock", overrides=SMALL).config
     assert config.scene is not None
-    return Twin(config.scene, {}, config.canonical)
+    return SimServer(config.scene, {}, config.canonical)
 
 
 @pytest.mark.parametrize(
@@ -134,27 +134,29 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, act: str) -> Twin:
     ],
 )
 def test_what_goes_wrong_there_is_a_twin_error_here(monkeypatch: pytest.MonkeyPatch, act: str, words: str) -> None:
-    with stand_in(monkeypatch, act) as twin, pytest.raises(TwinError, match=words):
-        twin.move({})
+    with stand_in(monkeypatch, act) as sim_server, pytest.raises(SimServerError, match=words):
+        sim_server.move({})
 
 
 def test_a_process_that_says_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    with stand_in(monkeypatch, "time.sleep(600)") as twin:
+    with stand_in(monkeypatch, "time.sleep(600)") as sim_server:
         monkeypatch.setattr(twins, "PATIENCE", 0.2)
-        with pytest.raises(TwinError, match=r"no answer within 0\.2 s"):
-            twin.move({})
-        assert twin._process.returncode is not None
+        with pytest.raises(SimServerError, match=r"no answer within 0\.2 s"):
+            sim_server.move({})
+        assert sim_server._process.returncode is not None
 
 
 def test_after_ctrl_c_no_old_answer_is_taken_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    with stand_in(monkeypatch, "time.sleep(1.0); write_message(sys.stdout.buffer, {'error': 'an old answer'})") as twin:
+    with stand_in(
+        monkeypatch, "time.sleep(1.0); write_message(sys.stdout.buffer, {'error': 'an old answer'})"
+    ) as sim_server:
         hit = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
         hit.start()
         with pytest.raises(KeyboardInterrupt):
-            twin.move({})
+            sim_server.move({})
         hit.join()
-        with pytest.raises(TwinError, match="is closed; open the rig anew"):
-            twin.move({})
+        with pytest.raises(SimServerError, match="is closed; open the rig anew"):
+            sim_server.move({})
 
 
 # -- the true process ------------------------------------------------------------------------------------------------
@@ -166,65 +168,66 @@ def config() -> RigConfig:
 
 
 @pytest.fixture(scope="module")
-def twin(config: RigConfig) -> Iterator[Twin]:
+def sim_server(config: RigConfig) -> Iterator[SimServer]:
     assert config.scene is not None
     models = {
         name: sensor.model
         for name, sensor in config.sensors.items()
         if not isinstance(sensor, SimSensorConfig) and sensor.model is not None  # type: ignore[union-attr]
     }
-    with Twin(config.scene, models, config.canonical) as running:
+    with SimServer(config.scene, models, config.canonical) as running:
         yield running
 
 
-def closer(twin: Twin, way: float) -> dict[str, Pose]:
+def closer(sim_server: SimServer, way: float) -> dict[str, Pose]:
     """Both sensors moved along their own z [m]."""
     signs = {"lower": 1.0, "upper": -1.0}
     return {
-        name: Pose(pose.position + [0, 0, signs[name] * way], pose.quaternion) for name, pose in twin.initial.items()
+        name: Pose(pose.position + [0, 0, signs[name] * way], pose.quaternion)
+        for name, pose in sim_server.initial.items()
     }
 
 
-def touching(twin: Twin) -> float:
+def touching(sim_server: SimServer) -> float:
     """How far both must come from their start until they touch [m]: half of what is between gels and body."""
-    return 0.5 * (twin.initial["upper"].position[2] - twin.initial["lower"].position[2] - 4e-3)
+    return 0.5 * (sim_server.initial["upper"].position[2] - sim_server.initial["lower"].position[2] - 4e-3)
 
 
-def test_a_bench_answers_with_pictures_surfaces_forces_and_truth(twin: Twin, config: RigConfig) -> None:
-    clear = twin.place(twin.initial)
+def test_a_bench_answers_with_pictures_surfaces_forces_and_truth(sim_server: SimServer, config: RigConfig) -> None:
+    clear = sim_server.place(sim_server.initial)
     assert set(clear.images) == set(clear.surfaces) == set(clear.wrenches) == {"lower", "upper"}
     assert clear.images["upper"].shape == (30, 40, 3)
     assert clear.surfaces["upper"].height.shape == (16, 16)
     assert max(float(np.abs(wrench).max()) for wrench in clear.wrenches.values()) < 0.05
-    pressed = twin.move(closer(twin, touching(twin) + 0.1e-3))
+    pressed = sim_server.move(closer(sim_server, touching(sim_server) + 0.1e-3))
     assert pressed.index == clear.index + 1 and pressed.time > clear.time
     assert all(wrench[2] < -0.05 for wrench in pressed.wrenches.values())  # the object pushes back
     assert float(pressed.surfaces["upper"].height.max()) > 20e-6
     assert clear.truth is not None and pressed.truth is not None
     assert pressed.truth.height < clear.truth.height
-    fresh = twin.place(twin.initial)
+    fresh = sim_server.place(sim_server.initial)
     assert fresh.truth is not None and fresh.truth.height == pytest.approx(clear.truth.height)
 
 
-def test_what_cannot_be_done_is_said_and_the_bench_goes_on(twin: Twin) -> None:
-    twin.place(twin.initial)
-    with pytest.raises(TwinError, match=r"simulated bench: .*third"):
-        twin.move({**twin.initial, "third": Pose()})
-    assert np.isfinite(twin.place(twin.initial).wrenches["upper"]).all()
+def test_what_cannot_be_done_is_said_and_the_bench_goes_on(sim_server: SimServer) -> None:
+    sim_server.place(sim_server.initial)
+    with pytest.raises(SimServerError, match=r"simulated cell: .*third"):
+        sim_server.move({**sim_server.initial, "third": Pose()})
+    assert np.isfinite(sim_server.place(sim_server.initial).wrenches["upper"]).all()
 
 
-def test_ctrl_c_is_for_the_parent(twin: Twin) -> None:
-    """A terminal sends it to all; the bench must not die in the middle of an episode that ends in order."""
-    os.kill(twin.pid, signal.SIGINT)
-    assert twin.place(twin.initial).truth is not None
+def test_ctrl_c_is_for_the_parent(sim_server: SimServer) -> None:
+    """A terminal sends it to all; the cell must not die in the middle of an episode that ends in order."""
+    os.kill(sim_server.pid, signal.SIGINT)
+    assert sim_server.place(sim_server.initial).truth is not None
 
 
-def test_a_killed_process_is_a_twin_error_and_closing_stays_harmless(twin: Twin) -> None:
+def test_a_killed_process_is_a_twin_error_and_closing_stays_harmless(sim_server: SimServer) -> None:
     """The last test of this process."""
-    os.kill(twin.pid, signal.SIGKILL)
-    with pytest.raises(TwinError, match=rf"process {twin.pid}.*open the rig anew"):
-        twin.move(twin.initial)
-    twin.close()
+    os.kill(sim_server.pid, signal.SIGKILL)
+    with pytest.raises(SimServerError, match=rf"process {sim_server.pid}.*open the rig anew"):
+        sim_server.move(sim_server.initial)
+    sim_server.close()
 
 
 def until(done: Callable[[], bool], what: str) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacsim.gym.env import TacsimEnv
     from tacsim.models.scene import Scene
     from tacsim.models.sensor import CanonicalGrid
-    from tacsim.physics.worlds.world import World
+    from tacsim.physics.world import World
     from tacsim.record.replay import ReplayClock, ReplaySensor
     from tacsim.sim.sensor import SimClock, SimSensor
 
@@ -141,7 +141,7 @@ def _open_sim(config: RigConfig) -> Rig:
     """One World seen as sensors, arms and a clock."""
     from calibration.normaliser import for_simulated
     from tacsim.compute.threads import at_once
-    from tacsim.physics.worlds.world import make_world
+    from tacsim.physics.world import make_world
     from tacsim.sim.sensor import SimArm, SimClock, SimStart
 
     scene = config.scene

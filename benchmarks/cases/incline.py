@@ -10,7 +10,7 @@ from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene, Settling
-from tacsim.physics.worlds.world import World, make_world
+from tacsim.physics.world import World, make_world
 
 FRICTION = 0.5
 # Ten times the earth's [m/s^2], so that a block just beyond the limit goes far enough to be seen to move; no more, for

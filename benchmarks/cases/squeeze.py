@@ -15,7 +15,7 @@ from benchmarks.truth.roughness import print_roughness
 from tacsim.compute.threads import at_once
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
-from tacsim.physics.worlds.world import MoveStats, World, make_world
+from tacsim.physics.world import MoveStats, World, make_world
 
 if TYPE_CHECKING:
     from tacsim.interface import FloatArray

@@ -22,7 +22,7 @@ from tacsim.pose import inverse, rotate, transform
 if TYPE_CHECKING:
     from tacsim.interface import FloatArray
     from tacsim.models.scene import GelSurface
-    from tacsim.physics.worlds.world import World
+    from tacsim.physics.world import World
 
 MM = 1e3  # m -> mm, of a snapshot's lengths
 CELL = 2.0  # of the patch, in particle spacings

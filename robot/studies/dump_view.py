@@ -19,7 +19,7 @@ from tacsim.physics.exec import layout
 from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, no_dumps
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.worlds.world import MoveStats, World, make_world
+from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.report.figure import COLOURS, INK, canvas, plain, save
 
 State = Mapping[str, NDArray[Any]]

@@ -19,7 +19,7 @@ from tacsim.models.scene import GelSurface, Scene, Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
-from tacsim.physics.worlds.world import World, make_world
+from tacsim.physics.world import World, make_world
 
 Image = NDArray[np.uint8]
 

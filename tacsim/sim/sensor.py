@@ -17,7 +17,7 @@ from tacsim.models.hardware import ArmLimits
 from tacsim.models.rig import SimMotion
 from tacsim.models.scene import GelSurface
 from tacsim.optics.noise import NoiseSource
-from tacsim.physics.worlds.world import MoveStats, World
+from tacsim.physics.world import MoveStats, World
 
 CLEARANCE = 0.05e-3  # gap that the first, fast part of an approach leaves [m]
 FIRST_STEP = 0.1e-3  # of the slow part [m]
@@ -92,7 +92,7 @@ class SimClock:
         self.version += 1
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How the last move went, all of tacsim.physics.worlds.world.MoveStats, and how many targets the limits
+        """How the last move went, all of tacsim.physics.world.MoveStats, and how many targets the limits
         shortened."""
         stats = self.stats
         if stats is None:

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.cases.squeeze import close, squeeze_scene, touching
 from benchmarks.truth.gap import gaps
-from tacsim.physics.worlds.world import World
+from tacsim.physics.world import World
 
 UM = 1e-6
 

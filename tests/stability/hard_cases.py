@@ -36,10 +36,11 @@ from tacsim.models.scene import (
     Sphere,
 )
 from tacsim.physics.failure import diagnosis, health
-from tacsim.physics.failure.health import RETRIES, SimulationDiverged
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.motion.retry import RETRIES
 from tacsim.physics.seed import world as seed_world
+from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.physics.worlds import hybrid, press
-from tacsim.physics.worlds.world import MoveStats, World, make_world
 
 Targets = Mapping[str, Pose]
 Motions = Callable[[World], Iterator[Targets]]

@@ -12,7 +12,7 @@ from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import GelSurface, Scene
-from tacsim.physics.worlds.world import MoveStats
+from tacsim.physics.world import MoveStats
 from tacsim.rig import Rig
 
 HEIGHT, RADIUS, GAP = 10e-3, 0.25e-3, 0.5e-3  # of the body; of a particle; between gel and body at first [m]
@@ -126,7 +126,7 @@ def open_springs(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]
             worlds.append(SpringWorld(scene))
             return worlds[-1]
 
-        monkeypatch.setattr("tacsim.physics.worlds.world.make_world", make)
+        monkeypatch.setattr("tacsim.physics.world.make_world", make)
         rig = open_rig(load_rig("sim", task=task, overrides=[*SMALL, *overrides]))
         rig.world = worlds[-1]  # type: ignore[attr-defined]
         opened.append(rig)

@@ -24,7 +24,7 @@ from benchmarks.harness.runner import Case
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, SensorModel
-from tacsim.physics.worlds.world import World, make_world
+from tacsim.physics.world import World, make_world
 
 if TYPE_CHECKING:
     from calibration.light.ball_press import Fit

@@ -34,7 +34,7 @@ from tacsim.interface import FloatArray, Pose, SurfaceMap, Truth
 if TYPE_CHECKING:
     from tacsim.models.scene import Scene
     from tacsim.models.sensor import CanonicalGrid, SensorModel
-    from tacsim.physics.worlds.world import World
+    from tacsim.physics.world import World
 
 PATIENCE = 600.0  # for one answer: a first motion compiles, a hard one takes many substeps [s]
 NICENESS = 19
@@ -57,7 +57,7 @@ class SceneFrame:
     surfaces: Mapping[str, SurfaceMap]  # by sensor, on the canonical grid
     wrenches: Mapping[str, FloatArray]  # (6,) on each sensor, about its origin, its axes [N, N m]
     truth: Truth | None  # of the body
-    stats: Mapping[str, float]  # how the simulated motion went (tacsim.physics.worlds.world.MoveStats)
+    stats: Mapping[str, float]  # how the simulated motion went (tacsim.physics.world.MoveStats)
     seconds: float  # that it took
 
 
@@ -239,7 +239,7 @@ class WorldCell:
     def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
         from tacsim.optics.noise import noise_source
         from tacsim.optics.render import Renderer
-        from tacsim.physics.worlds.world import make_world
+        from tacsim.physics.world import make_world
 
         self.world: World = make_world(scene)
         self._initial = self.world.snapshot()

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,9 @@ from pydantic import Field, ValidationError
 from tacsim.interface import Pose
 from tacsim.models.quantity import Config
 from tacsim.models.scene import Mesh, Scene, Shape
-from tacsim.physics.worlds.world import Order
-
-if TYPE_CHECKING:
-    from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.move import MoveCommand
+from tacsim.physics.snapshot import State
 
 FOLDER = "TACSIM_DUMPS"  # environment variable: where dumps are written; none are without it, or where it is empty
 MOST_DUMPS = 20  # in one folder; training that diverges again and again must not fill the disk
@@ -43,7 +42,6 @@ MOMENTS = ("before", "good", "failed")
 MESH = "shape.stl"
 
 Numbers7 = tuple[float, float, float, float, float, float, float]
-State = Mapping[str, NDArray[Any]]
 Poses = Mapping[str, Pose]
 
 
@@ -80,10 +78,10 @@ class Dump:
     states: Mapping[str, State]
 
     @property
-    def order(self) -> Order:
+    def order(self) -> MoveCommand:
         """What the motion was asked for."""
         info = self.info
-        return Order(_poses(info.targets), info.loads, info.duration, info.flow)
+        return MoveCommand(_poses(info.targets), info.loads, info.duration, info.flow)
 
     def poses(self, moment: str) -> dict[str, Pose]:
         """Of the driven frames; at "good" those of the end of its launch, a few substeps later."""
@@ -126,7 +124,7 @@ def write(
     folder: Path,
     scene: Scene,
     poses: Poses,
-    order: Order,
+    order: MoveCommand,
     before: State,
     failure: SimulationDiverged,
 ) -> Path:
@@ -145,7 +143,7 @@ def write(
 
 
 def _write(
-    place: Path, scene: Scene, poses: Poses, order: Order, before: State, failure: SimulationDiverged
+    place: Path, scene: Scene, poses: Poses, order: MoveCommand, before: State, failure: SimulationDiverged
 ) -> None:  # fmt: skip
     scene, mesh = _with_mesh(scene, MESH)
     if mesh is not None:

@@ -1,39 +1,28 @@
-"""When a simulation leaves what is physical: what is watched, how a motion is retried, and the error that says so.
-
-A launch that ends unphysical is not repeated by itself: an instability grows for many launches before it shows, so the
-state at the start of the bad launch is not to be trusted. The whole motion starts again, from the state before it, with
-half the time step.
-"""
+"""What counts as unphysical after a launch of kernels, and the error that says what, where and what to do."""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Scene
 from tacsim.physics.exec import layout
 from tacsim.physics.failure import diagnosis
-from tacsim.physics.worlds.world import MoveStats, Order
+from tacsim.physics.snapshot import State, copies
 
 SMALLEST_VOLUME_RATIO = 0.05  # det F of a gel element, elastic volume ratio of a particle; below, it counts as inverted
-SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned inside out
 SMALLEST_STEP_VOLUME = 0.1  # det(I + dt C) of a particle in one substep
 FASTEST = 0.5  # speed of a particle or gel node / wave speed
 LARGEST_COURANT = 1.0  # time step / time of the pressure wave through the smallest cell or most squeezed element
-RETRIES = 2  # each halves the time step
 LARGEST_GRID = 20_000_000  # nodes of one environment; 80 bytes each on a CPU, in four copies
 
-State = Mapping[str, NDArray[Any]]
 ADVICE = "move less far or slower, or use a finer preset"
-NEW_WORLD = "restore a snapshot, or make a new world"
 NO_ROOM = "restore a snapshot in which its particles are together; worlds of a smaller batch have more room each"
 
 
@@ -129,14 +118,10 @@ class Health:
         return None
 
 
-def copies(arrays: State) -> dict[str, NDArray[Any]]:
-    return {name: a.copy(order="K") for name, a in arrays.items()}  # as they lie: particles' numbers are rows
-
-
 def judged(arrays: State, good: State, health: Health, where: Place) -> Health:
     """`health` of a launch that changed `arrays` from `good` to what they are.
 
-    Raises SimulationDiverged if that is unphysical; whoever runs the motion (see `retried`) rolls back and retries.
+    Raises SimulationDiverged if that is unphysical; tacsim.physics.motion.retry rolls back and tries again.
     """
     complaint = health.complaint() or _complaint(arrays)
     if complaint is None:
@@ -159,94 +144,6 @@ def _complaint(arrays: State) -> tuple[str, diagnosis.Quantity] | None:
     if volumes is not None and not volumes.min() > SMALLEST_VOLUME_RATIO:
         return f"a particle is crushed (elastic volume ratio {volumes.min():.3g})", "particle volume"
     return None
-
-
-class Driven(Protocol):
-    """What `retried` needs of a world."""
-
-    scene: Scene
-
-    def pose(self, name: str) -> Pose: ...
-    def arrays(self) -> State:
-        """Views of all that changes in a motion, by name."""
-        ...
-
-    def snapshot(self) -> Mapping[str, NDArray[Any]]: ...
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None: ...
-
-
-Wanted = TypeVar("Wanted")
-Seen = TypeVar("Seen")
-
-
-def retried(
-    world: Driven, order: Order, motion: Callable[[int], Generator[Wanted, Seen, MoveStats]]
-) -> Generator[Wanted, Seen, MoveStats]:
-    """The motion `motion(refine)`, which does with `world` what is asked for, with 1/refine of its step; refine = 1, 2,
-    4.
-
-    Whoever runs it throws in the SimulationDiverged of a launch; the world then rolls back by itself and yields the
-    first launch of the next try. After every failure, an interruption included, the world is as it was before. Raises
-    SimulationDiverged when no step does, or when the state was broken already; writes a dump then if one is asked for
-    (tacsim.physics.failure.dump).
-    """
-    before = world.snapshot()
-    broken = diagnosis.not_finite(before)
-    if broken is not None:
-        failure = SimulationDiverged(broken, "before the motion began", NEW_WORLD)
-        failure.good = failure.failed = before
-    else:
-        for retry in range(RETRIES + 1):
-            try:
-                stats = yield from motion(2**retry)
-                _require_upright(world, order.targets)
-                return replace(stats, retries=retry)
-            except SimulationDiverged as diverged:
-                failure, failure.refine = diverged, 2**retry
-                world.restore(before)
-                if not diverged.retry:
-                    break
-            except BaseException:
-                world.restore(before)
-                raise
-    failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, world.scene.gel.size)
-    _dump(world, order, before, failure)
-    raise failure
-
-
-def _require_upright(world: Driven, targets: Mapping[str, Pose]) -> None:
-    """Raises SimulationDiverged if a motion ended with a gel element inside out."""
-    state, thickness = world.arrays(), world.scene.gel.size[2] * 1e3
-    if "gel_displacement" not in state or diagnosis.nearly_at_rest(state, thickness):
-        return
-    corners = diagnosis.corner_volumes(state, thickness)
-    if corners is not None and not corners.min() > SMALLEST_CORNER:
-        words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
-        end = Place("at the end of the motion and its hold", {**_poses(world), **targets})
-        failure = SimulationDiverged(words, str(end))
-        failure.quantity, failure.failed, failure.poses = "corner", copies(state), end.poses
-        raise failure
-
-
-def _poses(world: Driven) -> dict[str, Pose]:
-    scene = world.scene
-    frames = (*scene.sensors, *(() if scene.indenter is None else ("indenter",)))
-    return {name: world.pose(name) for name in frames}
-
-
-def _dump(world: Driven, order: Order, before: State, failure: SimulationDiverged) -> None:
-    """Writes the dump if the environment names a folder for it; an error here must not hide the one reported."""
-    folder = os.environ.get("TACSIM_DUMPS")  # tacsim.physics.failure.dump.FOLDER, which is loaded only to write
-    if folder is None:
-        failure.no_dump = "set TACSIM_DUMPS to a folder to keep a replayable state"
-    if not folder:
-        return
-    from tacsim.physics.failure import dump
-
-    try:
-        failure.dump = dump.write(Path(folder), world.scene, _poses(world), order, before, failure)
-    except (OSError, ValueError) as error:
-        failure.no_dump = f"no dump could be written to {folder}: {error}"
 
 
 def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place, most: int = LARGEST_GRID) -> None:

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.models.scene import Settling
-from tacsim.physics.failure.health import Place, SimulationDiverged, State
+from tacsim.physics.failure.health import Place, SimulationDiverged
 from tacsim.physics.motion.path import MM, Path
-from tacsim.physics.worlds.world import MoveStats
+from tacsim.physics.move import MoveStats
+from tacsim.physics.snapshot import State
 
 PIECE = 20  # substeps of one launch on the way
 LOOKS = 2  # earlier looks that a look is compared with: one alone may meet the same phase of what rings

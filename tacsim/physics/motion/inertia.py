@@ -16,7 +16,7 @@ from tacsim.interface import Pose
 from tacsim.physics.gel.gel import MM, MPA, GelParams
 from tacsim.physics.motion.controller import Launch
 from tacsim.physics.motion.path import MOST, PEAK, ROUNDING, Path, longest_way
-from tacsim.physics.worlds.world import is_number
+from tacsim.physics.move import is_number
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 

@@ -19,7 +19,7 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.motion.controller import Launch, Motion, Reading, move_and_settle
 from tacsim.physics.motion.path import Path
-from tacsim.physics.worlds.world import MoveStats, is_number
+from tacsim.physics.move import MoveStats, is_number
 
 # All as shares of the gel's thickness
 PIECE = 0.06  # longest way between two corrections

@@ -185,7 +185,7 @@ def _substeps(count: float, length: float, mach: float) -> int:
     return math.ceil(count)
 
 
-def merged(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:
+def resolve_targets(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:
     """Where every driven frame ends. Raises KeyError for a frame that is not driven, TypeError for what is no pose."""
     if not isinstance(targets, Mapping):
         raise TypeError(f"targets are poses by the names of frames ({', '.join(poses)}), found {targets!r}")

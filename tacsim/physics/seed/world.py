@@ -20,12 +20,14 @@ from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 from tacsim.physics.exec.layout import NUMBERS
-from tacsim.physics.failure.health import Health, Place, SimulationDiverged, copies, judged, require_room, retried
+from tacsim.physics.failure.health import Health, Place, SimulationDiverged, judged, require_room
 from tacsim.physics.motion.controller import Motion, Reading, Scheme, move_and_settle, run
 from tacsim.physics.motion.load import keep_loads, require_loads
-from tacsim.physics.motion.path import MM, Path, merged, plan
-from tacsim.physics.worlds.not_copyable import SingleWorld
-from tacsim.physics.worlds.world import MoveStats, Order, put_back, taken
+from tacsim.physics.motion.path import MM, Path, plan, resolve_targets
+from tacsim.physics.motion.retry import retried
+from tacsim.physics.move import MoveCommand, MoveStats
+from tacsim.physics.snapshot import copies, restore_arrays, snapshot_of
+from tacsim.physics.worlds.base import BaseWorld
 
 Float32 = NDArray[np.float32]
 
@@ -79,7 +81,7 @@ def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
     return Solid(mass=mass, volume=volume, mu=mu, lam=lam, limit=limit)  # type: ignore[call-arg]  # a Taichi dataclass
 
 
-class SeedWorld(SingleWorld):
+class SeedWorld(BaseWorld):
     """World of a scene with a body, by the seed's scheme.
 
     Raises ValueError without a body, or for one that hardens; RuntimeError on a device (TACSIM_DEVICE).
@@ -142,11 +144,11 @@ class SeedWorld(SingleWorld):
         }  # fmt: skip
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        return taken(self.arrays(), self._poses)
+        return snapshot_of(self.arrays(), self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See World."""
-        self._poses = put_back(self.arrays(), self.sensors, state)
+        self._poses = restore_arrays(self.arrays(), self.sensors, state)
 
     def wrench(self, name: str) -> NDArray[np.float64]:
         """(6,) what the gel does to its backing: what the object does to the gel, once the gel is at rest."""
@@ -189,10 +191,10 @@ class SeedWorld(SingleWorld):
             raise ValueError("physics 'seed' knows no true inertia; leave out the duration, or use physics 'hybrid'")
         if flow:
             raise ValueError("physics 'seed' settles every motion; leave out flow, or use physics 'hybrid'")
-        return run(self.motion(Order(targets, loads or {})), self._advance)
+        return run(self.motion(MoveCommand(targets, loads or {})), self._advance)
 
-    def _carry_out(self, order: Order) -> Motion:
-        end = merged(self._poses, order.targets)
+    def _run_command(self, order: MoveCommand) -> Motion:
+        end = resolve_targets(self._poses, order.targets)
         end.update((name, self._upright(name, end[name])) for name in order.targets)
         self._check_room(end)
         require_loads(order.loads, self.sensors)

@@ -15,15 +15,15 @@ from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.controller import Launch, Motion, advance_all
 from tacsim.physics.motion.load import LoadNotReached
+from tacsim.physics.move import MoveCommand, MoveStats
+from tacsim.physics.worlds.base import NotCopyable
 from tacsim.physics.worlds.hybrid import HybridState, HybridWorld
-from tacsim.physics.worlds.not_copyable import Single
 from tacsim.physics.worlds.press import PressState, PressWorld
-from tacsim.physics.worlds.world import MoveStats, Order
 
 Result = MoveStats | SimulationDiverged | LoadNotReached | None
 
 
-class Batch(Single):
+class Batch(NotCopyable):
     """Worlds of several scenes, all round bodies or all with indenters, whose gels share one lattice.
 
     All else is each scene's own: materials, friction, body or indenter, number of particles, settling. `worlds` are
@@ -70,7 +70,7 @@ class Batch(Single):
         motions: dict[int, Motion] = {}
         for index, (world, target, load) in enumerate(zip(self.worlds, targets, loads, strict=True)):
             if target is not None:
-                motions[index] = world.motion(Order(target, load or {}, duration, flow))
+                motions[index] = world.motion(MoveCommand(target, load or {}, duration, flow))
             elif load:
                 raise ValueError(f"environment {index} rests, so it cannot hold a load; give it targets, {{}} to stay")
         return self._run(motions)

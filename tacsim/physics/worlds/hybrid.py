@@ -21,7 +21,6 @@ from tacsim.physics.body.plasticine import (
 from tacsim.physics.body.surface import surface_points, tangent_planes
 from tacsim.physics.contact.contact import Kept
 from tacsim.physics.contact.gel_overlap import gel_overlap
-from tacsim.physics.exec.device import Mirror, run_hybrid
 from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
 from tacsim.physics.exec.layout import (
     BACKING,
@@ -42,23 +41,24 @@ from tacsim.physics.exec.layout import (
     PARAMS,
     SPREAD,
     STEP,
-    STEPS,
     STIFFNESS,
     TURNING,
 )  # fmt: skip
 from tacsim.physics.exec.team import run_team
-from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, copies, judged, require_room
+from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, judged, require_room
 from tacsim.physics.gel.gel import MM, MPA, GelState, gel_params, one_lattice
 from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
-from tacsim.physics.worlds.driven import DrivenWorld
+from tacsim.physics.snapshot import copies
+from tacsim.physics.worlds.device import Mirror, run_hybrid
+from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
 from tacsim.pose import HALF_TURN_X
 
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
 COURANT = 0.5
 # Damping on the way falsifies the path, since the gels give way and the body spreads; damping of the hold does not.
-ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0  # zeta in alpha = zeta c / thickness, while anything is driven and while held
+ZETA_GEL = 0.5  # zeta in alpha = zeta c / thickness, while anything is driven; while held: ZETA_GEL_HELD
 ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
@@ -88,7 +88,7 @@ class HybridState:
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 2, 6, 3) of the environments that go on, n each one's own."""
-        drive = side_by_side(drives, self.counts)
+        drive = stack_drives(drives, self.counts)
         self.gels.refresh()
         if ON_DEVICE:
             run_hybrid(
@@ -111,19 +111,7 @@ def _placed(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
     return body, (points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM, planes
 
 
-def side_by_side(drives: Mapping[int, np.ndarray], counts: np.ndarray) -> np.ndarray:
-    """Drives (n, frames, 6, 3) of some environments in one array (E, longest, ...); writes all n into `counts`."""
-    counts[:, STEPS] = 0
-    first = next(iter(drives.values()))
-    longest = max(len(drive) for drive in drives.values())
-    together = np.zeros((len(counts), longest, *first.shape[1:]), np.float32)
-    for index, drive in drives.items():
-        together[index, : len(drive)] = drive
-        counts[index, STEPS] = len(drive)
-    return together
-
-
-class HybridWorld(DrivenWorld):
+class HybridWorld(FemWorld):
     """World of a scene with a body: `lower` and `upper` gel, and the plasticine between them."""
 
     sensors = ("lower", "upper")

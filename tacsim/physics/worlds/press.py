@@ -21,7 +21,6 @@ from tacsim.physics.contact.indenter import (
     Values,
     indent,
 )
-from tacsim.physics.exec.device import Mirror, run_press
 from tacsim.physics.exec.lanes import MOST, ON_DEVICE, PARTS, Counts, Params, Partial, aligned_zeros
 from tacsim.physics.exec.layout import (
     BACKING,
@@ -43,7 +42,7 @@ from tacsim.physics.exec.layout import (
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.exec.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
-from tacsim.physics.failure.health import Health, SimulationDiverged, copies, judged
+from tacsim.physics.failure.health import Health, SimulationDiverged, judged
 from tacsim.physics.gel.gel import (
     MM,
     MPA,
@@ -61,8 +60,9 @@ from tacsim.physics.gel.gel import (
 )
 from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
-from tacsim.physics.worlds.driven import DrivenWorld
-from tacsim.physics.worlds.hybrid import ZETA_GEL_HELD, side_by_side
+from tacsim.physics.snapshot import copies
+from tacsim.physics.worlds.device import Mirror, run_press
+from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
@@ -184,7 +184,7 @@ class PressState:
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
-        drive = side_by_side(drives, self.counts)
+        drive = stack_drives(drives, self.counts)
         self.gels.refresh()
         if ON_DEVICE:
             run_press(
@@ -198,7 +198,7 @@ class PressState:
             )  # fmt: skip
 
 
-class PressWorld(DrivenWorld):
+class PressWorld(FemWorld):
     """World of a scene with an indenter: the `lower` gel, and the `indenter` above it."""
 
     sensors = ("lower",)

@@ -17,7 +17,7 @@ from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, S
 from tacsim.physics.failure import health
 from tacsim.physics.failure.dump import DumpError, dumps_in, read
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.worlds.world import make_world
+from tacsim.physics.world import make_world
 
 SMALL = Gel(size=(6e-3, 6e-3, 4e-3))
 CLAY = BodyMaterial(yield_stress=30e3)

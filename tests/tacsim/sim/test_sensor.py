@@ -10,7 +10,7 @@ import pytest
 from tacsim.interface import Action, Pose, SensorSpec
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
-from tacsim.physics.worlds.world import MoveStats
+from tacsim.physics.world import MoveStats
 from tacsim.sim.sensor import TOUCH_TOLERANCE, NoTouch, SimArm, SimClock, SimSensor, SimStart, approach
 
 

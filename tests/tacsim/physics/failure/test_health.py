@@ -15,20 +15,19 @@ from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 from tacsim.physics.failure import diagnosis, health
 from tacsim.physics.failure.health import (
     LARGEST_COURANT,
-    RETRIES,
     Health,
     Place,
     SimulationDiverged,
-    copies,
     judged,
     require_room,
-    retried,
 )
 from tacsim.physics.motion.controller import Launch, Motion, Reading, run
 from tacsim.physics.motion.path import Path
+from tacsim.physics.motion.retry import RETRIES, retried
+from tacsim.physics.move import MoveCommand, MoveStats
+from tacsim.physics.snapshot import copies
 from tacsim.physics.worlds import press
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import MoveStats, Order
 
 BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3, 10e-3, 4e-3)))
 STILL = Path([Pose()], [Pose()], substeps=0, dt=0.4)
@@ -130,7 +129,7 @@ def test_a_motion_starts_again_from_the_state_before_it() -> None:
         world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
         return REST
 
-    stats = run(retried(world, Order({}), one_launch), advance)
+    stats = run(retried(world, MoveCommand({}), one_launch), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
     assert stats.retries == 1 and world.state["position"][0, 0] == 2.0
 
@@ -146,7 +145,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
         return REST
 
     with pytest.raises(SimulationDiverged) as caught:
-        run(retried(world, Order({}), one_launch), advance)
+        run(retried(world, MoveCommand({}), one_launch), advance)
     assert steps == [2**retry for retry in range(RETRIES + 1)]
     assert all(world.state[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
@@ -158,7 +157,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
 def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
     """As whoever advances many worlds at once does: a failure is thrown into its own motion only."""
     good, bad = Particles(), Particles()
-    motions = [retried(good, Order({}), one_launch), retried(bad, Order({}), one_launch)]
+    motions = [retried(good, MoveCommand({}), one_launch), retried(bad, MoveCommand({}), one_launch)]
     launches = [next(motion) for motion in motions]
     good.state["position"] += 1.0
     bad.state["position"] += 1.0
@@ -179,7 +178,7 @@ def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None
         raise error
 
     with pytest.raises(error):
-        run(retried(world, Order({}), one_launch), advance)
+        run(retried(world, MoveCommand({}), one_launch), advance)
     assert world.state["position"].max() == 1.0
 
 
@@ -189,7 +188,7 @@ def test_a_broken_state_is_told_before_anything_moves() -> None:
     with pytest.raises(
         SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
     ):
-        run(retried(world, Order({}), one_launch), lambda path, first, last: pytest.fail("it moved"))
+        run(retried(world, MoveCommand({}), one_launch), lambda path, first, last: pytest.fail("it moved"))
 
 
 def test_a_grid_without_end_is_refused() -> None:

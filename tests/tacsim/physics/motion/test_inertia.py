@@ -7,9 +7,9 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Body, Box, Gel, GelMaterial, Indenter, Scene
 from tacsim.physics.motion.inertia import FASTEST_DRIVE
 from tacsim.physics.seed.world import SeedWorld
+from tacsim.physics.world import World
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import World
 
 CUBE = Body(geometry=Box(size=(4e-3, 4e-3, 4e-3)))
 GEL = Gel(size=(12e-3, 12e-3, 2e-3))

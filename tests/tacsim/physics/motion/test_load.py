@@ -12,8 +12,8 @@ from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere
 from tacsim.physics.motion.controller import Reading, run
 from tacsim.physics.motion.load import LEAST, LoadNotReached, keep_loads
 from tacsim.physics.motion.path import Path, plan
+from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import World, make_world
 
 
 def press() -> PressWorld:

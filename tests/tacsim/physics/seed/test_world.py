@@ -9,7 +9,7 @@ from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene, Settling
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.seed import world as seed_world
 from tacsim.physics.seed.world import HALF_TURN, SeedWorld
-from tacsim.physics.worlds.world import World
+from tacsim.physics.world import World
 
 pytestmark = pytest.mark.cpu
 

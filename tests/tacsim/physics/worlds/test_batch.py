@@ -26,13 +26,14 @@ from tacsim.models.scene import (
 )
 from tacsim.physics.body import plasticine
 from tacsim.physics.exec.lanes import COPIES, MOST
-from tacsim.physics.failure.health import LARGEST_GRID, RETRIES, SimulationDiverged
+from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
 from tacsim.physics.motion.load import LoadNotReached
+from tacsim.physics.motion.retry import RETRIES
+from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.physics.worlds import press
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import MoveStats, World, make_world
 
 GEL = Gel(size=(8e-3, 8e-3, 4e-3))
 CLAY = BodyMaterial(yield_stress=30e3)

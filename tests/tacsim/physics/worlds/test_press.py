@@ -11,10 +11,10 @@ from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
 from tacsim.physics.contact.indenter import POINTS
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.move import MoveCommand
 from tacsim.physics.oracle.layer import layer_contact
 from tacsim.physics.worlds import press
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import Order
 
 
 def world(geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, **scene: object) -> PressWorld:
@@ -234,7 +234,7 @@ def test_a_motion_driven_launch_by_launch_is_the_move() -> None:
     together = [world(Sphere(radius=4e-3)) for _ in range(2)]
     targets = [{"indenter": Pose(np.array([0, 0, 3.9e-3 - deep]))} for deep in (0.2e-3, 0.5e-3)]
     stats = [w.move(target) for w, target in zip(alone, targets, strict=True)]
-    motions = [w.motion(Order(target)) for w, target in zip(together, targets, strict=True)]
+    motions = [w.motion(MoveCommand(target)) for w, target in zip(together, targets, strict=True)]
     ends = {}
     wanted = {index: next(motion) for index, motion in enumerate(motions)}
     while wanted:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tacsim.compute.runtime import launching
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface, Scene
-from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, STEP
+from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
-from tacsim.physics.failure.health import LARGEST_COURANT, retried
+from tacsim.physics.failure.health import LARGEST_COURANT
 from tacsim.physics.gel.gel import MM, GelParams, GelState, gel_surface
 from tacsim.physics.motion.controller import (
     Launch,
@@ -30,12 +30,16 @@ from tacsim.physics.motion.controller import (
 )
 from tacsim.physics.motion.inertia import Inertia, plan_in_time
 from tacsim.physics.motion.load import keep_loads, require_loads
-from tacsim.physics.motion.path import Path, merged, plan, plan_on
-from tacsim.physics.worlds.not_copyable import SingleWorld
-from tacsim.physics.worlds.world import MoveStats, Order, put_back, taken
+from tacsim.physics.motion.path import Path, plan, plan_on, resolve_targets
+from tacsim.physics.motion.retry import retried
+from tacsim.physics.move import MoveCommand, MoveStats
+from tacsim.physics.snapshot import restore_arrays, snapshot_of
+from tacsim.physics.worlds.base import BaseWorld
+
+ZETA_GEL_HELD = 1.0  # zeta in alpha = zeta c / thickness, the damping of a gel while nothing is driven
 
 
-class DrivenState(Protocol):
+class FemState(Protocol):
     """Arrays of some environments (HybridState, PressState)."""
 
     gels: GelState
@@ -45,14 +49,26 @@ class DrivenState(Protocol):
     def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None: ...
 
 
-class DrivenWorld(SingleWorld):
+def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Drives (n, frames, 6, 3) of some environments in one array (E, longest, ...); writes all n into `counts`."""
+    counts[:, STEPS] = 0
+    first = next(iter(drives.values()))
+    longest = max(len(drive) for drive in drives.values())
+    together = np.zeros((len(counts), longest, *first.shape[1:]), np.float32)
+    for index, drive in drives.items():
+        together[index, : len(drive)] = drive
+        counts[index, STEPS] = len(drive)
+    return together
+
+
+class FemWorld(BaseWorld):
     """One environment of a state whose gels are layers of finite elements in their sensors' frames."""
 
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
     yields: bool  # what is pressed keeps what a hurried motion does to it
 
     scene: Scene
-    _state: DrivenState
+    _state: FemState
     _index: int
     _gel: GelParams
     _rates: NDArray[np.float64]  # (frames, 6) at which a motion that flows has left them [-, rad/mm]
@@ -85,12 +101,12 @@ class DrivenWorld(SingleWorld):
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        return taken({**self.arrays(), **self._numbers()}, self._poses)
+        return snapshot_of({**self.arrays(), **self._numbers()}, self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See World."""
         numbers = self._numbers()
-        self._poses = put_back({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
+        self._poses = restore_arrays({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
         self._take(self._true if numbers["true_inertia"] else self._scaled)
 
     def wrench(self, name: str) -> NDArray[np.float64]:
@@ -143,10 +159,10 @@ class DrivenWorld(SingleWorld):
         self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
         *, flow: bool = False,
     ) -> MoveStats:  # fmt: skip
-        return run(self.motion(Order(targets, loads or {}, duration, flow)), self._advance)
+        return run(self.motion(MoveCommand(targets, loads or {}, duration, flow)), self._advance)
 
-    def _carry_out(self, order: Order) -> Motion:
-        end = merged(self._poses, order.targets)
+    def _run_command(self, order: MoveCommand) -> Motion:
+        end = resolve_targets(self._poses, order.targets)
         require_loads(order.loads, self.sensors)
         begin, goals, rest = dict(self._poses), dict(end), np.zeros_like(self._rates)
         a, b = list(begin.values()), list(end.values())

@@ -8,10 +8,10 @@ from typing import Any, NoReturn, Self
 
 from tacsim.interface import Pose
 from tacsim.physics.motion.controller import Motion
-from tacsim.physics.worlds.world import Order
+from tacsim.physics.move import MoveCommand
 
 
-class Single:
+class NotCopyable:
     """What kernels change in place, through arrays that look into one another: a copy of it would be torn apart."""
 
     _instead = "make_world(scene) and restore(world.snapshot())"  # what to do, in words
@@ -21,7 +21,7 @@ class Single:
         raise TypeError(f"a {type(self).__name__} cannot be copied or pickled: {self._instead}")
 
 
-class SingleWorld(Single, ABC):
+class BaseWorld(NotCopyable, ABC):
     """One environment with driven frames, some of which are sensors; its motions come one after the other."""
 
     sensors: tuple[str, ...]
@@ -44,15 +44,15 @@ class SingleWorld(Single, ABC):
             raise KeyError(f"no sensor '{name}'; this world has {', '.join(self.sensors)}")
         return self.sensors.index(name)
 
-    def motion(self, order: Order) -> Motion:
+    def motion(self, order: MoveCommand) -> Motion:
         """`World.move`, a launch at a time. Raises RuntimeError, once begun, while another motion is not at its end."""
         if not self._free.acquire(blocking=False):
             raise RuntimeError("this world is already moving: wait for that motion, or give each thread its own world")
         try:
-            return (yield from self._carry_out(order))
+            return (yield from self._run_command(order))
         finally:
             self._free.release()
 
     @abstractmethod
-    def _carry_out(self, order: Order) -> Motion:
+    def _run_command(self, order: MoveCommand) -> Motion:
         """What `motion` does while no other does."""

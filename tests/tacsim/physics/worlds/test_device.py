@@ -22,10 +22,10 @@ from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Mesh, Sc
 from tacsim.physics.exec.layout import SHAPE_FIRST
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.controller import Launch
+from tacsim.physics.world import MoveStats, World
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import MoveStats, World
 
 SECONDS = 600  # for one process; a first run compiles
 GEL = Gel(size=(5e-3, 4e-3, 2e-3))
@@ -189,7 +189,7 @@ def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]])
 
 SENT = """
 import numpy as np
-from tacsim.physics.exec.device import Mirror
+from tacsim.physics.worlds.device import Mirror
 from tacsim.compute.runtime import start, ti
 start()
 mirror, host = Mirror(), np.ones((2, 3), np.float32)
@@ -206,7 +206,7 @@ def test_what_seldom_changes_is_sent_when_it_has() -> None:
 
 
 WORLD = (
-    "from tacsim.physics.worlds.world import make_world; from tacsim.models.scene import Scene; "
+    "from tacsim.physics.world import make_world; from tacsim.models.scene import Scene; "
     "make_world(Scene(physics={!r}))"
 )
 

@@ -13,11 +13,12 @@ import pytest
 
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Sphere
+from tacsim.physics.move import MoveCommand
 from tacsim.physics.seed.world import SeedWorld
+from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
-from tacsim.physics.worlds.world import Order, World, make_world
 
 GEL = Gel(size=(8e-3, 8e-3, 4e-3))
 BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=3e-3)), gel=GEL)
@@ -55,7 +56,7 @@ def test_a_world_makes_one_motion_at_a_time() -> None:
     """Its numbers are those of a motion on its way: whoever else moves it is told, and that motion is not disturbed."""
     batch, alone = Batch([BALL, BALL]), PressWorld(BALL)
     world = batch.worlds[0]
-    motion = world.motion(Order(down(world)))
+    motion = world.motion(MoveCommand(down(world)))
     next(motion)
     with pytest.raises(RuntimeError, match="this world is already moving"):
         world.move({})

@@ -15,7 +15,7 @@ from tacsim.physics.failure import dump
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.seed.world import SeedWorld
 from tacsim.physics.worlds.batch import Batch
-from tacsim.physics.worlds.driven import DrivenWorld
+from tacsim.physics.worlds.fem import FemWorld
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
 
@@ -25,7 +25,7 @@ BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=GEL
 STEP = 0.1e-3
 
 
-def nearer(world: DrivenWorld, by: float = STEP) -> dict[str, Pose]:
+def nearer(world: FemWorld, by: float = STEP) -> dict[str, Pose]:
     """Targets that bring the driven frames nearer to each other by `by` [m] in all."""
     first, second = world.snapshot()["poses"]
     names = list(world.truth().poses) if world.truth() is not None else ["lower", "indenter"]
@@ -33,7 +33,7 @@ def nearer(world: DrivenWorld, by: float = STEP) -> dict[str, Pose]:
     return {names[0]: Pose(first[:3] + up, first[3:]), names[1]: Pose(second[:3] - up, second[3:])}
 
 
-def force(world: DrivenWorld) -> float:
+def force(world: FemWorld) -> float:
     return -float(world.wrench("lower")[2])
 
 

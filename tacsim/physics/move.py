@@ -1,0 +1,50 @@
+"""What one motion of a world is asked for, and how it went."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from numbers import Real
+
+from tacsim.interface import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class MoveStats:
+    """How one motion went."""
+
+    substeps: int  # explicit substeps of motion and hold together
+    hold: int  # of which hold
+    residual: float  # largest relative force imbalance or force change at the end [-]
+    settled: bool  # residual <= the scene's tolerance
+    overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
+    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped) or met gels in one another
+    retries: int = 0  # times the motion was started again with half the time step
+    load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
+    time_step: float = 0.0  # as the way of the gel's pressure wave in it; of the last substep [m]
+    damping: float = 0.0  # of the gel in the last substep: its rate times the wave's time through the gel [-]
+    gel_overlap: float = 0.0  # deepest overlap of the two gels with one another at the end, which they do not feel [m]
+    courant: float = 0.0  # largest time step / time of the wave through the most squeezed element or grid cell [-]
+
+
+@dataclass(frozen=True, slots=True)
+class MoveCommand:
+    """What one motion of a world is asked for; see `World.move`."""
+
+    targets: Mapping[str, Pose]
+    loads: Mapping[str, float] = field(default_factory=dict)
+    duration: float | None = None
+    flow: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for options that exclude each other."""
+        if self.loads and self.duration is not None:
+            raise ValueError("loads are held in settled states, not in a motion with a duration: give one of the two")
+        if self.flow and (self.loads or self.duration is not None):
+            what = "loads are held in settled states" if self.loads else "a duration makes a motion dynamic"
+            raise ValueError(f"{what}, and a flowing motion is neither: give one of the two")
+
+
+def is_number(value: object) -> bool:
+    """Whether it is one real number, of Python or NumPy."""
+    return isinstance(value, Real)

@@ -1,0 +1,56 @@
+"""The state of a world as named arrays: copies of it, and how they are put back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import Pose
+
+State = Mapping[str, NDArray[Any]]  # arrays by name, in kernel units [mm, wave speed 1]
+
+
+def copies(arrays: State) -> dict[str, NDArray[Any]]:
+    """Copies in the same memory layout: particles' numbers are rows."""
+    return {name: a.copy(order="K") for name, a in arrays.items()}
+
+
+def snapshot_of(arrays: State, poses: Mapping[str, Pose]) -> dict[str, NDArray[Any]]:
+    """A snapshot: copies of a world's arrays, and the poses of its driven frames."""
+    state = copies(arrays)
+    state["poses"] = np.array([[*p.position, *p.quaternion] for p in poses.values()])
+    return state
+
+
+def restore_arrays(
+    arrays: State, frames: Sequence[str], state: State,
+    finite: Sequence[str] = (),
+) -> dict[str, Pose]:  # fmt: skip
+    """Copies a snapshot into a world's arrays; returns the poses.
+
+    finite: those of the arrays that no motion can begin from unless they are. Raises TypeError for what is no snapshot,
+    ValueError for one that does not fit; then nothing is changed.
+    """
+    if not isinstance(state, Mapping):
+        raise TypeError(f"a snapshot holds arrays by their names, as World.snapshot gives them; found {state!r}")
+    found = {name: np.asarray(state[name]) for name in (*arrays, "poses") if name in state}
+    for name, wanted in {**arrays, "poses": np.empty((len(frames), 7))}.items():
+        if name not in found or found[name].shape != wanted.shape:
+            shape = found[name].shape if name in found else "nothing"
+            raise ValueError(f"snapshot: '{name}' must have shape {wanted.shape}, found {shape}; is it of this scene?")
+        if not np.can_cast(found[name].dtype, wanted.dtype, "same_kind"):
+            raise ValueError(f"snapshot: '{name}' must hold {wanted.dtype}, found {found[name].dtype}")
+        if name in finite and not np.isfinite(found[name]).all():
+            raise ValueError(f"snapshot: '{name}' is not finite; restore another one")
+    poses = {}
+    for frame, numbers in zip(frames, found["poses"], strict=True):
+        try:
+            poses[frame] = Pose(numbers[:3], numbers[3:])
+        except ValueError as error:
+            raise ValueError(f"snapshot: 'poses' of '{frame}': {error}") from None
+    for name, a in arrays.items():
+        a[...] = found[name]
+    return poses

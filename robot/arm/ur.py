@@ -257,7 +257,7 @@ class URArm:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the worker
         written = self._link.states.count
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.arm.worker"],
+            [sys.executable, "-P", "-m", "robot.arm.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,

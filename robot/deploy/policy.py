@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 from tacsim.interface import Action, Needs, Observation, Policy, RigSpec
 from tacsim.tasks import Task
+
+PACKAGES = ("tacsim", "calibration", "robot")
 
 
 class PolicyNotFound(ValueError):
@@ -62,18 +66,30 @@ def _attribute(name: str) -> object:
     try:
         found: object = importlib.import_module(module_name)
     except ModuleNotFoundError as failure:
-        if failure.name is None or not (module_name + ".").startswith(failure.name + "."):
-            raise PolicyNotFound(
-                f"policy '{name}': module '{module_name}' itself imports '{failure.name}', which is missing"
-            ) from failure
-        raise PolicyNotFound(f"policy '{name}': no module '{failure.name}'; is its folder on PYTHONPATH?") from failure
+        missing = failure.name or ""
+        if not missing or not (module_name + ".").startswith(missing + "."):
+            why = f"module '{module_name}' itself imports '{missing}', which is missing{_namesake(missing)}"
+        else:
+            why = f"no module '{missing}'; is its folder on PYTHONPATH?{_namesake(missing)}"
+        raise PolicyNotFound(f"policy '{name}': {why}") from failure
     except (Exception, SystemExit) as failure:  # a script may end Python when it is imported
-        raise PolicyNotFound(f"policy '{name}': importing '{module_name}' failed: {failure!r}") from failure
+        why = f"importing '{module_name}' failed: {failure!r}{_namesake(str(failure))}"
+        raise PolicyNotFound(f"policy '{name}': {why}") from failure
     for part in path.split("."):
         if not hasattr(found, part):
-            raise PolicyNotFound(f"policy '{name}': '{module_name}' has no '{path}'")
+            raise PolicyNotFound(f"policy '{name}': '{module_name}' has no '{path}'{_namesake(module_name)}")
         found = getattr(found, part)
     return found
+
+
+def _namesake(words: str) -> str:
+    """What to add to an error that speaks of one of our packages: a file in the working folder has the same name."""
+    ours = Path(__file__).resolve().parents[2]
+    for package in PACKAGES:
+        for path in (Path(package).absolute(), Path(f"{package}.py").absolute()):
+            if re.search(rf"\b{package}\b", words) and path.exists() and path.resolve() != ours / package:
+                return f". '{package}' is a package of tacsim, {path} is not imported: rename it"
+    return ""
 
 
 def _as_policy(found: object, name: str) -> Policy:

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 PYTHONS = ((3, 11), (3, 14))  # from, up to but without
-OPENCV = "opencv-contrib-python-headless"  # the one distribution that may provide cv2 here
+OPENCV = "opencv-contrib-python-headless"  # the distribution that provides cv2
 State = Literal["ok", "warn", "fail"]
 
 
@@ -89,15 +89,20 @@ def _package(need: Requirement) -> Check:
 
 
 def second_opencv() -> list[Check]:
-    """Other opencv-* distributions write into the same cv2 folder; which files win is chance."""
+    """Other opencv-* distributions write into the same cv2 folder. Of one version they agree; else chance decides which
+    files win."""
     installed = {canonicalize_name(found.name): found.version for found in metadata.distributions() if found.name}
     others = sorted(name for name in installed if name.startswith("opencv-") and name != OPENCV)
     if not others:
         return [Check("one cv2", "ok", "no other opencv package")]
-    found = ", ".join(f"{name} {installed[name]}" for name in others) + f" beside {OPENCV}"
+    ours = installed.get(OPENCV, "")
+    found = f"{', '.join(f'{name} {installed[name]}' for name in others)} beside {OPENCV} {ours}"
+    if all(installed[name] == ours for name in others):
+        return [Check("one cv2", "ok", f"{found}: the same version")]
+    alike = " ".join(f"{name}=={ours}" for name in others)
     advice = (
-        f"python -m pip uninstall -y {' '.join(others)} && "
-        f"python -m pip install --force-reinstall --no-deps {OPENCV}=={installed.get(canonicalize_name(OPENCV), '4.*')}"
+        f"if nothing needs it: python -m pip uninstall -y {' '.join(others)}; else bring all to one version: "
+        f"python -m pip install {alike}. Then: python -m pip install --force-reinstall --no-deps {OPENCV}=={ours}"
     )
     return [Check("one cv2", "fail", found, advice)]
 
@@ -109,7 +114,9 @@ def opencv() -> list[Check]:
     found = f"{cv2.__version__} at {Path(cv2.__file__).parent}"
     if hasattr(cv2, "calibrateHandEye"):
         return [Check("cv2.calibrateHandEye", "ok", found)]
-    return [Check("cv2.calibrateHandEye", "fail", f"missing in {found}", f"python -m pip install '{OPENCV}>=4.13,<5'")]
+    return [
+        Check("cv2.calibrateHandEye", "fail", f"missing in {found}", f"python -m pip install '{OPENCV}>=4.13,<4.14'")
+    ]
 
 
 def taichi() -> list[Check]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from importlib import import_module
 from importlib.machinery import PathFinder
 
 TYPE_CHECKING = False  # typing itself would cost milliseconds at every start of Python
@@ -16,10 +17,24 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from importlib.machinery import ModuleSpec
     from types import ModuleType
+    from typing import Any
 
 
-ENTRY_POINT = "robot.open:make_env"  # named, not imported: tacsim stays below robot
 ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposition"}
+
+
+def make_env(**options: Any) -> Any:
+    """An environment by robot.open.make_env. Raises ImportError where another `robot` stands before ours."""
+    name = "robot.open"  # not an import statement: tacsim stays below robot
+    try:
+        return import_module(name).make_env(**options)
+    except ModuleNotFoundError as failure:
+        if failure.name != name:
+            raise
+        found = getattr(sys.modules.get("robot"), "__file__", None)
+        raise ImportError(
+            f"'robot' is {found}, not the package of tacsim: rename it, or run from another folder"
+        ) from failure
 
 
 def register_envs() -> None:
@@ -28,7 +43,7 @@ def register_envs() -> None:
 
     for name, task in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=ENTRY_POINT, kwargs={"task": task})
+            gymnasium.register(name, entry_point=f"{__name__}:make_env", kwargs={"task": task})
 
 
 def install() -> None:

@@ -72,7 +72,7 @@ class MockCamera:
         _check_options(host, port, width, height, fps, quality, allow_network)
         options = {"host": host, "port": port, "width": width, "height": height, "fps": fps, "quality": quality}
         # The package has imported this module by the time that it is run, which is no news.
-        command = [sys.executable, "-W", "ignore::RuntimeWarning:runpy", "-m", "robot.mock.camera.camera"]
+        command = [sys.executable, "-W", "ignore::RuntimeWarning:runpy", "-P", "-m", "robot.mock.camera.camera"]
         command += [part for name, value in options.items() for part in (f"--{name}", str(value))]
         command += ["--stamped"] * stamped + ["--allow-network"] * allow_network
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -81,7 +81,7 @@ class SimServer:
         root = str(Path(__file__).resolve().parents[3])
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.mock.cell.sim_server"],
+            [sys.executable, "-P", "-m", "robot.mock.cell.sim_server"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={"TACSIM_THREADS": "1", **os.environ, "PYTHONPATH": path},

@@ -63,7 +63,7 @@ class MockArms:
         check_hosts(self.hosts, allow_network)
         root = str(Path(__file__).resolve().parents[3])
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.mock", *arguments],
+            [sys.executable, "-P", "-m", "robot.mock", *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for the parent; the mock ends with it

@@ -50,15 +50,26 @@ def test_an_unknown_distribution_is_a_warning() -> None:
     assert check.state == "warn"
 
 
-@pytest.mark.parametrize("other", ["opencv-python", "OpenCV_Python_Headless"])
-def test_a_second_opencv_is_found_under_any_spelling(monkeypatch: pytest.MonkeyPatch, other: str) -> None:
-    ours = SimpleNamespace(name=machine.OPENCV, version="4.14.0.94")
-    monkeypatch.setattr(metadata, "distributions", lambda: [ours, SimpleNamespace(name=other, version="4.9.0")])
+@pytest.mark.parametrize(
+    ("other", "version", "state", "words"),
+    [
+        ("opencv-python", "4.9.0", "fail", "opencv-python 4.9.0 beside"),
+        ("OpenCV_Python_Headless", "4.9.0", "fail", "opencv-python-headless 4.9.0 beside"),
+        ("opencv-python-headless", "4.13.0.92", "ok", "the same version"),
+        ("no-opencv", "4.9.0", "ok", "no other opencv package"),
+    ],
+)
+def test_a_second_opencv_is_harmful_unless_of_the_same_version(
+    monkeypatch: pytest.MonkeyPatch, other: str, version: str, state: str, words: str
+) -> None:
+    installed = [
+        SimpleNamespace(name=machine.OPENCV, version="4.13.0.92"),
+        SimpleNamespace(name=other, version=version),
+    ]
+    monkeypatch.setattr(metadata, "distributions", lambda: installed)
     (check,) = machine.second_opencv()
-    assert check.state == "fail"
-    assert f"{machine.OPENCV}==4.14.0.94" in check.advice
-    monkeypatch.setattr(metadata, "distributions", lambda: [ours])
-    assert machine.second_opencv()[0].state == "ok"
+    assert check.state == state and words in check.found
+    assert (f"{machine.OPENCV}==4.13.0.92" in check.advice) == (state == "fail")
 
 
 def test_opencv_without_hand_eye_calibration_fails(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,7 +91,7 @@ def _package(need: Requirement) -> Check:
 def second_opencv() -> list[Check]:
     """Other opencv-* distributions write into the same cv2 folder. Of one version they agree; else chance decides which
     files win."""
-    installed = {canonicalize_name(found.name): found.version for found in metadata.distributions() if found.name}
+    installed = {str(canonicalize_name(each.name)): each.version for each in metadata.distributions() if each.name}
     others = sorted(name for name in installed if name.startswith("opencv-") and name != OPENCV)
     if not others:
         return [Check("one cv2", "ok", "no other opencv package")]

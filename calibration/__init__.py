@@ -1,0 +1,52 @@
+"""Real tactile sensors brought to the simulator's terms: light, lens, markers, poses, and how well the two agree.
+
+The names below are public: ``from calibration import read_bundle, FrameNormaliser``. A module is imported when a name
+of it is asked for. The paths of modules are private and may change from one version to the next.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tacsim.lazy import public_names
+
+if TYPE_CHECKING:
+    from calibration.bundle import BadBundle as BadBundle
+    from calibration.bundle import Calibration as Calibration
+    from calibration.bundle import read_bundle as read_bundle
+    from calibration.bundle import sensor_model as sensor_model
+    from calibration.bundle import write_bundle as write_bundle
+    from calibration.compare.compare import Comparison as Comparison
+    from calibration.compare.compare import Pairing as Pairing
+    from calibration.compare.compare import compare_frames as compare_frames
+    from calibration.compare.frame_set import Side as Side
+    from calibration.compare.frame_set import read_side as read_side
+    from calibration.errors import Unusable as Unusable
+    from calibration.lens.board import Board as Board
+    from calibration.lens.board import find_board as find_board
+    from calibration.lens.board import parse_board as parse_board
+    from calibration.lens.view import GelView as GelView
+    from calibration.lens.view import Lens as Lens
+    from calibration.lens.view import board_pose as board_pose
+    from calibration.lens.view import fit_lens as fit_lens
+    from calibration.lens.view import fit_view as fit_view
+    from calibration.lens.view import view_of_corners as view_of_corners
+    from calibration.light.ball_press import calibrate_light as calibrate_light
+    from calibration.light.image_folder import read_presses as read_presses
+    from calibration.light.noise import measure_noise as measure_noise
+    from calibration.markers.flow import MarkerFlow as MarkerFlow
+    from calibration.markers.flow import find_markers as find_markers
+    from calibration.normaliser import FrameNormaliser as FrameNormaliser
+    from calibration.normaliser import for_calibrated as for_calibrated
+    from calibration.normaliser import for_camera as for_camera
+    from calibration.normaliser import for_pictures as for_pictures
+    from calibration.normaliser import for_recorded as for_recorded
+    from calibration.normaliser import for_simulated as for_simulated
+    from calibration.poses.ball_touch import TouchFit as TouchFit
+    from calibration.poses.ball_touch import fit_touches as fit_touches
+    from calibration.poses.hand_eye import HandEyeFit as HandEyeFit
+    from calibration.poses.hand_eye import fit_hand_eye as fit_hand_eye
+    from calibration.poses.latency import Latency as Latency
+    from calibration.poses.latency import estimate_latency as estimate_latency
+else:
+    __getattr__, __dir__ = public_names(__name__)

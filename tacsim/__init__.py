@@ -1,0 +1,101 @@
+"""The contract between tactile rigs and policies, the simulator, the tasks, and the record of episodes.
+
+The names below are public: ``from tacsim import Observation, Action, Rig``. A module is imported when a name of it is
+asked for. The paths of modules are private and may change from one version to the next.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tacsim.lazy import public_names
+
+if TYPE_CHECKING:
+    from tacsim import pose as pose
+    from tacsim.config import ConfigError as ConfigError
+    from tacsim.config import LoadedRig as LoadedRig
+    from tacsim.config import config_root as config_root
+    from tacsim.config import json_schema as json_schema
+    from tacsim.config import load_rig as load_rig
+    from tacsim.config import load_scene as load_scene
+    from tacsim.config import load_sensor as load_sensor
+    from tacsim.config import load_task as load_task
+    from tacsim.control.contact_signal import contact_signal as contact_signal
+    from tacsim.gym.env import TacsimEnv as TacsimEnv
+    from tacsim.interface import Action as Action
+    from tacsim.interface import Arm as Arm
+    from tacsim.interface import ArmState as ArmState
+    from tacsim.interface import Clock as Clock
+    from tacsim.interface import EndOfEpisode as EndOfEpisode
+    from tacsim.interface import IncompatibleRig as IncompatibleRig
+    from tacsim.interface import Needs as Needs
+    from tacsim.interface import Normaliser as Normaliser
+    from tacsim.interface import Observation as Observation
+    from tacsim.interface import Policy as Policy
+    from tacsim.interface import Pose as Pose
+    from tacsim.interface import RigSpec as RigSpec
+    from tacsim.interface import SensorSpec as SensorSpec
+    from tacsim.interface import SurfaceMap as SurfaceMap
+    from tacsim.interface import TactileFrame as TactileFrame
+    from tacsim.interface import TactileObservation as TactileObservation
+    from tacsim.interface import TactileSource as TactileSource
+    from tacsim.interface import Truth as Truth
+    from tacsim.limits import ActionError as ActionError
+    from tacsim.limits import LimitExceeded as LimitExceeded
+    from tacsim.models.hardware import ArmLimits as ArmLimits
+    from tacsim.models.hardware import CameraSensorConfig as CameraSensorConfig
+    from tacsim.models.hardware import KeepOut as KeepOut
+    from tacsim.models.hardware import Placement as Placement
+    from tacsim.models.hardware import UrArmConfig as UrArmConfig
+    from tacsim.models.hardware import Workspace as Workspace
+    from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
+    from tacsim.models.rig import ReplaySensorConfig as ReplaySensorConfig
+    from tacsim.models.rig import RepositionConfig as RepositionConfig
+    from tacsim.models.rig import RigConfig as RigConfig
+    from tacsim.models.rig import SimArmConfig as SimArmConfig
+    from tacsim.models.rig import SimSensorConfig as SimSensorConfig
+    from tacsim.models.rig import SqueezeConfig as SqueezeConfig
+    from tacsim.models.scene import Body as Body
+    from tacsim.models.scene import BodyMaterial as BodyMaterial
+    from tacsim.models.scene import Box as Box
+    from tacsim.models.scene import Cylinder as Cylinder
+    from tacsim.models.scene import Gel as Gel
+    from tacsim.models.scene import GelMaterial as GelMaterial
+    from tacsim.models.scene import GelSurface as GelSurface
+    from tacsim.models.scene import Indenter as Indenter
+    from tacsim.models.scene import Mesh as Mesh
+    from tacsim.models.scene import Scene as Scene
+    from tacsim.models.scene import Settling as Settling
+    from tacsim.models.scene import Sphere as Sphere
+    from tacsim.models.sensor import CameraNoise as CameraNoise
+    from tacsim.models.sensor import CanonicalGrid as CanonicalGrid
+    from tacsim.models.sensor import Light as Light
+    from tacsim.models.sensor import Lighting as Lighting
+    from tacsim.models.sensor import Markers as Markers
+    from tacsim.models.sensor import SensorGeometry as SensorGeometry
+    from tacsim.models.sensor import SensorModel as SensorModel
+    from tacsim.optics.render import Renderer as Renderer
+    from tacsim.optics.surface import surface_map as surface_map
+    from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
+    from tacsim.physics.worlds.batch import Batch as Batch
+    from tacsim.physics.worlds.world import MoveStats as MoveStats
+    from tacsim.physics.worlds.world import World as World
+    from tacsim.physics.worlds.world import make_world as make_world
+    from tacsim.record.episode import Episode as Episode
+    from tacsim.record.episode import EpisodeError as EpisodeError
+    from tacsim.record.episode import EpisodeMeta as EpisodeMeta
+    from tacsim.record.episode import Step as Step
+    from tacsim.record.reader import iter_steps as iter_steps
+    from tacsim.record.reader import read_episode as read_episode
+    from tacsim.record.writer import Recorder as Recorder
+    from tacsim.report.report import write_report as write_report
+    from tacsim.rig import Rig as Rig
+    from tacsim.tasks import Outcome as Outcome
+    from tacsim.tasks import Reposition as Reposition
+    from tacsim.tasks import Squeeze as Squeeze
+    from tacsim.tasks import Task as Task
+    from tacsim.tasks import judge as judge
+    from tacsim.tasks import make_task as make_task
+    from tacsim.tasks.grip import Grip as Grip
+else:
+    __getattr__, __dir__ = public_names(__name__)

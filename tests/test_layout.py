@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import json
 import re
 import subprocess
 import sys
@@ -17,6 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("tacsim", "calibration", "robot")  # each imports only itself and those before it
 HEAVY = {"taichi", "cv2", "rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
 LIGHT_IMPORTS = (*PACKAGES, "tacsim.interface", "tacsim.config", "robot.open", "robot.cli")
+API: dict[str, list[str]] = json.loads((ROOT / "tests/api_surface.json").read_text(encoding="utf-8"))
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in MODULES}
 
@@ -85,6 +88,17 @@ def test_importing_is_light(module: str) -> None:
     assert done.stdout.split() == [], f"`import {module}` loads {done.stdout.strip()}: import it inside the function"
 
 
+@pytest.mark.parametrize("package", API)
+def test_public_names_are_those_of_the_list(package: str) -> None:
+    """A name leaves tests/api_surface.json only with a line in CHANGELOG.md."""
+    module = importlib.import_module(package)
+    assert sorted(module.__all__) == API[package]
+    for public in API[package]:
+        assert getattr(module, public) is not None
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
+        module.nothing  # noqa: B018
+
+
 def test_only_runtime_imports_taichi() -> None:
     found = {name(path) for path, tree in TREES.items() if "taichi" in map(top, imports(tree))}
     assert found == {"tacsim/compute/runtime.py"}
@@ -118,7 +132,12 @@ def test_kernel_files_keep_their_annotations() -> None:
 def test_mypy_spares_kernel_files_and_no_other() -> None:
     overrides = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]["overrides"]
     (spared,) = (item["module"] for item in overrides if item.get("check_untyped_defs") is False)
-    kernels = {name(path).removesuffix(".py").replace("/", ".") for path, tree in TREES.items() if has_kernels(tree)}
+    benchmarks = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "benchmarks").rglob("*.py")}
+    kernels = {
+        name(path).removesuffix(".py").replace("/", ".")
+        for path, tree in (TREES | benchmarks).items()
+        if has_kernels(tree)
+    }
     assert set(spared) == kernels
 
 

@@ -136,7 +136,7 @@ class Options:
 USUAL = Options()
 
 
-def compare(
+def compare_frames(
     a: Side,
     b: Side,
     calibration_a: Calibration | None = None,

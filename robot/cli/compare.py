@@ -72,7 +72,7 @@ def compare(
     folder = new_directory(out, "compare")
     with busy("loading"):
         from calibration.compare.compare import Options, Pairing
-        from calibration.compare.compare import compare as run
+        from calibration.compare.compare import compare_frames as run
         from calibration.compare.frame_set import BadSide
         from calibration.compare.report import figures, write
         from calibration.lens.rectification import BadCorners

@@ -104,7 +104,7 @@ def _fold(
     """Left-out presses by our gel, compared with the real ones in both ways; the calibration that has not seen them;
     wall and processor time of pressing; what to look at."""
     from calibration.bundle import sensor_model, write_bundle
-    from calibration.compare.compare import compare
+    from calibration.compare.compare import compare_frames
     from calibration.compare.frame_set import Shot, Side
     from calibration.light.ball_press import BadPresses, calibrate_light
     from robot.studies.matched_press import press_like
@@ -128,8 +128,8 @@ def _fold(
         ours, said = press_like(real, scene, sensor_model(Path(place)), GRID)
     taken = perf_counter() - wall, process_time() - cpu
     both = {
-        "pictures": compare(ours, real, calibration, calibration),
-        "surfaces": compare(ours, real, None, calibration),
+        "pictures": compare_frames(ours, real, calibration, calibration),
+        "surfaces": compare_frames(ours, real, None, calibration),
     }
     return both, calibration, taken, said
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from calibration.compare.alignment import by_geometry, by_size
-from calibration.compare.compare import METRICS, Comparison, Options, Pairing, bootstrap, compare, paired
+from calibration.compare.compare import METRICS, Comparison, Options, Pairing, bootstrap, compare_frames, paired
 from calibration.compare.frame_set import BadSide, Shot, Side, read_side, rectangle, through_corners
 from calibration.compare.report import as_json, figures, write
 from calibration.lens.rectification import BadCorners
@@ -45,7 +45,7 @@ def other(real: Side) -> Side:
 
 @pytest.fixture(scope="module")
 def compared(good: Side, real: Side) -> Comparison:
-    return compare(good, real)
+    return compare_frames(good, real)
 
 
 def test_a_good_simulation_surely_beats_the_null_and_comes_near_the_floor(compared: Comparison) -> None:
@@ -62,7 +62,7 @@ def test_a_good_simulation_surely_beats_the_null_and_comes_near_the_floor(compar
 
 
 def test_a_blank_beats_no_null(real: Side) -> None:
-    result = compare(blank(real), real)
+    result = compare_frames(blank(real), real)
     for key in ("mae", "psnr", "ssim", "contact_mae", "contact_psnr", "contact_ssim", "contact_ncc", "contact_iou"):
         assert result.overall[key].beats_null is False, key
         assert result.overall[key].mean == result.overall[key].null
@@ -71,7 +71,7 @@ def test_a_blank_beats_no_null(real: Side) -> None:
 
 
 def test_another_light_is_told_from_the_right_one(other: Side, real: Side, compared: Comparison) -> None:
-    result = compare(other, real)
+    result = compare_frames(other, real)
     assert result.overall["contact_mae"].mean > 5 * compared.overall["contact_mae"].mean
     assert result.overall["contact_ncc"].mean < 0.9
     assert math.hypot(*result.alignment.shift) < 3  # contacts are found in any light
@@ -79,25 +79,25 @@ def test_another_light_is_told_from_the_right_one(other: Side, real: Side, compa
 
 def test_the_whole_picture_flatters_where_the_contact_does_not(real: Side) -> None:
     """A blank scores high on all of the picture: the reason for the null and the contact region."""
-    result = compare(blank(real), real)
+    result = compare_frames(blank(real), real)
     assert result.overall["ssim"].mean > result.overall["contact_ssim"].mean + 0.1
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (3.4, -2.7), (-8.25, 5.5)])
 def test_a_known_shift_is_found_and_undone(good: Side, real: Side, shift: tuple[float, float]) -> None:
     moved = changed(good, lambda image: shifted(image, *shift), "all")
-    result = compare(moved, real)
+    result = compare_frames(moved, real)
     assert result.alignment.shift == pytest.approx(shift, abs=0.1)
     assert result.overall["contact_ncc"].mean > 0.97
     if shift != (0.0, 0.0):
-        unmoved = compare(moved, real, options=Options(shift=False))
+        unmoved = compare_frames(moved, real, options=Options(shift=False))
         assert unmoved.alignment.shift == (0.0, 0.0)
         assert unmoved.overall["contact_mae"].mean > 1.5 * result.overall["contact_mae"].mean
 
 
 def test_a_picture_of_twice_the_size_is_scaled(good: Side, real: Side) -> None:
     twice = changed(good, lambda image: image.repeat(2, axis=0).repeat(2, axis=1), "all")
-    result = compare(twice, real)
+    result = compare_frames(twice, real)
     assert result.overall["contact_ncc"].mean > 0.98
     assert result.alignment.shift == pytest.approx((0.0, 0.0), abs=0.1)
     assert "scaled by 0.5" in result.alignment.said
@@ -130,8 +130,8 @@ def test_corners_undo_a_slanted_view(real: Side) -> None:
     slanted = changed(real, lambda image: cv2.warpPerspective(image, matrix, (COLUMNS, ROWS)), "all")
     corners = tuple((float(u), float(v)) for u, v in inset)
     straight = through_corners(slanted, corners, real.shape)
-    assert compare(slanted, real).overall["contact_ncc"].mean < 0.8
-    assert compare(straight, real).overall["contact_ncc"].mean > 0.97
+    assert compare_frames(slanted, real).overall["contact_ncc"].mean < 0.8
+    assert compare_frames(straight, real).overall["contact_ncc"].mean > 0.97
     assert rectangle(corners) == (182, 239)  # the longest sides: right and bottom
     outside = ((-20.0, 0.0), corners[1], corners[2], corners[3])
     with pytest.raises(BadCorners, match="beyond the picture"):
@@ -151,7 +151,7 @@ def test_surfaces_that_a_simulation_knows_are_compared() -> None:
         surface = SurfaceMap(factor * height, factor * gradient, flow)
         return replace(plain, shots=tuple(replace(shot, surface=surface) for shot in plain.shots))
 
-    result = compare(knowing(0.9, 3e-5), knowing(1.0, 0.0))
+    result = compare_frames(knowing(0.9, 3e-5), knowing(1.0, 0.0))
     assert result.overall["marker_error"].mean == pytest.approx(3e-5 * math.sqrt(2), rel=1e-5)
     assert 0.05 < result.overall["height_share"].mean < 0.1  # a tenth too low, where it is at least half as deep
     assert result.overall["surface_iou"].mean == 1.0  # half of its own depth: the same place
@@ -168,7 +168,7 @@ def test_without_surfaces_it_says_so(compared: Comparison) -> None:
 
 
 def test_a_lone_reference_has_no_floor(good: Side, real: Side) -> None:
-    result = compare(good, replace(real, untouched=()))
+    result = compare_frames(good, replace(real, untouched=()))
     assert math.isnan(result.overall["contact_mae"].floor)
     assert "noise floor absent: B has no second frame without contact" in result.notes
 
@@ -176,7 +176,7 @@ def test_a_lone_reference_has_no_floor(good: Side, real: Side) -> None:
 def test_frames_without_contact_on_both_sides_make_the_floor(good: Side, real: Side) -> None:
     still_a = replace(good, shots=(*good.shots, Shot("still.png", good.reference)))
     still_b = replace(real, shots=(*real.shots, Shot("still.png", real.untouched[0].image)), untouched=())
-    result = compare(still_a, still_b)
+    result = compare_frames(still_a, still_b)
     assert result.overall["contact_mae"].floor == pytest.approx(1.69, abs=0.15)
     assert result.pairs[-1].flags == ("A: no contact", "B: no contact")
     assert math.isnan(result.pairs[-1].numbers["contact_mae"])
@@ -217,7 +217,7 @@ def test_counts_that_differ_are_refused_unless_names_decide(real: Side) -> None:
 
 
 def test_one_frame_has_numbers_but_no_interval(good: Side, real: Side) -> None:
-    result = compare(replace(good, shots=good.shots[:1]), replace(real, shots=real.shots[:1]))
+    result = compare_frames(replace(good, shots=good.shots[:1]), replace(real, shots=real.shots[:1]))
     error = result.overall["contact_mae"]
     assert error.mean < 3 and math.isnan(error.low) and error.beats_null is None
     assert "1 pair: too few for intervals; 3 are the least" in result.notes
@@ -225,33 +225,33 @@ def test_one_frame_has_numbers_but_no_interval(good: Side, real: Side) -> None:
 
 def test_saturated_frames_are_flagged(good: Side, real: Side) -> None:
     burnt = changed(real, lambda image: np.clip(image.astype(int) * 2, 0, 255).astype(np.uint8), "all")
-    result = compare(good, burnt)
+    result = compare_frames(good, burnt)
     assert any(flag.startswith("B: saturated: ") for pair in result.pairs for flag in pair.flags)
-    clean = compare(good, real)
+    clean = compare_frames(good, real)
     assert not any("saturated" in flag for pair in clean.pairs for flag in pair.flags)
 
 
 def test_a_stale_reference_is_flagged(good: Side, real: Side) -> None:
     stale = changed(real, lambda image: np.clip(image.astype(int) + 9, 0, 255).astype(np.uint8))
-    result = compare(good, stale)
+    result = compare_frames(good, stale)
     assert all(any("B: stale reference" in flag and "9 grey" in flag for flag in pair.flags) for pair in result.pairs)
 
 
 def test_swapped_colours_are_noticed(good: Side, real: Side, compared: Comparison) -> None:
     bgr = changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all")
-    assert any("red and blue look swapped" in note for note in compare(bgr, real).notes)
+    assert any("red and blue look swapped" in note for note in compare_frames(bgr, real).notes)
     assert not any("swapped" in note for note in compared.notes)
 
 
 def test_sizes_of_other_proportions_need_a_calibration(good: Side, real: Side) -> None:
     cut = changed(good, lambda image: image[:, :200], "all")
     with pytest.raises(BadSide, match=r"A is 200 x 200 px, B 260 x 200.*--calibration-a.*--corners-a"):
-        compare(cut, real)
+        compare_frames(cut, real)
 
 
 def test_pairs_that_are_none_are_not_shifted(real: Side) -> None:
     elsewhere = side(HiddenSensor(3), places=[(190, 140), (70, 60), (60, 150), (200, 60), (130, 50)])
-    result = compare(elsewhere, real)
+    result = compare_frames(elsewhere, real)
     assert result.alignment.shift == (0.0, 0.0)
     assert "not shifted" in result.alignment.said
 
@@ -374,14 +374,14 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
 def test_names_of_files_are_no_markup(good: Side, real: Side, tmp_path: Path) -> None:
     evil = "<img src=x onerror=alert(1)>.png"
     shots = (replace(good.shots[0], name=evil), *good.shots[1:])
-    result = compare(replace(good, shots=shots, name="<b>A</b>"), real)
+    result = compare_frames(replace(good, shots=shots, name="<b>A</b>"), real)
     page = write(tmp_path, result)[2].read_text(encoding="utf-8")
     assert evil not in page and "<b>A</b>" not in page
     assert "&lt;img src=x" in page
 
 
 def test_a_comparison_with_itself_can_be_written(real: Side, tmp_path: Path) -> None:
-    result = compare(real, real)
+    result = compare_frames(real, real)
     assert result.overall["psnr"].mean == math.inf
     config = json.loads(write(tmp_path, result)[0].read_text(encoding="utf-8"))
     assert config["overall"]["mae"]["mean"] == 0.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.bundle import Calibration
-from calibration.compare.compare import Comparison, compare
+from calibration.compare.compare import Comparison, compare_frames
 from calibration.compare.frame_set import BadSide, Side
 from calibration.compare.invariance import (
     CHANGES,
@@ -95,7 +95,7 @@ def good(real: Side, calibration: Calibration) -> Comparison:
     sensor = HiddenSensor(3)
     sensor.empty()
     made = replace(side(sensor, 6, name="good"), reference=real.reference, untouched=())
-    return compare(made, real, calibration, calibration)
+    return compare_frames(made, real, calibration, calibration)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_another_light_is_seen_in_the_picture_but_hardly_in_the_surface(real: Si
     """The claim of all this: each source's own calibration brings them together."""
     sensor = HiddenSensor(8)
     own, _ = calibrated(HiddenSensor(8))
-    found = invariance(compare(replace(side(sensor, 6), untouched=()), real, own, calibration), calibration)
+    found = invariance(compare_frames(replace(side(sensor, 6), untouched=()), real, own, calibration), calibration)
     views = {view.view: view for view in found.views}
     assert views["raw"].rho > 1 and views["raw"].auc == 1.0
     assert views["difference"].rho > 1
@@ -132,7 +132,7 @@ def test_a_fresh_reference_saves_from_a_change_of_gain(report: Report) -> None:
 
 
 def test_surfaces_and_drift_are_left_out_with_a_word(real: Side) -> None:
-    found = invariance(compare(replace(real, untouched=()), real))
+    found = invariance(compare_frames(replace(real, untouched=()), real))
     assert [view.view for view in found.views] == ["raw", "difference"]
     assert found.drifts == () and math.isnan(found.angle)
     assert len(found.notes) == 2
@@ -142,7 +142,7 @@ def test_surfaces_and_drift_are_left_out_with_a_word(real: Side) -> None:
 
 def test_too_few_presses_are_refused(real: Side) -> None:
     with pytest.raises(BadSide, match="3 pairs show contact in B; 4 are needed"):
-        invariance(compare(replace(real, shots=real.shots[:3]), replace(real, shots=real.shots[:3])))
+        invariance(compare_frames(replace(real, shots=real.shots[:3]), replace(real, shots=real.shots[:3])))
 
 
 def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: Path) -> None:

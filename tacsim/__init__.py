@@ -77,10 +77,10 @@ if TYPE_CHECKING:
     from tacsim.optics.render import Renderer as Renderer
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
+    from tacsim.physics.move import MoveStats as MoveStats
+    from tacsim.physics.world import World as World
+    from tacsim.physics.world import make_world as make_world
     from tacsim.physics.worlds.batch import Batch as Batch
-    from tacsim.physics.worlds.world import MoveStats as MoveStats
-    from tacsim.physics.worlds.world import World as World
-    from tacsim.physics.worlds.world import make_world as make_world
     from tacsim.record.episode import Episode as Episode
     from tacsim.record.episode import EpisodeError as EpisodeError
     from tacsim.record.episode import EpisodeMeta as EpisodeMeta

@@ -20,7 +20,7 @@ from tacsim.rig import Rig
 
 if TYPE_CHECKING:
     from calibration.normaliser import FrameNormaliser
-    from tacsim.control.gel_monitor import GelWatch
+    from tacsim.control.gel_monitor import GelMonitor
     from tacsim.gym.env import TacsimEnv
     from tacsim.models.scene import Scene
     from tacsim.models.sensor import CanonicalGrid
@@ -140,9 +140,9 @@ def _check_parts(config: RigConfig) -> None:
 def _open_sim(config: RigConfig) -> Rig:
     """One World seen as sensors, arms and a clock."""
     from calibration.normaliser import for_simulated
-    from tacsim.compute.threads import at_once
+    from tacsim.compute.threads import map_parallel
     from tacsim.physics.world import make_world
-    from tacsim.sim.sensor import SimArm, SimClock, SimStart
+    from tacsim.sim.sensor import SimArm, SimClock, SimReset
 
     scene = config.scene
     if scene is None:
@@ -174,17 +174,17 @@ def _open_sim(config: RigConfig) -> Rig:
         normalisers={
             name: for_simulated(sensor.model, scene.gel.size[:2], config.canonical) for name, sensor in models.items()
         },
-        start=SimStart(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
+        reset=SimReset(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
-        gather=at_once,
-        watch=_gel_watch(config, sensors),
-        held=held_loads(config.task),
+        gather=map_parallel,
+        on_tactile=_gel_monitor(config, sensors),
+        admittance=held_loads(config.task),
     )
 
 
-def _gel_watch(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelWatch | None:
-    from tacsim.control.gel_monitor import GelWatch
+def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
+    from tacsim.control.gel_monitor import GelMonitor
 
     limits = {
         name: arm.limits
@@ -192,7 +192,7 @@ def _gel_watch(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelWatch 
         if isinstance(arm, SimArmConfig) and arm.limits is not None
     }
     try:
-        return GelWatch({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
+        return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
     except ValueError as failure:
         raise CannotOpen(f"rig '{config.name}': {failure}") from None
 
@@ -285,7 +285,7 @@ def _open_replay(config: RigConfig) -> Rig:
             arms=arms,
             clock=clock,
             normalisers=normalisers,
-            start=_Rewind(clock, sensors),
+            reset=_Rewind(clock, sensors),
         )
         stack.pop_all()
         return rig

@@ -73,7 +73,7 @@ def check_workspace(target: Pose, lower: ArrayLike, upper: ArrayLike, arm: str) 
     return target
 
 
-def shorten(target: Pose, now: Pose, longest: float, widest: float) -> Pose:
+def limit_step(target: Pose, now: Pose, longest: float, widest: float) -> Pose:
     """`target` itself if it is within `longest` [m] and `widest` [rad] of `now`; otherwise the farthest pose on the
     straight way there (translation and rotation in step) that is. The caller tells what was really sent.
 
@@ -150,16 +150,16 @@ def region(lower: ArrayLike, upper: ArrayLike, planes: Iterable[tuple[ArrayLike,
     return Region(np.array(normals), np.array(offsets), tuple(names))
 
 
-def way_inside(start: ArrayLike, end: ArrayLike, inside: Region) -> float:
+def fraction_inside(start: ArrayLike, end: ArrayLike, inside: Region) -> float:
     """How much of the straight way from `start` to `end` (3,) [m] lies in the region, as a fraction from the start.
 
     From outside, a way that ends inside is free (it only gets better), and any other is closed.
     """
-    return float(ways_inside(start, end, inside))
+    return float(fractions_inside(start, end, inside))
 
 
-def ways_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> FloatArray:
-    """:func:`way_inside` of many ways at once: (..., 3) and (..., 3) -> (...,)."""
+def fractions_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> FloatArray:
+    """:func:`fraction_inside` of many ways at once: (..., 3) and (..., 3) -> (...,)."""
     here = np.asarray(starts, dtype=np.float64) @ inside.normals.T - inside.offsets
     there = np.asarray(ends, dtype=np.float64) @ inside.normals.T - inside.offsets
     shares: FloatArray = np.maximum(-here, 0.0) / (there - here).clip(min=ROUNDING)
@@ -167,7 +167,7 @@ def ways_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> FloatArra
     return least
 
 
-def way_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: float) -> float:
+def fraction_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: float) -> float:
     """How much of the straight way from `start` to `end` (3,) [m] stays `distance` [m] from `centre` (3,), as a
     fraction from the start. From inside the sphere, a way that leads away from the centre is free."""
     first, way = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64) - np.asarray(start)
@@ -181,15 +181,15 @@ def way_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: flo
     return 1.0 if root <= 0.0 else min(1.0, gap / (-along + float(np.sqrt(root))))
 
 
-def admit(
+def clip_to_region(
     target: Pose, now: Pose, inside: Region | None, apart: Iterable[tuple[ArrayLike, float]] = ()
 ) -> tuple[Pose, float]:
     """`target` itself if the whole straight way from `now` lies `inside` (None: anywhere) and keeps clear of the
     spheres `apart` (centre (3,), distance [m]); otherwise the farthest pose on it that does. Also the fraction of the
     way that is left."""
-    share = 1.0 if inside is None else way_inside(now.position, target.position, inside)
+    share = 1.0 if inside is None else fraction_inside(now.position, target.position, inside)
     for centre, distance in apart:
-        share = min(share, way_clear(now.position, target.position, centre, distance))
+        share = min(share, fraction_clear(now.position, target.position, centre, distance))
     if share >= 1.0:
         return target, 1.0
     from tacsim import pose as se3
@@ -211,7 +211,7 @@ def braking_end(position: ArrayLike, velocity: ArrayLike, deceleration: float) -
     return rest
 
 
-def overload(wrench: ArrayLike, force: float, torque: float) -> bool:
+def exceeds_wrench(wrench: ArrayLike, force: float, torque: float) -> bool:
     """True if `wrench` (6,) is heavier than `force` [N] or `torque` [N m], or is not a number: then nothing guards."""
     load = np.asarray(wrench, dtype=np.float64).tolist()
     return not (math.hypot(*load[:3]) <= force and math.hypot(*load[3:]) <= torque)
@@ -230,7 +230,7 @@ def joint_step_excess(before: ArrayLike, after: ArrayLike, speed: float, period:
     return share if np.isfinite(share) else float("inf")
 
 
-def segments_apart(a0: ArrayLike, a1: ArrayLike, b0: ArrayLike, b1: ArrayLike) -> float:
+def segment_distance(a0: ArrayLike, a1: ArrayLike, b0: ArrayLike, b1: ArrayLike) -> float:
     """The least distance of two straight pieces, from `a0` to `a1` and from `b0` to `b1` (3,) [m].
 
     Ericson, Real-Time Collision Detection (2005), 5.1.9.

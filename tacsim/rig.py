@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, Self
 
-from tacsim.compute.threads import one_by_one
+from tacsim.compute.threads import map_serial
 from tacsim.interface import (
     Action,
     Arm,
@@ -29,8 +29,11 @@ if TYPE_CHECKING:
     from tacsim.control.admittance import Admittance
 
 
-class Start(Protocol):
-    """What brings a rig to the start of an episode; `Rig.reset` calls the two in this order."""
+READ_TIMEOUT = 1.0  # longest wait for a frame [s]
+
+
+class Reset(Protocol):
+    """Brings a rig to the start of an episode; `Rig.reset` calls `clear`, then `touch`."""
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
         """Takes the gels clear of everything; returns a frame of each sensor without contact, the references I0."""
@@ -42,20 +45,19 @@ class Start(Protocol):
 
 
 class Rig:
-    """What a policy acts on. `tacsim.rig.Rig` never asks what kind of sensors and arms it holds.
+    """What a policy acts on. It never asks what kind of sensors and arms it holds.
 
     Args:
         name: for messages and records.
         sensors, arms: by name.
         normalisers: one for each sensor.
-        start: brings the rig to the start of an episode.
+        reset: brings the rig to the start of an episode.
         truth: the body as only a simulation knows it; None on rigs without.
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
-        read_timeout: how long to wait for a frame [s].
-        gather: how the sensors are read: one by one, or all at once where that is faster (tacsim.compute.threads).
-        beside: closes what the rig needs besides sensors and arms, after them.
-        watch: looks at what is touched before anybody acts on it, and raises what ends the episode.
-        held: normal forces that arms hold, whatever the actions ask along the z of their sensors; None: none.
+        gather: how the sensors are read: one by one, or in parallel where that is faster (tacsim.compute.threads).
+        on_tactile: called with every tactile observation before anybody acts on it; raises what ends the episode.
+        on_close: closes what the rig needs besides sensors and arms, after them.
+        admittance: holds normal forces, whatever the actions ask along the z axis of the sensors.
     """
 
     def __init__(
@@ -66,23 +68,22 @@ class Rig:
         arms: Mapping[str, Arm],
         clock: Clock,
         normalisers: Mapping[str, Normaliser],
-        start: Start,
+        reset: Reset,
         truth: Callable[[], Truth | None] | None = None,
         diagnostics: Callable[[], Mapping[str, float]] = dict,
-        read_timeout: float = 1.0,
-        gather: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = one_by_one,
-        beside: Callable[[], None] | None = None,
-        watch: Callable[[Mapping[str, TactileObservation]], None] | None = None,
-        held: Admittance | None = None,
+        gather: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = map_serial,
+        on_tactile: Callable[[Mapping[str, TactileObservation]], None] | None = None,
+        on_close: Callable[[], None] | None = None,
+        admittance: Admittance | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
         self.name = name
         self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
-        self._normalisers, self._start, self._truth = dict(normalisers), start, truth
-        self._diagnostics, self._timeout, self._beside = diagnostics, read_timeout, beside
-        self._gather, self._watch, self._held = gather, watch, held
-        self._felt: Mapping[str, ArmState] = {}
+        self._normalisers, self._reset, self._truth = dict(normalisers), reset, truth
+        self._diagnostics, self._gather, self._admittance = diagnostics, gather, admittance
+        self._on_tactile, self._on_close = on_tactile, on_close
+        self._arm_states: Mapping[str, ArmState] = {}
         self._frames: Mapping[str, TactileFrame] = {}
         self._references: Mapping[str, TactileFrame] = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
@@ -123,29 +124,29 @@ class Rig:
             raise IncompatibleRig(f"{who} cannot run on rig '{self.name}': it lacks {'; '.join(missing)}. It has {has}")
 
     def reset(self, seed: int = 0) -> Observation:
-        """References without contact, then gentle contact: the start of an episode. Same seed, same start."""
-        self._references = dict(self._start.clear(seed))
+        """Starts an episode: references without contact, then gentle contact. The same seed gives the same start."""
+        self._references = dict(self._reset.clear(seed))
         for name, normaliser in self._normalisers.items():
             normaliser.take_reference(self._references[name])
-        self._start.touch()
-        if self._held is not None:
-            self._held.reset()
+        self._reset.touch()
+        if self._admittance is not None:
+            self._admittance.reset()
         return self.observe()
 
     def observe(self) -> Observation:
-        """What the sensors say now, and what the arms that carry them said when the pictures were exposed.
+        """The newest tactile observations, and the states that the arms had when those pictures were exposed.
 
         Raises TimeoutError without a frame, EndOfEpisode after a recording.
         """
-        reads = [partial(sensor.read, self._timeout) for sensor in self._sensors.values()]
+        reads = [partial(sensor.read, READ_TIMEOUT) for sensor in self._sensors.values()]
         frames = dict(zip(self._sensors, self._gather(reads), strict=True))
         exposed = {self._sensors[name].spec.arm: frame.time for name, frame in frames.items()}
         arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self._arms.items()}
         now = self._clock.now()
         tactile = {name: self._normalisers[name](frame, now) for name, frame in frames.items()}
-        self._frames, self._felt = frames, arms
-        if self._watch is not None:
-            self._watch(tactile)
+        self._frames, self._arm_states = frames, arms
+        if self._on_tactile is not None:
+            self._on_tactile(tactile)
         return Observation(tactile=tactile, arms=arms, time=now)
 
     def step(self, action: Action) -> tuple[Observation, Mapping[str, Pose | None]]:
@@ -155,11 +156,11 @@ class Rig:
         Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged.
         """
         check_action(action, self._addressable, self.name)
-        if self._held is not None:
-            action = self._held(action, self._felt)
+        if self._admittance is not None:
+            action = self._admittance(action, self._arm_states)
         sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self._arms.items()}
-        if self._held is not None:
-            self._held.sent(sent)
+        if self._admittance is not None:
+            self._admittance.sent(sent)
         self._clock.tick()
         return self.observe(), sent
 
@@ -182,8 +183,8 @@ class Rig:
     def close(self) -> None:
         """Stops the arms and closes everything, each even when another fails."""
         arms = [step for arm in self._arms.values() for step in (arm.stop, arm.close)]
-        beside = [] if self._beside is None else [self._beside]
-        _each([*arms, *(sensor.close for sensor in self._sensors.values()), *beside])
+        others = [] if self._on_close is None else [self._on_close]
+        _each([*arms, *(sensor.close for sensor in self._sensors.values()), *others])
 
     def __enter__(self) -> Self:
         return self

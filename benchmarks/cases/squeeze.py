@@ -12,7 +12,7 @@ from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
 from benchmarks.truth.gap import gaps
 from benchmarks.truth.roughness import print_roughness
-from tacsim.compute.threads import at_once
+from tacsim.compute.threads import map_parallel
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.world import MoveStats, World, make_world
@@ -181,7 +181,7 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
     def run() -> MoveStats:
         world.restore(begin)
         stats = close(world, STEP, flow=flow)
-        at_once([partial(camera, world.surface(name)) for name in world.sensors])
+        map_parallel([partial(camera, world.surface(name)) for name in world.sensors])
         return stats
 
     timing, stats = timed(run, repeat)

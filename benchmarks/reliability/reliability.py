@@ -39,7 +39,7 @@ from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import matrix
 from robot.errors import ProtectiveStop, StaleObservationError
 from tacsim import pose as se3
-from tacsim.limits import ROUNDING, finite_targets, ways_inside
+from tacsim.limits import ROUNDING, finite_targets, fractions_inside
 
 GUARDED = 1_000_000  # hostile actions through the guard
 WIRED = 5_000  # and over the wire
@@ -55,7 +55,7 @@ def box_guard(repeat: int) -> list[Measurement]:
         rows = hostile(rng, GUARDED)
         ends = rows[finite_targets(rows), :3]
         begins = START + rng.uniform(-0.03, 0.03, ends.shape)
-        allowed = begins + ways_inside(begins, ends, inside)[:, None] * (ends - begins)
+        allowed = begins + fractions_inside(begins, ends, inside)[:, None] * (ends - begins)
         return {"outside": float((~(inside.excess(allowed) <= ROUNDING)).sum())}
 
     return repeated(1, once, [Figure("outside", COUNT, f"box and sloped plane, {GUARDED:,} actions")])

@@ -28,12 +28,12 @@ from tacsim.interface import FloatArray
 from tacsim.limits import (
     braking_end,
     exceeds,
+    exceeds_wrench,
     finite_targets,
+    fraction_inside,
     joint_step_excess,
-    overload,
     region,
-    segments_apart,
-    way_inside,
+    segment_distance,
 )
 
 HARD = 5.0  # least deceleration after a fault [m/s^2]
@@ -97,7 +97,7 @@ class Servo:
     def watch(self, now: Measured, partners: Sequence[Record | None]) -> None:
         """Looks for faults in what is measured: force, walls, the other arms."""
         orders = self.orders
-        if overload(now.wrench, orders.force, orders.torque):
+        if exceeds_wrench(now.wrench, orders.force, orders.torque):
             self.fault(ArmStatus.FORCE_LIMIT, now)
         here = now.sensor[:3, 3]
         if self.region.excess(braking_end(here, now.twist[:3], self._hard[0])) > BARRIER:
@@ -237,7 +237,7 @@ class Servo:
         gaps = []
         for partner, other in zip(self.orders.partners, partners, strict=True):
             assert other is not None  # else the arm waits
-            gap = segments_apart(motion.position, end, other["position"], other["stop"])
+            gap = segment_distance(motion.position, end, other["position"], other["stop"])
             gaps.append(gap - partner.distance - 2.0 * float(other["top_speed"]) * SKEW)
         return gaps
 
@@ -248,7 +248,7 @@ class Servo:
         if self._goal is None:
             return None
         end, turn = self._goal
-        share = way_inside(start.position, end, self.region)
+        share = fraction_inside(start.position, end, self.region)
         if share < 1.0:
             self.shortened += 1
             turn = rotation(share * rotation_vector(turn @ start.rotation.T)) @ start.rotation

@@ -38,9 +38,9 @@ from robot.errors import (
     StaleObservationError,
 )
 from tacsim import pose as se3
-from tacsim.control.gel_monitor import Touch
+from tacsim.control.gel_monitor import GelReading
 from tacsim.interface import Action, ArmState, Pose
-from tacsim.limits import ActionError, admit, check_action
+from tacsim.limits import ActionError, check_action, clip_to_region
 from tacsim.models.hardware import UrArmConfig
 
 CONNECT_TIMEOUT = 10.0  # of the constructor and of recover [s]
@@ -175,7 +175,7 @@ class URArm:
                 return None
             check_action(Action({self.name: target}), (self.name,), self.name)
             state = self.state()
-            allowed, _ = admit(target, state.pose, self._region, self._spheres())
+            allowed, _ = clip_to_region(target, state.pose, self._region, self._spheres())
             flange = self._frames.flange(se3.to_matrix(allowed))
             assert state.joints is not None
             if self._kinematics.inverse(flange, state.joints) is None:
@@ -192,12 +192,12 @@ class URArm:
             if not self._closed:
                 self._send(Kind.HOLD)
 
-    def tell(self, shown: Touch | None) -> None:
+    def tell(self, shown: GelReading | None) -> None:
         """What the sensors show by now: beyond limits.depth or limits.shear the arm stops, and it stands once the last
         picture is older than `observation_timeout`. None: nobody looks by now, and neither is watched."""
         with self._lock:
             if not self._closed:
-                known = Touch(math.nan) if shown is None else shown
+                known = GelReading(math.nan) if shown is None else shown
                 self._link.touches.write(touch(known.seen, known.depth, known.shear))
 
     def zero_wrench(self) -> None:

@@ -22,7 +22,7 @@ from robot.rig.twin_sensor import TwinSensor
 from tacsim import pose as se3
 from tacsim.control.admittance import held_loads
 from tacsim.control.contact_signal import contact_signal
-from tacsim.control.gel_monitor import GelWatch
+from tacsim.control.gel_monitor import GelMonitor
 from tacsim.interface import ArmState, Normaliser, Pose, TactileSource
 from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
@@ -158,12 +158,12 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
             arms=behind,
             clock=clock,
             normalisers=normalisers,
-            start=start,
+            reset=start,
             truth=cell.truth if cell.knows_truth else None,
             diagnostics=diagnostics,
-            beside=cell.close,
-            watch=_watch(config, sensors, arms),
-            held=held_loads(config.task),
+            on_close=cell.close,
+            on_tactile=_watch(config, sensors, arms),
+            admittance=held_loads(config.task),
         )
         stack.pop_all()
         return rig
@@ -213,13 +213,13 @@ def _feel(
     return felt
 
 
-def _watch(config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mapping[str, Driven]) -> GelWatch:
+def _watch(config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mapping[str, Driven]) -> GelMonitor:
     """Tells the arms what their gels show, and guards those by it. Raises DeviceError for a limit that cannot be
     watched, because its sensor delivers no height or flow."""
     limits = {name: arm.limits for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
     tell = {name: driven.arm.tell for name, driven in arms.items()}
     try:
-        return GelWatch({name: sensor.spec for name, sensor in sensors.items()}, limits, tell, SafetyViolation)
+        return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, tell, SafetyViolation)
     except ValueError as failure:
         raise DeviceError(str(failure)) from None
 

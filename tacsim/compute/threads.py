@@ -25,17 +25,17 @@ def threads() -> int:
     return min(int(wanted), cores())
 
 
-def one_by_one(calls: Sequence[Callable[[], Result]]) -> list[Result]:
+def map_serial(calls: Sequence[Callable[[], Result]]) -> list[Result]:
     """What the calls return; the first that fails is the last that is called."""
     return [call() for call in calls]
 
 
-def at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
+def map_parallel(calls: Sequence[Callable[[], Result]]) -> list[Result]:
     """What the calls return, each called on a thread of its own as far as there are some: for long calculations that
     release the interpreter's lock. None of them may call this itself: it could wait for its own thread for ever. When
     one fails the others are waited for, then the first failure, in their order, is raised."""
     if len(calls) < 2 or threads() < 2:
-        return one_by_one(calls)
+        return map_serial(calls)
     pool = _pool(os.getpid())
     others = [pool.submit(call) for call in calls[1:]]
     try:

@@ -16,7 +16,7 @@ from tacsim.config.kinds import NotFound, is_name, kind_of, named
 from tacsim.config.messages import report_errors
 from tacsim.config.overrides import Override, apply, parse_override
 from tacsim.config.references import read_file
-from tacsim.models.hardware import UrArmConfig, loosened
+from tacsim.models.hardware import UrArmConfig, weakened_limits
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
@@ -75,7 +75,7 @@ def _require_limits(config: RigConfig, file: RigConfig) -> None:
     for name, arm in config.arms.items():
         there = file.arms.get(name)
         if isinstance(arm, UrArmConfig) and isinstance(there, UrArmConfig) and arm.mock is None:
-            problems += [f"arms.{name}.{what}" for what in loosened(there, arm)]
+            problems += [f"arms.{name}.{what}" for what in weakened_limits(there, arm)]
     kept = {frozenset(apart.arms): apart.distance for apart in config.keep_out}
     problems += [
         f"keep_out of {' and '.join(apart.arms)}: less than {apart.distance:g} m"

@@ -14,7 +14,7 @@ from tacsim.models.hardware import ArmLimits
 
 
 @dataclass(frozen=True, slots=True)
-class Touch:
+class GelReading:
     """What an arm is told of the tactile sensors."""
 
     seen: float  # when the oldest picture of the rig was exposed, on its clock [s]
@@ -22,7 +22,7 @@ class Touch:
     shear: float = math.nan  # how far their surface is dragged; NaN: they cannot tell [m]
 
 
-def touch_of(touch: TactileObservation) -> tuple[float, float]:
+def depth_and_shear(touch: TactileObservation) -> tuple[float, float]:
     """Depth and shear [m] that one sensor shows; NaN where it cannot tell."""
     depth = shear = math.nan
     if touch.height is not None:
@@ -33,7 +33,7 @@ def touch_of(touch: TactileObservation) -> tuple[float, float]:
     return depth, shear
 
 
-class GelWatch:
+class GelMonitor:
     """Looks at every observation: tells each arm what its gels show, and raises LimitExceeded beyond its limits.
 
     Args:
@@ -49,7 +49,7 @@ class GelWatch:
         self,
         sensors: Mapping[str, SensorSpec],
         limits: Mapping[str, ArmLimits],
-        tell: Mapping[str, Callable[[Touch], None]],
+        tell: Mapping[str, Callable[[GelReading], None]],
         error: type[LimitExceeded] = LimitExceeded,
     ) -> None:
         self._carried = {name: spec.arm for name, spec in sensors.items() if spec.arm is not None}
@@ -69,11 +69,11 @@ class GelWatch:
     def __call__(self, tactile: Mapping[str, TactileObservation]) -> None:
         """`tactile`: by sensor name. Every arm is told before anything is raised."""
         seen = min((touch.time for touch in tactile.values()), default=math.nan)
-        shown = {name: touch_of(tactile[name]) for name in self._carried if name in tactile}
+        shown = {name: depth_and_shear(tactile[name]) for name in self._carried if name in tactile}
         for arm, tell in self._tell.items():
             own = [shown[name] for name, carrier in self._carried.items() if carrier == arm and name in shown]
             depth, shear = _worst(depth for depth, _ in own), _worst(shear for _, shear in own)
-            tell(Touch(seen, depth, shear))
+            tell(GelReading(seen, depth, shear))
         for name, found in shown.items():
             arm = self._carried[name]
             limits = self._limits.get(arm)

@@ -194,7 +194,7 @@ class HardwareStart(Config):
     touch_signal: Annotated[float, Field(gt=0)] | None = None  # contact signal that counts as touch; None: by force
 
 
-def loosened(before: UrArmConfig, after: UrArmConfig) -> list[str]:
+def weakened_limits(before: UrArmConfig, after: UrArmConfig) -> list[str]:
     """What guards the arm less in `after` than in `before`, as "key: from -> to"."""
     found = []
     for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed", "force", "torque"):

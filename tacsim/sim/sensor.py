@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, Pose, SensorSpec, SurfaceMap, TactileFrame, Truth
-from tacsim.limits import LimitExceeded, admit, overload, shorten
+from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_step
 from tacsim.models.hardware import ArmLimits
 from tacsim.models.rig import SimMotion
 from tacsim.models.scene import GelSurface
@@ -153,8 +153,8 @@ class SimArm:
             return None
         now, allowed = self._world.pose(self._frame), target
         if self._region is not None or self._apart:
-            allowed, _ = admit(target, now, self._region, self._spheres())
-        allowed = shorten(allowed, now, self._longest, self._widest)
+            allowed, _ = clip_to_region(target, now, self._region, self._spheres())
+        allowed = limit_step(allowed, now, self._longest, self._widest)
         self._clock.target(self._frame, allowed, limited=allowed is not target)
         return allowed
 
@@ -178,7 +178,7 @@ class SimArm:
         if limits is None:
             return
         wrench = self._wrench()
-        if overload(wrench, limits.force, limits.torque):
+        if exceeds_wrench(wrench, limits.force, limits.torque):
             self.stop()
             force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1)
             raise LimitExceeded(
@@ -245,7 +245,7 @@ class SimSensor:
         """Nothing is held open."""
 
 
-class SimStart:
+class SimReset:
     """Start of a simulated episode: the world's initial state, and the approach to gentle contact.
 
     Args:

@@ -156,7 +156,9 @@ def test_the_guard_lets_nothing_out_and_counts_what_it_does(monkeypatch: pytest.
     (case,) = [case for case in ROBOT if case.name == "box_guard"]
     (found,) = measure(case, 5)
     assert (found.error, found.error_unit, found.repeats) == (0.0, "count", 1)
-    monkeypatch.setattr(reliability, "ways_inside", lambda starts, *_: np.ones(len(starts)))  # a guard that is none
+    monkeypatch.setattr(
+        reliability, "fractions_inside", lambda starts, *_: np.ones(len(starts))
+    )  # a guard that is none
     (broken,) = measure(case, 5)
     assert broken.error > 5_000
 

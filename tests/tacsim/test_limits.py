@@ -13,19 +13,19 @@ from tacsim import pose as se3
 from tacsim.interface import Action, Pose
 from tacsim.limits import (
     ActionError,
-    admit,
     braking_end,
     check_action,
     check_workspace,
+    clip_to_region,
+    exceeds_wrench,
     finite_targets,
+    fraction_clear,
+    fraction_inside,
+    fractions_inside,
     joint_step_excess,
-    overload,
+    limit_step,
     region,
-    shorten,
     stopping_distance,
-    way_clear,
-    way_inside,
-    ways_inside,
 )
 
 START = se3.from_rotation_vector([0.1, -0.2, 0.3], [0.4, 0.0, 0.0])
@@ -39,8 +39,8 @@ def moved(shift: list[float], turn: list[float]) -> Pose:
 
 def test_a_motion_within_the_limits_is_returned_itself() -> None:
     target = moved([0.3e-3, 0.0, -0.4e-3], [0.0, 0.02, 0.0])
-    assert shorten(target, START, 0.5e-3, 0.02) is target
-    assert shorten(START, START, 0.5e-3, 0.02) is START
+    assert limit_step(target, START, 0.5e-3, 0.02) is target
+    assert limit_step(START, START, 0.5e-3, 0.02) is START
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_a_motion_within_the_limits_is_returned_itself() -> None:
 def test_a_longer_motion_is_cut_on_the_straight_way(longest: float, widest: float, share: float) -> None:
     """The tighter limit shortens shift and turn alike, so that the way stays straight."""
     target = moved([0.3e-3, 0.0, -0.4e-3], [0.0, 0.02, 0.0])
-    sent = shorten(target, START, longest, widest)
+    sent = limit_step(target, START, longest, widest)
     assert np.allclose(sent.position - START.position, share * np.array([0.3e-3, 0, -0.4e-3]), atol=1e-12)
     assert np.allclose(se3.difference(START, sent)[3:], [0.0, share * 0.02, 0.0], atol=1e-9)
 
@@ -64,7 +64,7 @@ def test_what_is_sent_never_exceeds_a_limit(
     shift: list[float], turn: list[float], longest: float, widest: float
 ) -> None:
     target = moved(shift, turn)
-    sent = shorten(target, START, longest, widest)
+    sent = limit_step(target, START, longest, widest)
     metres, radians = se3.distance(START, sent)
     assert metres <= longest * (1 + 1e-6)
     assert radians <= widest + 1e-6
@@ -75,7 +75,7 @@ def test_what_is_sent_never_exceeds_a_limit(
 @pytest.mark.parametrize("limits", [(0.0, 1.0), (1.0, -1.0), (math.nan, 1.0)])
 def test_limits_must_be_positive(limits: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="must be positive"):
-        shorten(START, START, *limits)
+        limit_step(START, START, *limits)
 
 
 def test_a_good_action_passes() -> None:
@@ -159,7 +159,7 @@ def test_many_hostile_targets_are_refused_or_shortened_into_the_box() -> None:
     shortened = 0
     for row in rows[finite_targets(rows)]:
         wanted = Pose(row[:3], row[3:])
-        sent, share = admit(wanted, now, SLOPE)
+        sent, share = clip_to_region(wanted, now, SLOPE)
         assert SLOPE.excess(sent.position) <= 1e-9
         assert (sent is wanted) == (share == 1.0)
         shortened += share < 1.0
@@ -172,17 +172,17 @@ def test_a_million_hostile_ways_end_inside() -> None:
     rows = hostile(1_000_000, seed=2)
     ends = rows[finite_targets(rows), :3]
     starts = np.random.default_rng(2).uniform([0.0, -0.2, 0.1], BOX[1], ends.shape)  # on the free side of the slope
-    shares = ways_inside(starts, ends, SLOPE)
+    shares = fractions_inside(starts, ends, SLOPE)
     assert ((shares >= 0.0) & (shares <= 1.0)).all()
     assert (shares < 1.0).sum() > 100_000
     assert SLOPE.excess(starts + shares[:, None] * (ends - starts)).max() <= 1e-9
     some = range(0, len(ends), 5_000)
-    assert [way_inside(starts[k], ends[k], SLOPE) for k in some] == pytest.approx(shares[some].tolist(), abs=1e-12)
+    assert [fraction_inside(starts[k], ends[k], SLOPE) for k in some] == pytest.approx(shares[some].tolist(), abs=1e-12)
 
 
 @given(points, points)
 def test_the_way_inside_is_as_long_as_can_be(start: np.ndarray, end: np.ndarray) -> None:
-    share = way_inside(start, end, SLOPE)
+    share = fraction_inside(start, end, SLOPE)
     if SLOPE.excess(start) <= 0:
         last = start + share * (end - start)
         assert SLOPE.excess(last) <= 1e-8
@@ -198,7 +198,7 @@ def test_the_way_inside_is_as_long_as_can_be(start: np.ndarray, end: np.ndarray)
 def test_the_way_keeps_clear_of_a_sphere(
     start: np.ndarray, end: np.ndarray, centre: np.ndarray, distance: float
 ) -> None:
-    share = way_clear(start, end, centre, distance)
+    share = fraction_clear(start, end, centre, distance)
     begin = float(np.linalg.norm(start - centre))
     for s in np.linspace(0.0, share, 20):
         assert np.linalg.norm(start + s * (end - start) - centre) >= min(distance, begin) - 1e-7
@@ -224,9 +224,9 @@ def test_stopping_needs_room() -> None:
 
 
 def test_loads_and_steps_that_are_too_large_or_no_numbers() -> None:
-    assert not overload([3.0, 0, 4.0, 0, 0, 1.0], 5.0, 1.0)
-    assert overload([3.0, 0, 4.1, 0, 0, 0.0], 5.0, 1.0)
-    assert overload([0, 0, 0, 0.8, 0, 0.8], 5.0, 1.0)
-    assert overload([math.nan, 0, 0, 0, 0, 0], 5.0, 1.0) and overload([0, 0, 0, 0, math.nan, 0], 5.0, 1.0)
+    assert not exceeds_wrench([3.0, 0, 4.0, 0, 0, 1.0], 5.0, 1.0)
+    assert exceeds_wrench([3.0, 0, 4.1, 0, 0, 0.0], 5.0, 1.0)
+    assert exceeds_wrench([0, 0, 0, 0.8, 0, 0.8], 5.0, 1.0)
+    assert exceeds_wrench([math.nan, 0, 0, 0, 0, 0], 5.0, 1.0) and exceeds_wrench([0, 0, 0, 0, math.nan, 0], 5.0, 1.0)
     assert joint_step_excess(np.zeros(6), [0, 0, -0.002, 0, 0, 0.001], 1.0, 2e-3) == pytest.approx(1.0)
     assert joint_step_excess(np.zeros(6), [0, 0, math.nan, 0, 0, 0], 1.0, 2e-3) == math.inf

@@ -99,7 +99,7 @@ def make_rig(parts: Parts, **more: Any) -> Rig:
         arms=arms,
         clock=parts,
         normalisers={"finger": parts},
-        start=parts,
+        reset=parts,
         **more,
     )
 
@@ -215,4 +215,4 @@ def test_everything_is_closed_even_when_parts_fail() -> None:
 def test_each_sensor_needs_its_normaliser() -> None:
     parts = Parts()
     with pytest.raises(ValueError, match=r"sensors \['finger'\] but normalisers \[\]"):
-        Rig(name="bench", sensors={"finger": parts}, arms={}, clock=parts, normalisers={}, start=parts)
+        Rig(name="bench", sensors={"finger": parts}, arms={}, clock=parts, normalisers={}, reset=parts)

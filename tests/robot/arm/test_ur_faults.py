@@ -18,7 +18,7 @@ from robot.errors import (
 )
 from robot.mock import MockUR
 from tacsim import pose as se3
-from tacsim.control.gel_monitor import Touch
+from tacsim.control.gel_monitor import GelReading
 from tests.robot.arm.mocked import (
     HOST,
     check_path,
@@ -69,10 +69,10 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR) -> None:
 def test_a_gel_pressed_too_far_stops_the_arm_that_presses_it(mock: MockUR) -> None:
     with URArm(config(limits={"depth": 1e-3, "speed": 0.05}), "left") as arm:
         start = arm.state().pose
-        arm.tell(Touch(time.monotonic(), depth=0.9e-3))
+        arm.tell(GelReading(time.monotonic(), depth=0.9e-3))
         in_motion(arm, moved(start, z=-0.1))
         since = mock.faults.received().last
-        arm.tell(Touch(time.monotonic(), depth=1.1e-3))
+        arm.tell(GelReading(time.monotonic(), depth=1.1e-3))
         until(lambda: arm.status() == ArmStatus.GEL_LIMIT, "gel limit")
         until(lambda: arm._link.states.latest()["resting"] == 1, "rest")  # type: ignore[index]
         records = arm._link.states.recent(HISTORY)
@@ -89,7 +89,7 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
     with URArm(config(observation_timeout=0.5), "left") as arm:
         start = arm.state().pose
         far = moved(start, x=0.12)
-        arm.tell(Touch(time.monotonic()))
+        arm.tell(GelReading(time.monotonic()))
         in_motion(arm, far)
         until(lambda: arm.status() == ArmStatus.BLIND, "blind")
         until(arm.at_rest, "rest")

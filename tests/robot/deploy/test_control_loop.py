@@ -96,7 +96,7 @@ def make_rig(hand: Hand, truth: bool = True) -> Rig:
         arms={"lower": hand, "upper": hand},
         clock=hand,
         normalisers={"lower": hand},
-        start=hand,
+        reset=hand,
         truth=hand.truth if truth else None,
         diagnostics=lambda: {"residual": 0.25},
     )

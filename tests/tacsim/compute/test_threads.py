@@ -13,7 +13,7 @@ from functools import partial
 import pytest
 
 from tacsim.compute import threads
-from tacsim.compute.threads import at_once, one_by_one
+from tacsim.compute.threads import map_parallel, map_serial
 
 
 @pytest.fixture(params=["1", "2", "4"])
@@ -31,13 +31,13 @@ def test_results_stand_in_the_order_of_the_calls(allowed: int) -> None:
         return index
 
     calls = [partial(slow_first, index) for index in range(5)]
-    assert at_once(calls) == one_by_one(calls) == list(range(5))
-    assert at_once([]) == []
+    assert map_parallel(calls) == map_serial(calls) == list(range(5))
+    assert map_parallel([]) == []
 
 
 def test_as_many_run_at_once_as_may(allowed: int) -> None:
     together = threading.Barrier(allowed, timeout=5.0)
-    at_once([together.wait] * allowed)  # a barrier is passed by all of them or by none
+    map_parallel([together.wait] * allowed)  # a barrier is passed by all of them or by none
 
 
 def test_the_first_failure_is_raised_when_all_are_done(allowed: int) -> None:
@@ -47,7 +47,7 @@ def test_the_first_failure_is_raised_when_all_are_done(allowed: int) -> None:
         raise ValueError(words)
 
     with pytest.raises(ValueError, match="second"):
-        at_once([lambda: done.append(0), partial(fails, "second"), partial(fails, "third")])
+        map_parallel([lambda: done.append(0), partial(fails, "second"), partial(fails, "third")])
     if allowed > 1:
 
         def slow() -> None:
@@ -55,7 +55,7 @@ def test_the_first_failure_is_raised_when_all_are_done(allowed: int) -> None:
             done.append(1)
 
         with pytest.raises(ValueError, match="first"):
-            at_once([partial(fails, "first"), slow])
+            map_parallel([partial(fails, "first"), slow])
         assert done[-1] == 1  # nothing runs on behind the caller's back
 
 
@@ -72,7 +72,7 @@ from functools import partial
 from tacsim import threads
 threads.cores = lambda: 2
 def work():
-    assert threads.at_once([partial(abs, -1), partial(abs, -2)]) == [1, 2]
+    assert threads.map_parallel([partial(abs, -1), partial(abs, -2)]) == [1, 2]
 work()
 child = multiprocessing.get_context("fork").Process(target=work)
 child.start()

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tacsim.control.gel_monitor import GelWatch, Touch
+from tacsim.control.gel_monitor import GelMonitor, GelReading
 from tacsim.interface import SensorSpec, TactileObservation
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
@@ -40,7 +40,7 @@ def blind() -> TactileObservation:
 
 
 def test_a_gel_pressed_or_dragged_too_far_ends_the_episode() -> None:
-    watch = GelWatch(sensors(), {"upper": limits(1e-3, 0.5e-3)}, {})
+    watch = GelMonitor(sensors(), {"upper": limits(1e-3, 0.5e-3)}, {})
     good = touch(0.9e-3, 0.4e-3, hidden=5e-3)
     watch({"lower": touch(3e-3, 3e-3), "upper": good})  # nothing was said of the lower arm
     with pytest.raises(LimitExceeded, match=r"sensor 'upper': depth 1\.1 mm, limits\.depth of arm 'upper' is 1 mm"):
@@ -50,15 +50,15 @@ def test_a_gel_pressed_or_dragged_too_far_ends_the_episode() -> None:
 
 
 def test_what_is_watched_and_cannot_be_seen_is_too_much() -> None:
-    watch = GelWatch(sensors(), {"upper": limits(depth=1e-3)}, {})
+    watch = GelMonitor(sensors(), {"upper": limits(depth=1e-3)}, {})
     with pytest.raises(LimitExceeded, match=r"depth cannot be seen"):
         watch({"lower": touch(0.0, 0.0), "upper": blind()})
 
 
 def test_arms_are_told_before_anything_is_raised() -> None:
-    told: dict[str, Touch] = {}
+    told: dict[str, GelReading] = {}
     tell = {name: lambda shown, name=name: told.__setitem__(name, shown) for name in ("lower", "upper")}
-    watch = GelWatch(sensors(), {"lower": limits(depth=1e-3)}, tell)
+    watch = GelMonitor(sensors(), {"lower": limits(depth=1e-3)}, tell)
     with pytest.raises(LimitExceeded):
         watch({"lower": touch(2e-3, 1e-4, time=5.0), "upper": touch(3e-4, 2e-4, time=4.0)})
     assert told["lower"].depth == pytest.approx(2e-3)
@@ -70,6 +70,6 @@ def test_arms_are_told_before_anything_is_raised() -> None:
 
 def test_a_limit_that_no_sensor_can_tell_is_refused() -> None:
     with pytest.raises(ValueError, match=r"arms\.upper\.limits\.depth: sensor 'upper' cannot tell it"):
-        GelWatch(sensors(height=False), {"upper": limits(depth=1e-3)}, {})
+        GelMonitor(sensors(height=False), {"upper": limits(depth=1e-3)}, {})
     with pytest.raises(ValueError, match=r"arms\.lower\.limits\.shear"):
-        GelWatch(sensors(flow=False), {"lower": limits(shear=1e-3)}, {})
+        GelMonitor(sensors(flow=False), {"lower": limits(shear=1e-3)}, {})

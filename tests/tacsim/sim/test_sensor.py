@@ -11,7 +11,7 @@ from tacsim.interface import Action, Pose, SensorSpec
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
 from tacsim.physics.world import MoveStats
-from tacsim.sim.sensor import TOUCH_TOLERANCE, NoTouch, SimArm, SimClock, SimSensor, SimStart, approach
+from tacsim.sim.sensor import TOUCH_TOLERANCE, NoTouch, SimArm, SimClock, SimReset, SimSensor, approach
 
 
 def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
@@ -196,7 +196,7 @@ def test_placement_follows_the_seed(open_springs: Any) -> None:
 
 def test_without_touch_force_the_gels_stay_clear(spring_world: Any) -> None:
     clock = SimClock(spring_world, 0.1)
-    SimStart(spring_world, clock, {}, None).touch()
+    SimReset(spring_world, clock, {}, None).touch()
     assert spring_world.moves == []
 
 

@@ -22,7 +22,6 @@ RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates:
 COURANT = 0.4
 Keep = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
 HALF_PERIODS = 4  # of a standing wave that are timed
-SETTLED_PACE = 12  # launches after which the number of threads has been chosen (tacsim.physics.exec.team)
 
 
 def yield_scene(side: float, spacing: float, gel_element: float) -> Scene:
@@ -92,12 +91,8 @@ def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measureme
         body.state.c()[:, 2, 2] = rate
         return body
 
-    def warm() -> None:
-        for _ in range(SETTLED_PACE):
-            body.advance(1)
-
     body = initial()
-    timing, _ = timed(lambda: body.advance(substeps), repeat, warm)
+    timing, _ = timed(lambda: body.advance(substeps), repeat, lambda: body.advance(1))
     momentum = body.state.v().mean(axis=0, dtype=np.float64)
     drift = float(np.linalg.norm(momentum - [0.0, 0.0, 0.01])) / 0.01
     yielded = float((body.state.flow() > 0.0).mean())

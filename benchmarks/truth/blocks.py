@@ -14,7 +14,7 @@ from tacsim.physics.body.transfers import (
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.exec.lanes import LANES, NODES, PARTS, Counts, Params, Partial, strip, vec3
+from tacsim.physics.exec.lanes import LANES, NODES, PARTS, Counts, Params, Partial, first_of, strip, vec3
 from tacsim.physics.exec.layout import (
     BACKING,
     COUNTS,
@@ -29,7 +29,7 @@ from tacsim.physics.exec.layout import (
     STEP,
     STEPS,
 )  # fmt: skip
-from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, piece_done, run_team
 from tacsim.physics.gel.element import SMALLEST_STRETCH
 from tacsim.physics.gel.gel import (
     Corners,
@@ -59,29 +59,29 @@ def body_substeps(
     own substeps are (tacsim.physics.worlds.hybrid_kernels)."""
     for task in range(team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            member = task // CHUNK
-            for it in range(steps.shape[1]):
-                for share in range(shares(member, team)):
-                    part = member + share * team
+            plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
+            pieces = PARTS * (2 * steps.shape[1] + 1)
+            piece = next_piece(sync, 0, pieces)
+            while piece < pieces:
+                stage, part = piece // PARTS, piece % PARTS
+                for _gather in range(once_if(stage % 2 == 0 and stage > 0)):
+                    grid_to_particles(0, part, particles, velocities, params, counts, partial)
+                for _scatter in range(once_if(stage % 2 == 0 and stage < 2 * steps.shape[1])):
                     clear_masses(0, part, masses, counts)
                     particles_to_grid(0, part, particles, masses, params, counts, partial)
-                meet(sync, 0, team, 2 * it + 1)
-                plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
-                for share in range((rows - member + team - 1) // team):
-                    i = member + share * team
-                    for at in range(i * plane, (i + 1) * plane):
-                        q = node_sum(0, i, at, masses, velocities, counts)
-                        moved = strip(0.0)
-                        for n in ti.static(range(NODES)):
-                            if q[4 * n + 3] > 0.0:
-                                moved[4 * n] = keep_x * q[4 * n] / q[4 * n + 3]
-                                moved[4 * n + 1] = keep_y * q[4 * n + 1] / q[4 * n + 3]
-                                moved[4 * n + 2] = keep_z * q[4 * n + 2] / q[4 * n + 3]
-                        velocities[at] = moved
-                meet(sync, 0, team, 2 * it + 2)
-                for share in range(shares(member, team)):
-                    part = member + share * team
-                    grid_to_particles(0, part, particles, velocities, params, counts, partial)
+                for _motion in range(once_if(stage % 2 == 1)):
+                    for i in range(first_of(rows, part, PARTS), first_of(rows, part + 1, PARTS)):
+                        for at in range(i * plane, (i + 1) * plane):
+                            q = node_sum(0, i, at, masses, velocities, counts)
+                            moved = strip(0.0)
+                            for n in ti.static(range(NODES)):
+                                if q[4 * n + 3] > 0.0:
+                                    moved[4 * n] = keep_x * q[4 * n] / q[4 * n + 3]
+                                    moved[4 * n + 1] = keep_y * q[4 * n + 1] / q[4 * n + 3]
+                                    moved[4 * n + 2] = keep_z * q[4 * n + 2] / q[4 * n + 3]
+                            velocities[at] = moved
+                piece_done(sync, 0)
+                piece = next_piece(sync, 0, pieces)
 
 
 @ti.kernel

@@ -52,7 +52,7 @@ from tacsim.physics.exec.layout import (
     TURNING,
     VELOCITY,
 )  # fmt: skip
-from tacsim.physics.exec.team import CHUNK, WHO, Sync, first_in_chunk, meet, shares
+from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, piece_done
 from tacsim.physics.gel.gel import (
     Corners,
     Lattice,
@@ -258,17 +258,28 @@ def substeps(
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
-    Two meetings a substep: what is scattered must be whole before it is summed, and summed before it is gathered.
+    Two stages a substep: what is scattered must be whole before it is summed, and summed before it is gathered. A part
+    is gathered in the stage in which it is scattered again.
     """
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            turn, member = task // CHUNK // team, task // CHUNK % team
-            env = sync[turn, WHO]
+            turn = task // CHUNK // team
+            env = sync[turn, ENVIRONMENT]
             nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
-            for it in range(counts[env, STEPS]):
-                highest = ti.Vector([contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny) for g in range(2)])
-                for share in range(shares(member, team)):
-                    part = member + share * team
+            steps = counts[env, STEPS]
+            pieces = PARTS * (2 * steps + 1)
+            highest, known = ti.Vector([0.0, 0.0]), -1  # of the two gels, in this stage
+            piece = next_piece(sync, turn, pieces)
+            while piece < pieces:
+                stage, part = piece // PARTS, piece % PARTS
+                it, scatters = stage // 2, stage % 2 == 0
+                for _new in range(once_if(scatters and stage != known)):
+                    known = stage
+                    for g in ti.static(range(2)):
+                        highest[g] = contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny)
+                for _gather in range(once_if(scatters and it > 0)):
+                    grid_to_particles(env, part, particles, velocities, params, counts, partial)
+                for _scatter in range(once_if(scatters and it < steps)):
                     partial[env, part, OVERLAP] = 0.0
                     for g in range(2):
                         touch_gel(
@@ -281,12 +292,8 @@ def substeps(
                         env, part, 2, nodes, corners, lattice, params, counts, partial,
                         layers, nx, ny,
                     )  # fmt: skip
-                meet(sync, turn, team, 2 * it + 1)
-                for share in range(shares(member, team)):
-                    part = member + share * team
+                for _motion in range(once_if(not scatters)):
                     gel_advance(env, part, 2, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
                     grid_update(env, part, it, drive, masses, velocities, params, counts, partial)
-                meet(sync, turn, team, 2 * it + 2)
-                for share in range(shares(member, team)):
-                    part = member + share * team
-                    grid_to_particles(env, part, particles, velocities, params, counts, partial)
+                piece_done(sync, turn)
+                piece = next_piece(sync, turn, pieces)

@@ -41,7 +41,16 @@ from tacsim.physics.exec.layout import (
     STEPS,
     STIFFNESS,
 )  # fmt: skip
-from tacsim.physics.exec.team import CHUNK, WHO, Sync, first_in_chunk, meet, run_team, shares
+from tacsim.physics.exec.team import (
+    CHUNK,
+    ENVIRONMENT,
+    Sync,
+    first_in_chunk,
+    next_piece,
+    once_if,
+    piece_done,
+    run_team,
+)
 from tacsim.physics.failure.health import Health, SimulationDiverged, judged
 from tacsim.physics.gel.gel import (
     MM,
@@ -85,22 +94,24 @@ def press_substeps(
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            turn, member = task // CHUNK // team, task // CHUNK % team
-            env = sync[turn, WHO]
+            turn = task // CHUNK // team
+            env = sync[turn, ENVIRONMENT]
             nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
-            for it in range(counts[env, STEPS]):
-                for share in range(shares(member, team)):
-                    part = member + share * team
+            pieces = 2 * PARTS * counts[env, STEPS]  # two stages a substep: forces, then motion
+            piece = next_piece(sync, turn, pieces)
+            while piece < pieces:
+                stage, part = piece // PARTS, piece % PARTS
+                for _forces in range(once_if(stage % 2 == 0)):
+                    it = stage // 2
                     indent(env, part, it, drive, skin, touch, slip, pressure, values, params, counts, partial, nx, ny)
                     gel_forces(
                         env, part, 1, nodes, corners, lattice, params, counts, partial,
                         layers, nx, ny,
                     )  # fmt: skip
-                meet(sync, turn, team, 2 * it + 1)
-                for share in range(shares(member, team)):
-                    part = member + share * team
+                for _motion in range(once_if(stage % 2 == 1)):
                     gel_advance(env, part, 1, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
-                meet(sync, turn, team, 2 * it + 2)
+                piece_done(sync, turn)
+                piece = next_piece(sync, turn, pieces)
 
 
 def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:

@@ -14,14 +14,16 @@ if TYPE_CHECKING:
     from calibration.bundle import BadBundle as BadBundle
     from calibration.bundle import Calibration as Calibration
     from calibration.bundle import read_bundle as read_bundle
-    from calibration.bundle import sensor_model as sensor_model
+    from calibration.bundle import read_sensor_model as read_sensor_model
     from calibration.bundle import write_bundle as write_bundle
     from calibration.compare.compare import Comparison as Comparison
     from calibration.compare.compare import Pairing as Pairing
     from calibration.compare.compare import compare_frames as compare_frames
-    from calibration.compare.frame_set import Side as Side
-    from calibration.compare.frame_set import read_side as read_side
-    from calibration.errors import Unusable as Unusable
+    from calibration.errors import BadFrames as BadFrames
+    from calibration.errors import CalibrationError as CalibrationError
+    from calibration.frame_set import Frame as Frame
+    from calibration.frame_set import FrameSet as FrameSet
+    from calibration.frame_set import read_frame_set as read_frame_set
     from calibration.lens.board import Board as Board
     from calibration.lens.board import find_board as find_board
     from calibration.lens.board import parse_board as parse_board
@@ -31,19 +33,21 @@ if TYPE_CHECKING:
     from calibration.lens.view import fit_lens as fit_lens
     from calibration.lens.view import fit_view as fit_view
     from calibration.lens.view import view_of_corners as view_of_corners
-    from calibration.light.ball_press import calibrate_light as calibrate_light
-    from calibration.light.image_folder import read_presses as read_presses
+    from calibration.light.calibrator import LightFit as LightFit
+    from calibration.light.calibrator import calibrate_light as calibrate_light
     from calibration.light.noise import measure_noise as measure_noise
     from calibration.markers.flow import MarkerFlow as MarkerFlow
     from calibration.markers.flow import find_markers as find_markers
     from calibration.normaliser import FrameNormaliser as FrameNormaliser
-    from calibration.normaliser import for_calibrated as for_calibrated
-    from calibration.normaliser import for_camera as for_camera
-    from calibration.normaliser import for_pictures as for_pictures
-    from calibration.normaliser import for_recorded as for_recorded
-    from calibration.normaliser import for_simulated as for_simulated
+    from calibration.normaliser import normaliser_for_calibration as normaliser_for_calibration
+    from calibration.normaliser import normaliser_for_camera as normaliser_for_camera
+    from calibration.normaliser import normaliser_for_pictures as normaliser_for_pictures
+    from calibration.normaliser import normaliser_for_recording as normaliser_for_recording
+    from calibration.normaliser import normaliser_for_simulation as normaliser_for_simulation
+    from calibration.poses.ball_touch import BallTouch as BallTouch
     from calibration.poses.ball_touch import TouchFit as TouchFit
     from calibration.poses.ball_touch import fit_touches as fit_touches
+    from calibration.poses.hand_eye import BoardPose as BoardPose
     from calibration.poses.hand_eye import HandEyeFit as HandEyeFit
     from calibration.poses.hand_eye import fit_hand_eye as fit_hand_eye
     from calibration.poses.latency import Latency as Latency

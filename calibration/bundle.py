@@ -18,8 +18,8 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from calibration.errors import Unusable
-from calibration.height.inverse import InverseModel
+from calibration.errors import CalibrationError
+from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
 from tacsim.config import ConfigError, load
 from tacsim.models.hardware import Placement
@@ -38,7 +38,7 @@ Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class BadBundle(Unusable):
+class BadBundle(CalibrationError):
     """A calibration that cannot be used: which, why, and what to do."""
 
 
@@ -177,7 +177,7 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
     return calibration, picture
 
 
-def sensor_model(path: Path) -> SensorModel:
+def read_sensor_model(path: Path) -> SensorModel:
     """The simulated twin of a calibrated sensor, as its rectified picture shows it: geometry, untouched picture, light,
     and the camera's noise if it was measured.
 

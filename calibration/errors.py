@@ -1,4 +1,4 @@
-"""What all errors of calibrating have in common: somebody must give something else."""
+"""The errors of calibration: each says what cannot be used, why, and what to do."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class Unusable(ValueError):
-    """A calibration, or what one is to be made from, cannot be used: which, why, and what to do."""
+class CalibrationError(ValueError):
+    """A calibration, or what one is to be made from, cannot be used."""
+
+
+class BadFrames(CalibrationError):
+    """Frames that cannot be calibrated from, or compared."""
 
 
 @contextmanager
-def naming(part: str) -> Iterator[None]:
-    """Makes an `Unusable` say which part of a rig it speaks of."""
+def error_context(part: str) -> Iterator[None]:
+    """Puts the name of a part of a rig before the message of a `CalibrationError`."""
     try:
         yield
-    except Unusable as error:
+    except CalibrationError as error:
         raise type(error)(f"{part}: {error}") from error

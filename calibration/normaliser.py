@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.drift import DriftFinder, size_of
-from calibration.height.gradient import from_model
-from calibration.height.inverse import PolynomialSlopes
-from calibration.height.surface import SurfaceFinder, seen_box, view, window
-from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view
+from calibration.height.colour_table import from_model
+from calibration.height.slope_polynomial import PolynomialSlopes
+from calibration.height.surface_finder import SurfaceFinder, view, window
+from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view, seen_box
 from calibration.lens.view import GelView
 from calibration.markers.flow import MarkerFlow, marker_grid, require_no_markers
 from calibration.reference import (
@@ -251,12 +251,14 @@ class FrameNormaliser:
             )
 
 
-def for_simulated(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+def normaliser_for_simulation(
+    model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid
+) -> FrameNormaliser:
     """The normaliser of a simulated sensor; `gel_size`: x, y [m]."""
     return FrameNormaliser(from_geometry(model.geometry, gel_size, canonical_image(grid)), grid)
 
 
-def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
     gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
     without inverse, or markers too small for the image."""
@@ -265,7 +267,7 @@ def for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: Canoni
     return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size))
 
 
-def for_calibrated(
+def normaliser_for_calibration(
     calibration: Calibration, grid: CanonicalGrid, untouched: NDArray[np.uint8] | None = None
 ) -> FrameNormaliser:
     """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle.
@@ -288,11 +290,13 @@ def for_calibrated(
     return FrameNormaliser(rectify, grid, find, flow, untouched=known)
 
 
-def for_recorded(config: ReplaySensorConfig, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
+def normaliser_for_recording(
+    config: ReplaySensorConfig, image_shape: tuple[int, int], grid: CanonicalGrid
+) -> FrameNormaliser:
     """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, or through the
     four corners of the gel.
 
-    Raises calibration.lens.rectification.BadCorners, calibration.bundle.BadBundle.
+    Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle.
     """
     if config.calibration is not None:
         return _of_bundle(config.calibration, image_shape, grid)
@@ -300,17 +304,19 @@ def for_recorded(config: ReplaySensorConfig, image_shape: tuple[int, int], grid:
     return FrameNormaliser(seen, grid, drifts=True)
 
 
-def for_camera(config: CameraSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+def normaliser_for_camera(
+    config: CameraSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid
+) -> FrameNormaliser:
     """The normaliser of a sensor that a camera sees: by its calibration, by its model, or through the four corners of
     the gel. Only the last finds no height. `gel_size`: x, y of a model's gel [m].
 
     Raises calibration.bundle.BadBundle, ValueError for a model without inverse,
-    calibration.lens.rectification.BadCorners.
+    calibration.lens.view.BadCorners.
     """
     if config.calibration is not None:
         return _of_bundle(config.calibration, (config.height, config.width), grid)
     if config.model is not None:
-        return for_pictures(config.model, gel_size, grid)
+        return normaliser_for_pictures(config.model, gel_size, grid)
     shape = (config.height, config.width)
     return FrameNormaliser(from_corners(config.corners, config.size, shape, canonical_image(grid)), grid, drifts=True)
 
@@ -324,7 +330,7 @@ def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> 
             f"{path} was calibrated on pictures of {wide} x {high} px, this sensor delivers {columns} x {rows}: set "
             "width and height of the sensor to those of the calibration, or calibrate again at this setting"
         )
-    return for_calibrated(calibration, grid, untouched)
+    return normaliser_for_calibration(calibration, grid, untouched)
 
 
 def _marker_flow(

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calibration.errors import naming
+from calibration.errors import error_context
 from tacsim.config import LoadedRig, load_rig
 from tacsim.control.admittance import held_loads
 from tacsim.interface import Arm, Normaliser, SensorSpec, TactileFrame
@@ -99,7 +99,8 @@ def make_env(
 
 
 def check_sensors(config: RigConfig) -> None:
-    """Raises what opening the rig would raise over what its cameras show: CannotOpen, calibration.errors.Unusable."""
+    """Raises what opening the rig would raise over what its cameras show: CannotOpen,
+    calibration.errors.CalibrationError."""
     _check_parts(config)
     cameras = {name: each for name, each in config.sensors.items() if isinstance(each, CameraSensorConfig)}
     if cameras:
@@ -139,7 +140,7 @@ def _check_parts(config: RigConfig) -> None:
 
 def _open_sim(config: RigConfig) -> Rig:
     """One World seen as sensors, arms and a clock."""
-    from calibration.normaliser import for_simulated
+    from calibration.normaliser import normaliser_for_simulation
     from tacsim.compute.threads import map_parallel
     from tacsim.physics.world import make_world
     from tacsim.sim.sensor import SimArm, SimClock, SimReset
@@ -172,7 +173,8 @@ def _open_sim(config: RigConfig) -> Rig:
         arms=arms,
         clock=clock,
         normalisers={
-            name: for_simulated(sensor.model, scene.gel.size[:2], config.canonical) for name, sensor in models.items()
+            name: normaliser_for_simulation(sensor.model, scene.gel.size[:2], config.canonical)
+            for name, sensor in models.items()
         },
         reset=SimReset(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
         truth=None if scene.body is None else world.truth,
@@ -270,7 +272,7 @@ def _open_replay(config: RigConfig) -> Rig:
         for name, sensor in recorded.items():
             sensors[name] = source = ReplaySensor(sensor, name, clock)
             stack.callback(source.close)
-            with naming(f"sensors.{name}"):
+            with error_context(f"sensors.{name}"):
                 normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, config.canonical)
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
@@ -308,13 +310,13 @@ def _replay_normaliser(
     config: ReplaySensorConfig, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
 ) -> FrameNormaliser:
     """By the corners of the rig file; without them by what an episode says of its own sensor."""
-    from calibration.normaliser import for_recorded, for_simulated
+    from calibration.normaliser import normaliser_for_recording, normaliser_for_simulation
 
     original = None if config.corners is not None else _recorded_rig(Path(config.source or ""))
     sensor = None if original is None else original.sensors.get(name)
     if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
-        return for_simulated(sensor.model, original.scene.gel.size[:2], grid)
-    return for_recorded(sensor if isinstance(sensor, ReplaySensorConfig) else config, image_shape, grid)
+        return normaliser_for_simulation(sensor.model, original.scene.gel.size[:2], grid)
+    return normaliser_for_recording(sensor if isinstance(sensor, ReplaySensorConfig) else config, image_shape, grid)
 
 
 def _recorded_rig(source: Path) -> RigConfig | None:

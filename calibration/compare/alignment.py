@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.compare.frame_set import BadSide
 from calibration.compare.metrics import contact_region, patch_of, untouched_change
+from calibration.errors import BadFrames
 from tacsim.models.sensor import SensorGeometry
 
 Float32 = NDArray[np.float32]
@@ -77,13 +77,13 @@ class Alignment:
 
 
 def by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
-    """A of `source` rows, columns scaled to B's `shape`: both show the same part of the gel. Raises BadSide when their
-    proportions differ."""
+    """A of `source` rows, columns scaled to B's `shape`: both show the same part of the gel.
+    Raises BadFrames when their proportions differ."""
     if source == shape:
         return Alignment(np.eye(2, 3), shape, source)
     across, down = source[1] / shape[1], source[0] / shape[0]
     if abs(across / down - 1) > ASPECT:
-        raise BadSide(
+        raise BadFrames(
             f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. "
             "Give the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
             "--corners-b)"

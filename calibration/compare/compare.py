@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment, by_geometry, by_size, find_shift
-from calibration.compare.frame_set import BadSide, Shot, Side, doubts
-from calibration.compare.surfaces import Touch, touches, untouched
+from calibration.compare.surfaces import SurfaceEstimate, estimate_surfaces, flat_surface
+from calibration.errors import BadFrames
+from calibration.frame_set import Frame, FrameSet, frame_warnings
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.models.sensor import CanonicalGrid
 
@@ -84,8 +85,8 @@ METRICS = (
 class Pair:
     """One frame of A against one of B."""
 
-    a: Shot
-    b: Shot
+    a: Frame
+    b: Frame
     numbers: Numbers
     null: Numbers  # the same of A's reference
     flags: tuple[str, ...]
@@ -110,14 +111,14 @@ class Overall:
 class Comparison:
     """The whole result."""
 
-    a: Side
-    b: Side
+    a: FrameSet
+    b: FrameSet
     alignment: Alignment
     pairs: tuple[Pair, ...]
     overall: dict[str, Overall]
     notes: tuple[str, ...]
-    touched_a: tuple[Touch, ...] | None = None  # surfaces of the pairs, aligned; None: not known
-    touched_b: tuple[Touch, ...] | None = None
+    surfaces_a: tuple[SurfaceEstimate, ...] | None = None  # surfaces of the pairs, aligned; None: not known
+    surfaces_b: tuple[SurfaceEstimate, ...] | None = None
 
     def aligned(self, image: Image) -> Image:
         """A picture of A in the pixels of B."""
@@ -137,8 +138,8 @@ USUAL = Options()
 
 
 def compare_frames(
-    a: Side,
-    b: Side,
+    a: FrameSet,
+    b: FrameSet,
     calibration_a: Calibration | None = None,
     calibration_b: Calibration | None = None,
     options: Options = USUAL,
@@ -147,13 +148,13 @@ def compare_frames(
     """Compares A with B.
 
     A calibration says where a side's pixels lie on the gel, and finds height and gradient in its pictures; without one
-    the surfaces that a simulation has recorded count. `on_pair` hears of progress. Raises BadSide.
+    the surfaces that a simulation has recorded count. `on_pair` hears of progress. Raises BadFrames.
     """
     couples, left = paired(a, b, options.pairing)
     alignment, notes = _alignment(a, b, couples, calibration_a, calibration_b, shift=options.shift)
     grid = options.grid
-    found_a, said_a = touches(a, [shot for shot, _ in couples], calibration_a, grid)
-    found_b, said_b = touches(b, [shot for _, shot in couples], calibration_b, grid)
+    found_a, said_a = estimate_surfaces(a, [shot for shot, _ in couples], calibration_a, grid)
+    found_b, said_b = estimate_surfaces(b, [shot for _, shot in couples], calibration_b, grid)
     if found_a is not None and found_b is not None and calibration_b is not None:
         moved = np.array(alignment.shift) * calibration_b.geometry.pixel_pitch / grid.pitch
         found_a = tuple(touch.moved(moved) for touch in found_a)
@@ -174,23 +175,23 @@ def compare_frames(
     return Comparison(a, b, alignment, tuple(pairs), overall, tuple(notes), found_a, found_b)
 
 
-def paired(a: Side, b: Side, pairing: Pairing) -> tuple[list[tuple[Shot, Shot]], list[str]]:
-    """The frames that belong together, and in words which were left out. Raises BadSide when that cannot be told."""
-    named_a, named_b = ({Path(shot.name).stem.lower(): shot for shot in side.shots} for side in (a, b))
+def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame, Frame]], list[str]]:
+    """The frames that belong together, and in words which were left out. Raises BadFrames when that cannot be told."""
+    named_a, named_b = ({Path(shot.name).stem.lower(): shot for shot in side.frames} for side in (a, b))
     common = [name for name in named_a if name in named_b]
-    same = len(common) == len(a.shots) == len(b.shots)
+    same = len(common) == len(a.frames) == len(b.frames)
     if pairing is Pairing.name or (pairing is Pairing.auto and same):
         if not common:
-            raise BadSide(f"no frame of {a.name} has the name of one of {b.name}; pair them in order (--pair order)")
-        rest = len(a.shots) + len(b.shots) - 2 * len(common)
+            raise BadFrames(f"no frame of {a.name} has the name of one of {b.name}; pair them in order (--pair order)")
+        rest = len(a.frames) + len(b.frames) - 2 * len(common)
         said = [f"{rest} frames have no partner of their name and are left out"] if rest else []
         return [(named_a[name], named_b[name]) for name in common], said
-    if len(a.shots) != len(b.shots):
-        raise BadSide(
-            f"{a.name} has {len(a.shots)} frames, {b.name} {len(b.shots)}: which belong together? {len(common)} names "
-            "are in both; pair these alone with --pair name, or give both the same number of frames"
+    if len(a.frames) != len(b.frames):
+        raise BadFrames(
+            f"{a.name} has {len(a.frames)} frames, {b.name} {len(b.frames)}: which belong together? {len(common)} "
+            "names are in both; pair these alone with --pair name, or give both the same number of frames"
         )
-    return list(zip(a.shots, b.shots, strict=True)), ["paired in order: the names differ"] if not same else []
+    return list(zip(a.frames, b.frames, strict=True)), ["paired in order: the names differ"] if not same else []
 
 
 def bootstrap(values: Float64, seed: int = 0) -> tuple[float, float]:
@@ -206,7 +207,7 @@ def bootstrap(values: Float64, seed: int = 0) -> tuple[float, float]:
 class _Judge:
     """Scores pairs in the pixels of B."""
 
-    def __init__(self, a: Side, b: Side, alignment: Alignment, grid: CanonicalGrid) -> None:
+    def __init__(self, a: FrameSet, b: FrameSet, alignment: Alignment, grid: CanonicalGrid) -> None:
         self._b, self._alignment, self._grid = b, alignment, grid
         self._covered = alignment.covered
         self._whole = None if self._covered.all() else self._covered
@@ -214,7 +215,7 @@ class _Judge:
         self._plain: list[float] = []  # correlations of the pairs as they are, and with red and blue exchanged
         self._swapped: list[float] = []
 
-    def pair(self, a: Shot, b: Shot, touch_a: Touch | None, touch_b: Touch | None) -> Pair:
+    def pair(self, a: Frame, b: Frame, touch_a: SurfaceEstimate | None, touch_b: SurfaceEstimate | None) -> Pair:
         seen_a, seen_b = self._alignment(a.image), b.image.astype(np.float32)
         change_a, change_b = seen_a - self._reference_a, seen_b - self._b.reference
         contact_a, contact_b = (metrics.contact_region(change) & self._covered for change in (change_a, change_b))
@@ -226,18 +227,18 @@ class _Judge:
         null["contact_ncc"] = metrics.correlation(np.zeros_like(change_b), change_b, region)
         if touch_a is not None and touch_b is not None:
             numbers |= self.surfaces(touch_a, touch_b, touch_a)
-            null |= self.surfaces(untouched(touch_b), touch_b, touch_a)
+            null |= self.surfaces(flat_surface(touch_b), touch_b, touch_a)
         if region.any():
             self._plain.append(numbers["contact_ncc"])
             self._swapped.append(metrics.correlation(change_a[..., ::-1], change_b, region))
         reference_b = self._b.reference.astype(np.float32)
         flags = [
-            *(f"A: {words}" for words in doubts(seen_a, self._reference_a, contact_a)),
-            *(f"B: {words}" for words in doubts(seen_b, reference_b, contact_b)),
+            *(f"A: {words}" for words in frame_warnings(seen_a, self._reference_a, contact_a)),
+            *(f"B: {words}" for words in frame_warnings(seen_b, reference_b, contact_b)),
         ]
         return Pair(a, b, numbers, null, tuple(flags), region, metrics.patch_of(contact_b))
 
-    def against_reference(self, shot: Shot, region: Mask) -> Numbers:
+    def against_reference(self, shot: Frame, region: Mask) -> Numbers:
         """An untouched frame of B against B's reference, where a pair has contact."""
         return self._pictures(shot.image, self._b.reference, region)
 
@@ -256,7 +257,7 @@ class _Judge:
             "contact_ssim": float(similarity[region].mean()) if region.any() else math.nan,
         }
 
-    def surfaces(self, a: Touch, b: Touch, drawn: Touch) -> Numbers:
+    def surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, drawn: SurfaceEstimate) -> Numbers:
         """Of A's surface against B's, where B or `drawn` is pressed."""
         pressed_a, pressed_b, of_drawn = (metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, drawn))
         where = (of_drawn | pressed_b) & b.valid
@@ -275,7 +276,7 @@ class _Judge:
             else metrics.end_point_error(a.flow, b.flow),
         }
 
-    def noise(self, still: Touch, on: Touch) -> Numbers:
+    def noise(self, still: SurfaceEstimate, on: SurfaceEstimate) -> Numbers:
         """Of the surface found in an untouched frame of B against a flat one, where another is pressed."""
         where = metrics.pressed_region(on.height, CONTACT_HEIGHT) & on.valid
         error = metrics.height_error(still.height, np.zeros_like(still.height), where)
@@ -310,9 +311,9 @@ def _contacts(a: Mask, b: Mask) -> Numbers:
 
 
 def _alignment(
-    a: Side,
-    b: Side,
-    couples: Sequence[tuple[Shot, Shot]],
+    a: FrameSet,
+    b: FrameSet,
+    couples: Sequence[tuple[Frame, Frame]],
     calibration_a: Calibration | None,
     calibration_b: Calibration | None,
     *,
@@ -322,14 +323,14 @@ def _alignment(
         alignment = by_geometry(calibration_a.geometry, calibration_b.geometry)
         for side, shape, said in ((a, alignment.source, "A"), (b, alignment.shape, "B")):
             if side.shape != shape:
-                raise BadSide(
+                raise BadFrames(
                     f"{side.name} is {side.shape[1]} x {side.shape[0]} px, the calibration of {said} is of "
                     f"{shape[1]} x {shape[0]}; it belongs to another sensor or setting"
                 )
     else:
         alignment = by_size(a.shape, b.shape)
     if not alignment.covered.any():
-        raise BadSide("A shows no part of the gel that B shows; are these the right calibrations?")
+        raise BadFrames("A shows no part of the gel that B shows; are these the right calibrations?")
     if not shift:
         return alignment, []
     chosen = couples if len(couples) <= LOOKED_AT else [
@@ -341,7 +342,7 @@ def _alignment(
 
 
 def _floor(
-    judge: _Judge, b: Side, pairs: Sequence[Pair], calibration: Calibration | None, grid: CanonicalGrid
+    judge: _Judge, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None, grid: CanonicalGrid
 ) -> tuple[Numbers, list[str]]:
     """What two pictures of B without contact score, where the pairs have contact; and in words if there are none."""
     quiet = [pair.b for pair in pairs if not pair.region.any()]
@@ -352,8 +353,8 @@ def _floor(
         return {}, [f"noise floor absent: {why}"]
     scores = [judge.against_reference(frame, pair.region) for frame in frames for pair in touched]
     floor = {key: _mean([score[key] for score in scores]) for key in scores[0]}
-    found, _ = touches(b, frames, calibration, grid)
-    pressed, _ = touches(b, [pair.b for pair in touched], calibration, grid)
+    found, _ = estimate_surfaces(b, frames, calibration, grid)
+    pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration, grid)
     if found is not None and pressed is not None:
         surfaces = [judge.noise(still, on) for still in found for on in pressed]
         floor |= {key: _mean([score[key] for score in surfaces]) for key in surfaces[0]}

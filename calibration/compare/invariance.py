@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.compare import DRAWS, GRID, Comparison
-from calibration.compare.frame_set import BadSide, Image
-from calibration.compare.surfaces import touches
+from calibration.compare.surfaces import estimate_surfaces
+from calibration.errors import BadFrames
+from calibration.frame_set import Image
 from tacsim.control.contact_signal import CONTACT_HEIGHT
 from tacsim.models.sensor import CanonicalGrid
 
@@ -107,7 +108,7 @@ def invariance(
 ) -> Report:
     """Of a finished comparison. Gradient and height need surfaces on both sides, the drift table B's calibration.
 
-    Raises BadSide for fewer than FEWEST presses with contact in B.
+    Raises BadFrames for fewer than FEWEST presses with contact in B.
     """
     folds = [(comparison, calibration_b)]
     return pooled_invariance(folds, grid, on_step)
@@ -119,14 +120,14 @@ def pooled_invariance(
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
     """The same of several comparisons, each with B's calibration: parts of one set of presses, of which each was left
-    out of the calibration that it is seen through. Raises BadSide for fewer than FEWEST presses with contact in B."""
+    out of the calibration that it is seen through. Raises BadFrames for fewer than FEWEST presses with contact in B."""
     touched = [
         {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
         for comparison, _ in folds
     ]
     count = sum(map(len, touched))
     if count < FEWEST:
-        raise BadSide(f"{count} pairs show contact in B; {FEWEST} are needed to tell how far two presses are apart")
+        raise BadFrames(f"{count} pairs show contact in B; {FEWEST} are needed to tell how far two presses are apart")
     radii = [patch.radius for one in touched for patch in one.values()]
     half, words = _size(folds[0][1], radii)
     parts = [
@@ -145,7 +146,7 @@ def pooled_invariance(
     notes = [] if "height" in common else ["gradient and height are left out: no surfaces on both sides"]
     angle = math.nan
     drifts: list[Drift] = []
-    if any(comparison.touched_a is None or calibration is None for comparison, calibration in folds):
+    if any(comparison.surfaces_a is None or calibration is None for comparison, calibration in folds):
         notes.append("no drift table: it needs surfaces of A and the calibration of B")
     else:
         angle = _angle(folds, touched, grid, None, None)
@@ -246,10 +247,10 @@ def _patches(
             cut = _cut(other, x, y, half)
             zero = still if view == "raw" else 0.0
             _add(found[view], _cut(one, x, y, half), cut, cut - zero)
-        if comparison.touched_a is None or comparison.touched_b is None:
+        if comparison.surfaces_a is None or comparison.surfaces_b is None:
             continue
         at_x, at_y, reach = _in_cells(comparison, k, calibration, grid, x, y)
-        touch_a, touch_b = comparison.touched_a[k], comparison.touched_b[k]
+        touch_a, touch_b = comparison.surfaces_a[k], comparison.surfaces_b[k]
         for view, one, other in (
             ("gradient", touch_a.gradient, touch_b.gradient),
             ("height", touch_a.height, touch_b.height),
@@ -275,8 +276,8 @@ def _in_cells(
     """Centre of the patch of pair k on the canonical grid, and half its side [cells]."""
     reach = PATCH / 2 / grid.pitch
     if calibration is None:  # both surfaces were recorded
-        assert comparison.touched_b is not None
-        patch = metrics.patch_of(metrics.pressed_region(comparison.touched_b[k].height, CONTACT_HEIGHT))
+        assert comparison.surfaces_b is not None
+        patch = metrics.patch_of(metrics.pressed_region(comparison.surfaces_b[k].height, CONTACT_HEIGHT))
         return (patch.x, patch.y, reach) if patch is not None else (grid.columns / 2, grid.rows / 2, reach)
     u0, v0 = calibration.geometry.principal
     scale = calibration.geometry.pixel_pitch / grid.pitch
@@ -307,12 +308,12 @@ def _angle(
     """Mean gradient angle error of B's changed frames against A's surfaces, where those are pressed [degrees]."""
     angles: list[float] = []
     for (comparison, calibration), one in zip(folds, touched, strict=True):
-        assert comparison.touched_a is not None
-        truth = [comparison.touched_a[k] for k in one]
+        assert comparison.surfaces_a is not None
+        truth = [comparison.surfaces_a[k] for k in one]
         reference = comparison.b.reference if of_reference is None else of_reference(comparison.b.reference)
         real = [comparison.pairs[k].b for k in one]
-        shots = [replace(shot, image=shot.image if change is None else change(shot.image)) for shot in real]
-        found, _ = touches(replace(comparison.b, reference=reference), shots, calibration, grid)
+        frames = [replace(shot, image=shot.image if change is None else change(shot.image)) for shot in real]
+        found, _ = estimate_surfaces(replace(comparison.b, reference=reference), frames, calibration, grid)
         assert found is not None  # there is a calibration
         angles += [
             metrics.gradient_angle(

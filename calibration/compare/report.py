@@ -160,8 +160,8 @@ def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
     error = np.abs(a.astype(np.float32) - b).mean(axis=2)
     found = [("A", a), ("B", b), ("A − its reference", change_a), ("B − its reference", change_b)]
     found.append(("|A − B|, 0 to 64 grey; contact outlined", _outlined(_coloured(error, 64.0), pair.region)))
-    if comparison.touched_a is not None and comparison.touched_b is not None:
-        height_a, height_b = comparison.touched_a[k].height, comparison.touched_b[k].height
+    if comparison.surfaces_a is not None and comparison.surfaces_b is not None:
+        height_a, height_b = comparison.surfaces_a[k].height, comparison.surfaces_b[k].height
         deepest = max(float(height_a.max()), float(height_b.max()), 1e-6)
         found += [(f"height of {side}, 0 to {deepest * 1e3:.2f} mm", _coloured(height, deepest))
                   for side, height in (("A", height_a), ("B", height_b))]  # fmt: skip

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.bundle import Calibration
-from calibration.compare.frame_set import BadSide, Image, Shot, Side
-from calibration.normaliser import for_calibrated
+from calibration.errors import BadFrames
+from calibration.frame_set import Frame, FrameSet, Image
+from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import UnusableReference
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid
@@ -20,7 +21,7 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Touch:
+class SurfaceEstimate:
     """The surface of one frame."""
 
     height: Float32  # (h, w) into the gel [m]
@@ -28,7 +29,7 @@ class Touch:
     flow: Float32 | None  # (m, n, 2) at the markers [m]
     valid: NDArray[np.bool_]  # (h, w)
 
-    def moved(self, shift: NDArray[np.float64]) -> Touch:
+    def moved(self, shift: NDArray[np.float64]) -> SurfaceEstimate:
         """The surface seen from `shift` (x, y) [cells] farther on. Its flow stays that of the same markers."""
         import cv2
 
@@ -44,50 +45,50 @@ class Touch:
         return replace(self, height=np.asarray(at(self.height)), gradient=np.asarray(at(self.gradient)))
 
 
-def touches(
-    side: Side,
-    shots: Sequence[Shot],
+def estimate_surfaces(
+    side: FrameSet,
+    frames: Sequence[Frame],
     calibration: Calibration | None,
     grid: CanonicalGrid,
     reference: Image | None = None,
-) -> tuple[tuple[Touch, ...] | None, str]:
+) -> tuple[tuple[SurfaceEstimate, ...] | None, str]:
     """The surfaces of some frames of a side; or None, and why not.
 
     With a calibration they are found in the pictures, also where a simulation knows them by itself: then both sides go
-    the same way. `reference`: instead of the side's own. Raises BadSide for a reference that cannot be used.
+    the same way. `reference`: instead of the side's own. Raises BadFrames for a reference that cannot be used.
     """
     if calibration is None:
-        return _recorded(shots, grid)
-    normaliser = for_calibrated(calibration, grid)
+        return _recorded(frames, grid)
+    normaliser = normaliser_for_calibration(calibration, grid)
     try:
         normaliser.take_reference(TactileFrame(side.reference if reference is None else reference, 0.0, 0))
         found = []
-        for shot in shots:
+        for shot in frames:
             seen = normaliser(TactileFrame(shot.image, 0.0, 0), 0.0)
             assert seen.height is not None and seen.gradient is not None
-            found.append(Touch(seen.height, seen.gradient, seen.flow, seen.valid))
+            found.append(SurfaceEstimate(seen.height, seen.gradient, seen.flow, seen.valid))
     except UnusableReference as error:
-        raise BadSide(f"{side.name}: {side.reference_from}: {error}") from None
+        raise BadFrames(f"{side.name}: {side.reference_from}: {error}") from None
     except ValueError as error:
-        raise BadSide(f"{side.name}: {error}") from None
+        raise BadFrames(f"{side.name}: {error}") from None
     return tuple(found), ""
 
 
-def untouched(like: Touch) -> Touch:
+def flat_surface(like: SurfaceEstimate) -> SurfaceEstimate:
     """The surface of a gel that nothing touches."""
     flow = None if like.flow is None else np.zeros_like(like.flow)
-    return Touch(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
+    return SurfaceEstimate(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
 
 
-def _recorded(shots: Sequence[Shot], grid: CanonicalGrid) -> tuple[tuple[Touch, ...] | None, str]:
+def _recorded(frames: Sequence[Frame], grid: CanonicalGrid) -> tuple[tuple[SurfaceEstimate, ...] | None, str]:
     shape = (grid.rows, grid.columns)
     found = []
-    for shot in shots:
+    for shot in frames:
         if shot.surface is None:
             return None, "pictures alone have no height; give the sensor's calibration"
         if shot.surface.height.shape != shape:
             lies = " x ".join(map(str, shot.surface.height.shape))
             return None, f"the recorded surface has {lies} cells, not {shape[0]} x {shape[1]}; give a calibration"
         everywhere = np.ones(shape, dtype=np.bool_)
-        found.append(Touch(shot.surface.height, shot.surface.gradient, shot.surface.flow, everywhere))
+        found.append(SurfaceEstimate(shot.surface.height, shot.surface.gradient, shot.surface.flow, everywhere))
     return tuple(found), ""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import Unusable
+from calibration.errors import CalibrationError
 from tacsim.interface import FloatArray
 from tacsim.models.quantity import parse
 
@@ -25,7 +25,7 @@ STRONG = 0.4  # of a usual dot's contrast: what is weaker is no dot
 SAME = 0.35  # of the distance of two dots: so near is the same place
 
 
-class BadBoard(Unusable):
+class BadBoard(CalibrationError):
     """A board that is described wrongly, or not found."""
 
 

@@ -8,25 +8,17 @@ Where the camera sees finer than the canonical grid, each canonical pixel is the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import Unusable
-from calibration.lens.view import GelView
+from calibration.lens.view import Corners, GelView, check_corners
 from tacsim.models.sensor import SensorGeometry
 from tacsim.optics.grid import PixelGrid, image_grid
 
-Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
-
 LARGEST_FACTOR = 16  # look-ups along each side of one canonical pixel
-
-
-class BadCorners(Unusable):
-    """The four corners are no picture of a rectangle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,18 +160,9 @@ def _limited(factor: int) -> int:
     return max(factor, 1)
 
 
-def check_corners(corners: Sequence[tuple[float, float]], image_shape: tuple[int, int]) -> None:
-    """Raises BadCorners."""
-    points = np.array(corners, dtype=np.float64)
-    if points.shape != (4, 2) or not np.isfinite(points).all():
-        raise BadCorners(f"corners must be 4 finite pixels (u, v), got {corners!r}")
-    edge = np.roll(points, -1, axis=0) - points
-    turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
-    if not (turn > 1.0).all():  # v grows downwards: clockwise as seen is positive
-        raise BadCorners(
-            f"corners {corners!r} are no convex quadrangle; give top left, top right, bottom right, bottom left "
-            "[px, u to the right, v down]"
-        )
-    rows, columns = image_shape
-    if (np.abs(points - (columns / 2, rows / 2)) > (columns, rows)).any():
-        raise BadCorners(f"corners {corners!r} lie far outside the image of {columns} x {rows} px")
+def seen_box(valid: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns of a view in which gel is seen. Raises ValueError when there are none."""
+    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
+    if len(rows) < 2 or len(columns) < 2:
+        raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

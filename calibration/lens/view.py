@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.errors import Unusable
+from calibration.errors import CalibrationError
 from calibration.lens.board import Points
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
@@ -32,10 +32,15 @@ FEWEST_POINTS = 6  # of a plane
 Side = Annotated[int, Field(ge=16, le=8192)]
 Positive = Annotated[Length, Field(gt=0)]
 Pair = tuple[float, float]
+Corners = tuple[Pair, Pair, Pair, Pair]
 
 
-class BadView(Unusable):
+class BadView(CalibrationError):
     """Pictures of a board that tell no lens, or no plane."""
+
+
+class BadCorners(CalibrationError):
+    """The four corners are no picture of a rectangle."""
 
 
 class Lens(Config):
@@ -266,11 +271,26 @@ def fit_view(
     )
 
 
+def check_corners(corners: Sequence[tuple[float, float]], image_shape: tuple[int, int]) -> None:
+    """Raises BadCorners."""
+    points = np.array(corners, dtype=np.float64)
+    if points.shape != (4, 2) or not np.isfinite(points).all():
+        raise BadCorners(f"corners must be 4 finite pixels (u, v), got {corners!r}")
+    edge = np.roll(points, -1, axis=0) - points
+    turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
+    if not (turn > 1.0).all():  # v grows downwards: clockwise as seen is positive
+        raise BadCorners(
+            f"corners {corners!r} are no convex quadrangle; give top left, top right, bottom right, bottom left "
+            "[px, u to the right, v down]"
+        )
+    rows, columns = image_shape
+    if (np.abs(points - (columns / 2, rows / 2)) > (columns, rows)).any():
+        raise BadCorners(f"corners {corners!r} lie far outside the image of {columns} x {rows} px")
+
+
 def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int, int]) -> GelView:
     """The view of a gel of `size` (x, y) [m] by its corners in the picture: top left, top right, bottom right, bottom
-    left [px]. No residual tells whether they are right. Raises calibration.lens.rectification.BadCorners."""
-    from calibration.lens.rectification import check_corners
-
+    left [px]. No residual tells whether they are right. Raises BadCorners."""
     check_corners(corners, image_shape)
     lens = pinhole(image_shape)
     x, y = size[0] / 2, size[1] / 2

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.light.ball_press import Fit
+from calibration.light.calibrator import LightFit
 
 MOST = 8  # presses that are drawn, the worst first
 REACH = 2.0  # contact radii round the middle
 
 
-def draw(fit: Fit, path: Path) -> None:
+def draw(fit: LightFit, path: Path) -> None:
     """Writes a PNG: of each press the change of colour as it was seen, as it is predicted by the others, and the
     error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
     from matplotlib.figure import Figure

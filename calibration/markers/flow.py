@@ -13,8 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.height.surface import seen_box
-from calibration.lens.rectification import Rectification
+from calibration.lens.rectification import Rectification, seen_box
 from calibration.markers.dots import SMALLEST, DotFinder
 from calibration.markers.lattice import Lattice, NoLattice, find_lattice, spread, usual_pitch
 from calibration.markers.tracker import DotTracker

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.robust_fit import Adjusted, BadMeasurements, adjust, moved, swing
+from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, perturbed, robust_fit
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
 FEWEST = 6  # touches: 18 equations for 9 numbers
-LEAST_SWING = np.radians(5.0)  # of the tilts, see adjustment.swing [rad]
+MIN_SPREAD = np.radians(5.0)  # of the tilts, see adjustment.swing [rad]
 LEAST_SPREAD = 0.5e-3  # of the contacts over the gel, in the direction in which they vary least [m]
 CAP = 0.5  # the ball is looked for where the dent is deeper than this part of its deepest: inside the contact circle
 LEAST_CELLS = 12  # of a cap
@@ -38,7 +38,7 @@ class TouchNoise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Touch:
+class BallTouch:
     """One touch."""
 
     tool: Pose  # world_from_tool; any frame that stands still will do for the world
@@ -76,7 +76,7 @@ def deviation(covariance: FloatArray) -> tuple[float, float]:
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:6].sum()))
 
 
-def fit_touches(touches: Sequence[Touch], ball_radius: float, noise: TouchNoise | None = None) -> TouchFit:
+def fit_touches(touches: Sequence[BallTouch], ball_radius: float, noise: TouchNoise | None = None) -> TouchFit:
     """Fits tool_from_sensor to touches of a ball of `ball_radius` [m].
 
     Maximum likelihood for independent normal noise; no first guess is needed. Raises BadMeasurements.
@@ -90,22 +90,22 @@ def fit_touches(touches: Sequence[Touch], ball_radius: float, noise: TouchNoise 
     _check_spread(turn, seen)
     sigma = np.sqrt(np.array([noise.centre, noise.centre, noise.depth]) ** 2 + noise.robot**2)
 
-    def solve(base: FloatArray, starts: list[FloatArray]) -> Adjusted:
+    def solve(base: FloatArray, starts: list[FloatArray]) -> RobustFit:
         def residuals(change: FloatArray) -> FloatArray:
-            sensor = moved(base, change)
+            sensor = perturbed(base, change)
             # the ball's centre in tool axes, then in the sensor's, less where it was seen
             in_tool = np.einsum("nji,nj->ni", turn, change[6:9] - place)
             missed: FloatArray = ((in_tool - sensor[:3, 3]) @ sensor[:3, :3] - seen) / sigma
             return missed
 
-        return adjust(residuals, starts, "touches")
+        return robust_fit(residuals, starts, "touches")
 
     identity = np.eye(4)
     rough = solve(identity, _starts(turn, place, seen))
-    base, ball = moved(identity, rough.parameters[:6]), rough.parameters[6:9]
+    base, ball = perturbed(identity, rough.parameters[:6]), rough.parameters[6:9]
     fit = solve(base, [np.concatenate([np.zeros(6), ball])])  # again, where a rotation vector is no long way round
     return TouchFit(
-        tool_from_sensor=se3.from_matrix(moved(base, fit.parameters[:6])),
+        tool_from_sensor=se3.from_matrix(perturbed(base, fit.parameters[:6])),
         ball=fit.parameters[6:9],
         covariance=fit.covariance[:6, :6],
         bound=fit.bound[:6, :6],
@@ -116,11 +116,11 @@ def fit_touches(touches: Sequence[Touch], ball_radius: float, noise: TouchNoise 
 
 
 def _check_spread(turn: FloatArray, seen: FloatArray) -> None:
-    tilts = swing(turn)
-    if tilts < LEAST_SWING:
+    tilts = angular_spread(turn)
+    if tilts < MIN_SPREAD:
         raise BadMeasurements(
             f"the tilts differ too little: one direction swings by only {np.degrees(tilts):.1f} degrees, "
-            f"{np.degrees(LEAST_SWING):.0f} are needed. Tilt the sensor about both axes of its gel, 20 degrees and more"
+            f"{np.degrees(MIN_SPREAD):.0f} are needed. Tilt the sensor about both axes of its gel, 20 degrees and more"
         )
     spread = float(np.sqrt(max(0.0, np.linalg.eigvalsh(np.cov(seen[:, :2].T))[0])))
     if spread < LEAST_SPREAD:
@@ -144,7 +144,7 @@ def _starts(turn: FloatArray, place: FloatArray, seen: FloatArray) -> list[Float
     return starts
 
 
-def touch_seen(
+def locate_ball(
     height: FloatArray, valid: NDArray[np.bool_], pitch: float, ball_radius: float
 ) -> tuple[tuple[float, float], float]:
     """Contact centre (x, y) [m] and depth [m] of a ball, in a surface `height` (h, w) [m] on the canonical grid.

@@ -16,12 +16,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.ball_touch import deviation
-from calibration.poses.robust_fit import Adjusted, BadMeasurements, adjust, invert, moved, swing
+from calibration.poses.robust_fit import (
+    BadMeasurements,
+    RobustFit,
+    angular_spread,
+    inverse,
+    perturbed,
+    robust_fit,
+)
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
 FEWEST = 6  # poses: 36 equations for 12 numbers
-LEAST_SWING = np.radians(15.0)  # of the flange, see adjustment.swing [rad]
+MIN_SPREAD = np.radians(15.0)  # of the flange, see adjustment.swing [rad]
 SUBSETS, SUBSET = 12, 5  # starts from a few poses each, lest one bad pose spoil them all
 RESETS = 2  # times that the weights are computed anew
 
@@ -37,7 +44,7 @@ class HandEyeNoise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class BoardPose:
     """One picture of the board, and where the flange was."""
 
     flange: Pose  # base_from_flange
@@ -62,23 +69,25 @@ class HandEyeFit:
         return deviation(self.covariance)
 
 
-def fit_hand_eye(sights: Sequence[Sight], *, fixed: bool = False, noise: HandEyeNoise | None = None) -> HandEyeFit:
+def fit_hand_eye(
+    board_poses: Sequence[BoardPose], *, fixed: bool = False, noise: HandEyeNoise | None = None
+) -> HandEyeFit:
     """Fits where the camera sits to what it saw. `fixed`: the camera is, and the board rides on the flange.
 
     Raises BadMeasurements.
     """
     noise = HandEyeNoise() if noise is None else noise
-    if len(sights) < FEWEST:
-        raise BadMeasurements(f"{len(sights)} poses are too few; at least {FEWEST} are needed, 15 to 30 are good")
-    flange = np.stack([se3.to_matrix(sight.flange) for sight in sights])
-    board = np.stack([se3.to_matrix(sight.board) for sight in sights])
-    spread = swing(flange[:, :3, :3])
-    if spread < LEAST_SWING:
+    if len(board_poses) < FEWEST:
+        raise BadMeasurements(f"{len(board_poses)} poses are too few; at least {FEWEST} are needed, 15 to 30 are good")
+    flange = np.stack([se3.to_matrix(sight.flange) for sight in board_poses])
+    board = np.stack([se3.to_matrix(sight.board) for sight in board_poses])
+    spread = angular_spread(flange[:, :3, :3])
+    if spread < MIN_SPREAD:
         raise BadMeasurements(
             f"the flange turns too little: one direction swings by only {np.degrees(spread):.1f} degrees, "
-            f"{np.degrees(LEAST_SWING):.0f} are needed. Turn it about all axes, 30 degrees and more"
+            f"{np.degrees(MIN_SPREAD):.0f} are needed. Turn it about all axes, 30 degrees and more"
         )
-    arm = invert(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
+    arm = inverse(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
     camera, mount, fit = np.eye(4), np.eye(4), None
     starts = _starts(arm, board)
     for _ in range(1 + RESETS):
@@ -88,7 +97,7 @@ def fit_hand_eye(sights: Sequence[Sight], *, fixed: bool = False, noise: HandEye
             (_solved(arm, board, start, noise, fixed=fixed) for start in starts), key=lambda each: each[2].scatter
         )
     assert fit is not None
-    predicted = invert(camera) @ invert(arm) @ mount
+    predicted = inverse(camera) @ inverse(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
     missed = np.linalg.norm(predicted[:, :3, 3] - board[:, :3, 3], axis=1)
     return HandEyeFit(
@@ -104,21 +113,21 @@ def fit_hand_eye(sights: Sequence[Sight], *, fixed: bool = False, noise: HandEye
 
 def _solved(
     arm: FloatArray, board: FloatArray, start: tuple[FloatArray, FloatArray], noise: HandEyeNoise, *, fixed: bool
-) -> tuple[FloatArray, FloatArray, Adjusted]:
+) -> tuple[FloatArray, FloatArray, RobustFit]:
     camera, mount = start
-    back = invert(arm)
+    back = inverse(arm)
     seen_turn = np.swapaxes(board[:, :3, :3], 1, 2)
     whiten = _whitening(camera, mount, arm, noise, fixed=fixed)
 
     def residuals(change: FloatArray) -> FloatArray:
-        predicted = invert(moved(camera, change[:6])) @ back @ moved(mount, change[6:])
+        predicted = inverse(perturbed(camera, change[:6])) @ back @ perturbed(mount, change[6:])
         turn = Rotation.from_matrix(predicted[:, :3, :3] @ seen_turn).as_rotvec()
         missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
         whitened: FloatArray = np.einsum("nij,nj->ni", whiten, missed)
         return whitened
 
-    fit = adjust(residuals, [np.zeros(12)], "poses")
-    return moved(camera, fit.parameters[:6]), moved(mount, fit.parameters[6:]), fit
+    fit = robust_fit(residuals, [np.zeros(12)], "poses")
+    return perturbed(camera, fit.parameters[:6]), perturbed(mount, fit.parameters[6:]), fit
 
 
 def _whitening(
@@ -130,8 +139,8 @@ def _whitening(
     camera) and `after` (the board in the flange): it turns the board, and shifts it by turn x lever.
     """
     count = len(arm)
-    before = invert(camera) @ invert(arm) if fixed else np.broadcast_to(invert(camera), (count, 4, 4))
-    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else invert(arm) @ mount
+    before = inverse(camera) @ inverse(arm) if fixed else np.broadcast_to(inverse(camera), (count, 4, 4))
+    after = np.broadcast_to(mount, (count, 4, 4)) if fixed else inverse(arm) @ mount
     lever, turn = after[:, :3, 3], before[:, :3, :3]
     effect = np.zeros((count, 6, 6))
     effect[:, :3, :3] = effect[:, 3:, 3:] = turn
@@ -158,7 +167,7 @@ def _starts(arm: FloatArray, board: FloatArray) -> list[tuple[FloatArray, FloatA
     chosen += [random.choice(count, min(SUBSET, count), replace=False) for _ in range(SUBSETS)]
     candidates = []
     for some in chosen:
-        if swing(arm[some, :3, :3]) < LEAST_SWING / 2:
+        if angular_spread(arm[some, :3, :3]) < MIN_SPREAD / 2:
             continue
         camera = closed_form(arm[some], board[some])
         mounts = arm @ camera @ board
@@ -190,8 +199,8 @@ def closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
 def park(arm: FloatArray, board: FloatArray) -> FloatArray:
     """The same without OpenCV: Park and Martin 1994, rotation first (Procrustes over all pairs), then the shift."""
     pairs = list(combinations(range(len(arm)), 2))
-    a = np.stack([invert(arm[j]) @ arm[i] for i, j in pairs])
-    b = np.stack([board[j] @ invert(board[i]) for i, j in pairs])
+    a = np.stack([inverse(arm[j]) @ arm[i] for i, j in pairs])
+    b = np.stack([board[j] @ inverse(board[i]) for i, j in pairs])
     axes_a, axes_b = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (a, b))
     u, _, vt = np.linalg.svd(axes_a.T @ axes_b)
     found = np.eye(4)

@@ -15,8 +15,8 @@ import yaml
 from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from calibration.poses.ball_touch import Touch
-from calibration.poses.hand_eye import Sight
+from calibration.poses.ball_touch import BallTouch
+from calibration.poses.hand_eye import BoardPose
 from tacsim.config import load
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.hardware import Placement
@@ -58,26 +58,26 @@ class TouchFile(Config):
     count: Count = None
     touches: Annotated[tuple[TouchEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
 
-    def measurements(self) -> list[Touch]:
-        return [Touch(each.tool.pose, each.contact, each.depth) for each in self.touches]
+    def measurements(self) -> list[BallTouch]:
+        return [BallTouch(each.tool.pose, each.contact, each.depth) for each in self.touches]
 
 
-class SightEntry(Config):
+class BoardPoseEntry(Config):
     """One picture of the board."""
 
     flange: Placement  # base_from_flange
     board: Placement  # camera_from_board
 
 
-class SightFile(Config):
+class BoardPoseFile(Config):
     """Poses of one board, seen by one camera."""
 
     camera: Literal["flange", "fixed"] = "flange"  # rides on the flange before a fixed board, or the other way round
     count: Count = None
-    poses: Annotated[tuple[SightEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
+    poses: Annotated[tuple[BoardPoseEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
 
-    def measurements(self) -> list[Sight]:
-        return [Sight(each.flange.pose, each.board.pose) for each in self.poses]
+    def measurements(self) -> list[BoardPose]:
+        return [BoardPose(each.flange.pose, each.board.pose) for each in self.poses]
 
 
 def read_touches(path: Path) -> TouchFile:
@@ -85,24 +85,24 @@ def read_touches(path: Path) -> TouchFile:
     return load(TouchFile, path)
 
 
-def read_sights(path: Path) -> SightFile:
+def read_board_poses(path: Path) -> BoardPoseFile:
     """Raises tacsim.config.ConfigError."""
-    return load(SightFile, path)
+    return load(BoardPoseFile, path)
 
 
-def touch_file(touches: Sequence[Touch], ball_radius: float) -> TouchFile:
+def touch_file(touches: Sequence[BallTouch], ball_radius: float) -> TouchFile:
     """What `write_record` shall write of touches."""
     entries = tuple(TouchEntry(tool=placement(t.tool), contact=t.contact, depth=max(0.0, t.depth)) for t in touches)
     return TouchFile(ball_radius=ball_radius, count=len(entries), touches=entries)
 
 
-def sight_file(sights: Sequence[Sight], *, fixed: bool) -> SightFile:
+def board_pose_file(board_poses: Sequence[BoardPose], *, fixed: bool) -> BoardPoseFile:
     """What `write_record` shall write of sights."""
-    entries = tuple(SightEntry(flange=placement(s.flange), board=placement(s.board)) for s in sights)
-    return SightFile(camera="fixed" if fixed else "flange", count=len(entries), poses=entries)
+    entries = tuple(BoardPoseEntry(flange=placement(s.flange), board=placement(s.board)) for s in board_poses)
+    return BoardPoseFile(camera="fixed" if fixed else "flange", count=len(entries), poses=entries)
 
 
-def write_record(path: Path, record: TouchFile | SightFile) -> Path:
+def write_record(path: Path, record: TouchFile | BoardPoseFile) -> Path:
     """Writes a file that the functions above read, in the place of one that may be there. Raises OSError."""
     lines = []
     for key, value in record.model_dump(mode="json").items():
@@ -124,7 +124,7 @@ def placement(pose: Pose) -> Placement:
     return Placement(position=(x, y, z), rotation=(a, b, c))
 
 
-def plain(pose: Pose, covariance: FloatArray | None = None) -> dict[str, Any]:
+def pose_as_json(pose: Pose, covariance: FloatArray | None = None) -> dict[str, Any]:
     """A pose for JSON [m, rad]; `covariance` (6, 6): of shift and rotation vector."""
     found: dict[str, Any] = placement(pose).model_dump(mode="json")
     if covariance is not None:

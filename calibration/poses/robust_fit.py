@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.errors import Unusable
+from calibration.errors import CalibrationError
 from tacsim.interface import FloatArray
 
 STRAY = 5.0  # a measurement off by so many standard deviations, all its residuals together, is a stray
@@ -28,12 +28,12 @@ DISAGREE = 3.0  # scatter over what the noise allows: beyond it something other 
 Residuals = Callable[[FloatArray], FloatArray]
 
 
-class BadMeasurements(Unusable):
+class BadMeasurements(CalibrationError):
     """Measurements that tell no transform: too few, too alike, or at odds with each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
+class RobustFit:
     """A fit and how sure it is."""
 
     parameters: FloatArray  # (p,) what is added to the start: for a pose, shift [m] and rotation vector [rad]
@@ -44,7 +44,7 @@ class Adjusted:
     scatter: float  # root mean square of the used residuals, by degrees of freedom: 1 if the stated noise is right
 
 
-def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adjusted:
+def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> RobustFit:
     """Fits parameters (p,) so that `residuals` (n, k), each over its standard deviation, become small.
 
     starts: the best of the fits from each of them is taken. what: the measurements in a word, for messages.
@@ -87,7 +87,7 @@ def adjust(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> Adj
             f"{what} disagree: they scatter {scatter:.1f} times as much as the stated noise allows ({DISAGREE:g} at "
             "most); is something loose, a length or a frame wrong, or the noise larger than stated?"
         )
-    return Adjusted(
+    return RobustFit(
         parameters=found,
         covariance=bound * max(1.0, scatter) ** 2,
         bound=bound,
@@ -111,7 +111,7 @@ def _scaled(information: FloatArray) -> FloatArray:
     return scaled
 
 
-def swing(rotations: FloatArray) -> float:
+def angular_spread(rotations: FloatArray) -> float:
     """How much `rotations` (n, 3, 3) differ [rad]: the direction that they turn least still swings by so much, as a
     root mean square; 0 if all turn about one axis.
 
@@ -123,7 +123,7 @@ def swing(rotations: FloatArray) -> float:
     return float(np.arcsin(np.sqrt(np.clip(least, 0.0, 1.0))))
 
 
-def moved(pose: FloatArray, change: FloatArray) -> FloatArray:
+def perturbed(pose: FloatArray, change: FloatArray) -> FloatArray:
     """`pose` (4, 4), shifted by change[:3] [m] and turned about its own origin by the rotation vector change[3:]; both
     along the axes of the frame that the pose is given in."""
     result = pose.copy()
@@ -132,7 +132,7 @@ def moved(pose: FloatArray, change: FloatArray) -> FloatArray:
     return result
 
 
-def invert(frames: FloatArray) -> FloatArray:
+def inverse(frames: FloatArray) -> FloatArray:
     """Inverses of rigid transforms (..., 4, 4)."""
     back = np.zeros_like(frames)
     turn = np.swapaxes(frames[..., :3, :3], -1, -2)

@@ -14,8 +14,8 @@ from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, p
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
     from calibration.compare.compare import Comparison
-    from calibration.compare.frame_set import Side
     from calibration.compare.invariance import Report
+    from calibration.frame_set import FrameSet
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 LENGTHS = ("height_rmse", "surface_radius", "surface_centroid", "marker_error")  # figures that may carry a unit
@@ -73,20 +73,22 @@ def compare(
     with busy("loading"):
         from calibration.compare.compare import Options, Pairing
         from calibration.compare.compare import compare_frames as run
-        from calibration.compare.frame_set import BadSide
         from calibration.compare.report import figures, write
-        from calibration.lens.rectification import BadCorners
+        from calibration.errors import BadFrames
+        from calibration.lens.view import BadCorners
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
     bundles = [None if path is None else _calibration(path) for path in (calibration_a, calibration_b)]
     try:
         truth = _metric(_read(b, reference_b, sensor_b), bundles[1])
         if _is_scene(a):
             if corners_a or corners_b or reference_a or sensor_a:
-                raise BadSide(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
+                raise BadFrames(
+                    f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated"
+                )
             made = _pressed(a, truth, calibration_b, set_ or [])
         else:
             if set_:
-                raise BadSide(f"--set changes a scene, but A is no scene: {a}")
+                raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
             made = _metric(_read(Path(a), reference_a, sensor_a), bundles[0])
         # from here on all pictures are metric where a calibration says how
         bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
@@ -98,7 +100,7 @@ def compare(
                 lambda done, total: bar.update(row, completed=done, total=total),
             )  # fmt: skip
         report = _invariance(result, bundles[1]) if invariance else None
-    except (BadSide, BadCorners) as error:
+    except (BadFrames, BadCorners) as error:
         raise typer.BadParameter(str(error), param_hint="A B") from None
     values = figures(result, report)
     _refuse_unknown(limits, values)
@@ -119,18 +121,18 @@ def _calibration(path: Path) -> Calibration:
         raise typer.BadParameter(str(error), param_hint="--calibration-a, --calibration-b") from None
 
 
-def _read(path: Path, reference: Path | None, sensor: str) -> Side:
-    from calibration.compare.frame_set import read_side
+def _read(path: Path, reference: Path | None, sensor: str) -> FrameSet:
+    from calibration.frame_set import read_frame_set
 
     with busy(f"reading {path}"):
-        return read_side(path, reference, sensor)
+        return read_frame_set(path, reference, sensor)
 
 
-def _metric(side: Side, bundle: Calibration | None) -> Side:
+def _metric(side: FrameSet, bundle: Calibration | None) -> FrameSet:
     """The side through lens and perspective of its calibration, where that has a view."""
-    from calibration.compare.frame_set import through_view
+    from calibration.frame_set import rectified_by_view
 
-    return side if bundle is None or bundle.view is None else through_view(side, bundle.view)
+    return side if bundle is None or bundle.view is None else rectified_by_view(side, bundle.view)
 
 
 def _is_scene(a: str) -> bool:
@@ -140,15 +142,15 @@ def _is_scene(a: str) -> bool:
     return a.lower().endswith((".yaml", ".yml")) or (not Path(a).exists() and a in names("scene"))
 
 
-def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) -> Side:
+def _pressed(name: str, truth: FrameSet, bundle: Path | None, overrides: list[str]) -> FrameSet:
     """A's frames by the simulator."""
-    from calibration.bundle import sensor_model
-    from calibration.compare.frame_set import BadSide
+    from calibration.bundle import read_sensor_model
+    from calibration.errors import BadFrames
     from tacsim.config import load_scene
     from tacsim.models.sensor import CanonicalGrid
 
     if bundle is None:
-        raise BadSide("a scene is seen through the light of B: give B's calibration (--calibration-b)")
+        raise BadFrames("a scene is seen through the light of B: give B's calibration (--calibration-b)")
     scene = load_scene(name, ["preset=standard", *overrides])
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
     from robot.studies.matched_press import press_like
@@ -156,7 +158,7 @@ def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) 
     with progress() as bar:
         row = bar.add_task("pressing", total=None)
         made, said = press_like(
-            truth, scene, sensor_model(bundle), CanonicalGrid(),
+            truth, scene, read_sensor_model(bundle), CanonicalGrid(),
             lambda done, total: bar.update(row, completed=done, total=total),
         )  # fmt: skip
     for words in said:
@@ -165,20 +167,21 @@ def _pressed(name: str, truth: Side, bundle: Path | None, overrides: list[str]) 
 
 
 def _straight(
-    a: Side, b: Side, texts: tuple[str | None, str | None], bundles: list[Calibration | None]
-) -> tuple[Side, Side]:
+    a: FrameSet, b: FrameSet, texts: tuple[str | None, str | None], bundles: list[Calibration | None]
+) -> tuple[FrameSet, FrameSet]:
     """Both sides seen straight on, where the corners of the gel are given: B's size counts."""
-    from calibration.compare.frame_set import BadSide, rectangle, through_corners
+    from calibration.errors import BadFrames
+    from calibration.frame_set import rectified_by_corners, rectified_shape
 
     corners = [None if text is None else _corners(text) for text in texts]
     for side, given, bundle in zip("ab", corners, bundles, strict=True):
         if given is not None and bundle is not None:
-            raise BadSide(
+            raise BadFrames(
                 f"--corners-{side} and --calibration-{side}: a calibration knows where the gel lies; give one"
             )
-    shape = b.shape if corners[1] is None else rectangle(corners[1])
-    straight_b = b if corners[1] is None else through_corners(b, corners[1], shape)
-    return (a if corners[0] is None else through_corners(a, corners[0], shape)), straight_b
+    shape = b.shape if corners[1] is None else rectified_shape(corners[1])
+    straight_b = b if corners[1] is None else rectified_by_corners(b, corners[1], shape)
+    return (a if corners[0] is None else rectified_by_corners(a, corners[0], shape)), straight_b
 
 
 def _corners(text: str) -> Corners:

@@ -39,14 +39,14 @@ class Guarded(TyperGroup):
 
 def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
-    from calibration.errors import Unusable
+    from calibration.errors import CalibrationError
     from robot.deploy.policy import PolicyNotFound
     from robot.open import CannotOpen
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
     from tacsim.physics.failure.dump import DumpError
 
-    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, Unusable, DumpError)):
+    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, CalibrationError, DumpError)):
         return str(error), UNUSABLE
     if _refused(error):
         return str(error), UNUSABLE

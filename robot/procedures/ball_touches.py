@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.ball_touch import Touch, touch_seen
+from calibration.poses.ball_touch import BallTouch, locate_ball
 from calibration.poses.robust_fit import BadMeasurements
 from robot.errors import DeviceError
 from robot.rig.hardware_rig import RigArm
@@ -91,7 +91,7 @@ def schedule(plan: TouchPlan) -> list[tuple[Rotation, FloatArray]]:
 class TouchRecord:
     """What came of a plan."""
 
-    touches: list[Touch]
+    touches: list[BallTouch]
     missed: list[str]  # touches that were left out, and why
 
 
@@ -103,7 +103,7 @@ def record_touches(
     plan: TouchPlan,
     stop: Callable[[], bool] = lambda: False,
     tell: Callable[[int], None] = lambda done: None,
-    keep: Callable[[Sequence[Touch]], None] = lambda touches: None,
+    keep: Callable[[Sequence[BallTouch]], None] = lambda touches: None,
 ) -> TouchRecord:
     """Resets the rig, touches, and leaves the arm lifted and stopped. `facts`: those that the rig was opened with.
     `keep` is given all touches so far after each one.
@@ -141,7 +141,7 @@ def record_touches(
                     raise DeviceError("most touches failed; the last:\n" + record.missed[-1]) from missed
                 continue
             balls.append(se3.transform(pose, np.array([*contact, plan.ball_radius - depth])))
-            record.touches.append(Touch(se3.compose(pose, sensor_from_tool), contact, depth))
+            record.touches.append(BallTouch(se3.compose(pose, sensor_from_tool), contact, depth))
             keep(record.touches)
     finally:
         rig.stop()
@@ -233,7 +233,7 @@ class _Toucher:
             time.sleep(max(0.0, due - time.monotonic()))
         seen = self._observe(SETTLE)
         assert seen.height is not None
-        contact, depth = touch_seen(seen.height.astype(np.float64), seen.valid, self._pitch, self._plan.ball_radius)
+        contact, depth = locate_ball(seen.height.astype(np.float64), seen.valid, self._pitch, self._plan.ball_radius)
         return contact, depth, self._rig.arms[self._arm].state().pose
 
     def _observe(self, settle: float) -> TactileObservation:

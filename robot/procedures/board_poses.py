@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.errors import Unusable
+from calibration.errors import CalibrationError
 from calibration.lens.board import BadBoard, Board, find_board
 from calibration.lens.view import BadView, Lens, board_pose
-from calibration.poses.hand_eye import LEAST_SWING, Sight
-from calibration.poses.robust_fit import swing
+from calibration.poses.hand_eye import MIN_SPREAD, BoardPose
+from calibration.poses.robust_fit import angular_spread
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
 from robot.mock.cell.cell import MockCell
@@ -36,7 +36,7 @@ LARGEST_RESIDUAL = 2.0  # of a board's pose, root mean square [px]
 PICTURE = 15.0  # longest wait for one [s]
 
 
-class CannotSee(Unusable):
+class CannotSee(CalibrationError):
     """This arm or this camera is not such that a board could tell where the camera sits."""
 
 
@@ -55,7 +55,7 @@ class SightPlan:
 class SightRecord:
     """What came of a plan."""
 
-    sights: list[Sight]
+    board_poses: list[BoardPose]
     missed: list[str]  # poses that were left out, and why
 
 
@@ -109,17 +109,17 @@ def record_sights(
     plan: SightPlan,
     stop: Callable[[], bool] = lambda: False,
     tell: Callable[[int], None] = lambda done: None,
-    keep: Callable[[Sequence[Sight]], None] = lambda sights: None,
+    keep: Callable[[Sequence[BoardPose]], None] = lambda board_poses: None,
 ) -> SightRecord:
     """Looks at the board from all poses of the plan and returns to the first; `keep` is given all sights so far after
     each one. Raises CannotSee when the board is not
     in view at the beginning, before anything has moved; and what the arm or the camera raise: the arm is stopped then.
     """
-    spread = swing(np.stack([turn.as_matrix() for turn in schedule(plan)]))
-    if spread < LEAST_SWING:
+    spread = angular_spread(np.stack([turn.as_matrix() for turn in schedule(plan)]))
+    if spread < MIN_SPREAD:
         raise CannotSee(
             f"with a tilt of {np.degrees(plan.tilt):.0f} degrees and {plan.poses} poses one direction would swing by "
-            f"only {np.degrees(spread):.1f} degrees; {np.degrees(LEAST_SWING):.0f} are needed: give a larger --tilt"
+            f"only {np.degrees(spread):.1f} degrees; {np.degrees(MIN_SPREAD):.0f} are needed: give a larger --tilt"
         )
     config = arm.config
     sensor_from_flange = se3.inverse(se3.compose(config.flange_from_tool.pose, config.tool_from_sensor.pose))
@@ -145,8 +145,8 @@ def record_sights(
                 record.missed.append(f"pose {done + 1}: {missed}")
                 continue
             sensor = se3.compose(base_from_world, arm.state().pose)
-            record.sights.append(Sight(se3.compose(sensor, sensor_from_flange), board))
-            keep(record.sights)
+            record.board_poses.append(BoardPose(se3.compose(sensor, sensor_from_flange), board))
+            keep(record.board_poses)
         go(arm, arm.name, begun, TRAVEL)
     finally:
         arm.stop()

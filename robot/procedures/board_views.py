@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import Unusable
+from calibration.errors import CalibrationError
 from calibration.lens.board import BadBoard, Board, Points, find_board
 from robot.procedures.presses import LOOK, PICTURE, Seeing
 from tacsim.interface import EndOfEpisode, FloatArray
@@ -38,7 +38,7 @@ WAYS = (
 ON_GEL = "lay the board on the gel, print side down, and leave it there"
 
 
-class CannotView(Unusable):
+class CannotView(CalibrationError):
     """Nobody held a board before the camera."""
 
 

@@ -16,9 +16,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import Unusable
-from calibration.light.ball_press import BadPresses
-from calibration.light.collect import PressCollection
+from calibration.errors import BadFrames, CalibrationError
+from calibration.light.press_collection import PressCollection
 from calibration.markers.dots import DotEraser
 from calibration.markers.flow import find_markers
 from calibration.markers.lattice import NoLattice
@@ -41,7 +40,7 @@ REFERENCE = "background.png"
 NOISE_FRAMES = 8  # pictures without contact that tell the camera's noise
 
 
-class CannotPress(Unusable):
+class CannotPress(CalibrationError):
     """This sensor is not such that a person could press a ball before it, or nobody did."""
 
 
@@ -103,7 +102,7 @@ def record_presses(
     tell: how many presses are done.
 
     A stop, and the end of a recorded source, leave what was taken. Raises CannotPress when nothing happens for long
-    or the gel does not become again what it was; BadPresses for a picture without contact that is dark or saturated;
+    or the gel does not become again what it was; BadFrames for a picture without contact that is dark or saturated;
     what the camera raises.
     """
     record = PressRecord()
@@ -127,7 +126,7 @@ def record_presses(
             image = watch.press(lambda: say("Still moving: hold the ball still."))
             try:
                 circle = collection.offer(image)
-            except BadPresses as why:
+            except BadFrames as why:
                 record.refused.append(str(why))
                 say(f"Not taken: {why}.")
             else:
@@ -144,14 +143,14 @@ def record_presses(
 
 
 def _to_judge(plan: PressPlan, reference: Image) -> Callable[[Image], Image] | None:
-    """Native picture -> the metric one that presses are judged by, without dots. Raises BadPresses."""
+    """Native picture -> the metric one that presses are judged by, without dots. Raises BadFrames."""
     if not plan.markers:
         return plan.rectify
     rectify = plan.rectify if plan.rectify is not None else lambda image: image
     try:
         _, radius = find_markers(rectify(reference))
     except NoLattice as nothing:
-        raise BadPresses(f"{nothing}; leave --markers out if none are printed") from None
+        raise BadFrames(f"{nothing}; leave --markers out if none are printed") from None
     erase = DotEraser(radius)
     return lambda image: erase(rectify(image))
 

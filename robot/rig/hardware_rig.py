@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from calibration.errors import naming
+from calibration.errors import error_context
 from robot.arm.time_alignment import ArmHistory
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
@@ -100,8 +100,8 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
     confirm: asks a person a question before anything approaches the body; not needed where all arms are mocks.
     dry_run: connects, sees, feels, times and records, but no motion is sent, neither by reset nor by step.
 
-    Raises DeviceError for what cannot be opened, calibration.errors.Unusable for a calibration, ValueError for a rig
-    that makes no sense.
+    Raises DeviceError for what cannot be opened, calibration.errors.CalibrationError for a calibration,
+    ValueError for a rig that makes no sense.
     """
     real = [name for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is None]
     # first, because a wrong calibration is known before anything is connected
@@ -235,17 +235,20 @@ def _confirmed(config: RigConfig, cell: MockCell, confirm: Confirm | None, *, re
 
 
 def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
-    from calibration.normaliser import for_simulated
+    from calibration.normaliser import normaliser_for_simulation
 
     if isinstance(config, CameraSensorConfig):
         return camera_normaliser(name, config, rig)
     assert isinstance(config, SimSensorConfig) and rig.scene is not None
-    return for_simulated(config.model, rig.scene.gel.size[:2], rig.canonical)
+    return normaliser_for_simulation(config.model, rig.scene.gel.size[:2], rig.canonical)
 
 
 def camera_normaliser(name: str, config: CameraSensorConfig, rig: RigConfig) -> FrameNormaliser:
-    """The normaliser of one camera of a rig. Raises calibration.errors.Unusable, naming the sensor; ValueError."""
-    from calibration.normaliser import for_camera
+    """The normaliser of one camera of a rig. Raises ValueError, and
+    calibration.errors.CalibrationError, which names the sensor."""
+    from calibration.normaliser import normaliser_for_camera
 
-    with naming(f"sensors.{name}"):
-        return for_camera(config, config.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical)
+    with error_context(f"sensors.{name}"):
+        return normaliser_for_camera(
+            config, config.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical
+        )

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.compare.frame_set import BadSide, Shot, Side
+from calibration.errors import BadFrames
+from calibration.frame_set import Frame, FrameSet
 from calibration.light.circle import Circle, NoCircle, contact_circle
 from tacsim.interface import Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
@@ -29,12 +30,12 @@ DEEPEST = 0.8  # of the gel's thickness
 
 
 def press_like(
-    real: Side,
+    real: FrameSet,
     scene: Scene,
     sensor: SensorModel,
     grid: CanonicalGrid,
     on_press: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Side, list[str]]:
+) -> tuple[FrameSet, list[str]]:
     """The frames of `real` by the simulator, under the same names; and in words what could not be done.
 
     Args:
@@ -43,28 +44,28 @@ def press_like(
         sensor: makes the pictures, of the size of the real ones: that of the sensor's calibration.
         grid: on which the surfaces are kept.
 
-    Raises BadSide for a scene without ball, pictures of another size, or no contact at all; SimulationDiverged.
+    Raises BadFrames for a scene without ball, pictures of another size, or no contact at all; SimulationDiverged.
     """
     if scene.indenter is None or not isinstance(scene.indenter.geometry, Sphere):
-        raise BadSide(f"scene '{scene.name}' presses no ball; what it presses is placed by the circle of a ball")
+        raise BadFrames(f"scene '{scene.name}' presses no ball; what it presses is placed by the circle of a ball")
     if real.shape != (sensor.geometry.height, sensor.geometry.width):
-        raise BadSide(
+        raise BadFrames(
             f"{real.name} is {real.shape[1]} x {real.shape[0]} px, the calibration is of "
             f"{sensor.geometry.width} x {sensor.geometry.height}; it belongs to another sensor or setting"
         )
     ball = scene.indenter.geometry.radius
     circles, notes = _circles(real, ball / sensor.geometry.pixel_pitch)
     bench = _Bench(scene, ball, sensor, grid)
-    done: dict[str, Shot] = {}
+    done: dict[str, Frame] = {}
     # from the widest contact down to none would peel; upwards the gel is only ever pressed farther
     for name, circle in sorted(circles.items(), key=lambda item: item[1].radius):
         on_press(len(done), len(circles))
         image, surface, said = bench.press(circle)
-        done[name] = Shot(name, image, surface)
+        done[name] = Frame(name, image, surface)
         notes += [f"{name}: {said}"] if said else []
     still = bench.untouched
-    shots = tuple(done.get(shot.name, Shot(shot.name, *still)) for shot in real.shots)
-    return Side(f"scene {scene.name}", still[0], "the untouched simulated gel", shots), notes
+    frames = tuple(done.get(shot.name, Frame(shot.name, *still)) for shot in real.frames)
+    return FrameSet(f"scene {scene.name}", still[0], "the untouched simulated gel", frames), notes
 
 
 class _Bench:
@@ -110,15 +111,15 @@ class _Bench:
         return self._render(at), surface_map(at, self._grid, self._sensor.markers)
 
 
-def _circles(real: Side, ball: float) -> tuple[dict[str, Circle], list[str]]:
-    """Contact circles by the frame's name, and where none was found. Raises BadSide when there is none at all."""
+def _circles(real: FrameSet, ball: float) -> tuple[dict[str, Circle], list[str]]:
+    """Contact circles by the frame's name, and where none was found. Raises BadFrames when there is none at all."""
     found: dict[str, Circle] = {}
     notes = []
-    for shot in real.shots:
+    for shot in real.frames:
         try:
             found[shot.name] = contact_circle(shot.image, real.reference, ball)
         except NoCircle as error:
             notes.append(f"{shot.name}: not pressed: {error}")
     if not found:
-        raise BadSide(f"{real.name}: no frame shows a ball's contact, so there is nothing to press. {notes[0]}")
+        raise BadFrames(f"{real.name}: no frame shows a ball's contact, so there is nothing to press. {notes[0]}")
     return found, notes

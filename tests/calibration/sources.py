@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 
 from calibration.bundle import Calibration, Provenance
-from calibration.compare.frame_set import Shot, Side
-from calibration.light.ball_press import calibrate_light
+from calibration.frame_set import Frame, FrameSet
+from calibration.light.calibrator import calibrate_light
 from tacsim.models.sensor import SensorGeometry
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
 
@@ -17,27 +17,29 @@ PLACES = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50)]
 DEPTHS = [0.5e-3, 0.35e-3, 0.65e-3, 0.45e-3, 0.55e-3, 0.3e-3]
 
 
-def side(sensor: HiddenSensor, count: int = 5, name: str = "made", places: list[tuple[int, int]] | None = None) -> Side:
+def side(
+    sensor: HiddenSensor, count: int = 5, name: str = "made", places: list[tuple[int, int]] | None = None
+) -> FrameSet:
     """Presses, the same for every sensor, and two more pictures without contact."""
     presses = [
         sensor.press(depth, x, y) for depth, (x, y) in zip(DEPTHS[:count], (places or PLACES)[:count], strict=True)
     ]
-    shots = tuple(Shot(f"press_{k}.png", press.image) for k, press in enumerate(presses))
-    still = tuple(Shot(f"background_{k}.png", sensor.empty()) for k in (2, 3))
-    return Side(name, sensor.empty(), "made up", shots, still)
+    frames = tuple(Frame(f"press_{k}.png", press.image) for k, press in enumerate(presses))
+    still = tuple(Frame(f"background_{k}.png", sensor.empty()) for k in (2, 3))
+    return FrameSet(name, sensor.empty(), "made up", frames, still)
 
 
-def changed(of: Side, change: object, what: str = "shots") -> Side:
+def changed(of: FrameSet, change: object, what: str = "shots") -> FrameSet:
     """The side with `change` (image -> image) applied to all its pictures; `what`: "all" also changes its reference."""
     assert callable(change)
-    shots = tuple(Shot(shot.name, change(shot.image)) for shot in of.shots)
+    frames = tuple(Frame(shot.name, change(shot.image)) for shot in of.frames)
     reference = change(of.reference) if what == "all" else of.reference
-    return Side(of.name, reference, of.reference_from, shots, of.untouched if what == "shots" else ())
+    return FrameSet(of.name, reference, of.reference_from, frames, of.untouched if what == "shots" else ())
 
 
-def blank(like: Side) -> Side:
+def blank(like: FrameSet) -> FrameSet:
     """A simulation that draws no contact at all."""
-    return Side("blank", like.reference, "made up", tuple(Shot(shot.name, like.reference) for shot in like.shots))
+    return FrameSet("blank", like.reference, "made up", tuple(Frame(shot.name, like.reference) for shot in like.frames))
 
 
 def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
@@ -50,10 +52,10 @@ def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
     return np.clip(np.rint(moved), 0, 255).astype(np.uint8)
 
 
-def save(of: Side, folder: Path, reference: str = "background.png") -> Path:
+def save(of: FrameSet, folder: Path, reference: str = "background.png") -> Path:
     """Writes a side as a folder of pictures."""
     folder.mkdir(parents=True)
-    for name, image in ((reference, of.reference), *((shot.name, shot.image) for shot in (*of.shots, *of.untouched))):
+    for name, image in ((reference, of.reference), *((shot.name, shot.image) for shot in (*of.frames, *of.untouched))):
         Image.fromarray(image).save(folder / name)
     return folder
 

@@ -15,13 +15,13 @@ from calibration.bundle import (
     Calibration,
     Provenance,
     read_bundle,
-    sensor_model,
+    read_sensor_model,
     write_bundle,
 )
-from calibration.height.inverse import TERMS, InverseModel
+from calibration.height.slope_polynomial import TERMS, InverseModel
 from calibration.lens.rectification import to_metric
 from calibration.lens.view import GelView, pinhole, view_of_corners
-from calibration.normaliser import for_calibrated, for_camera
+from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.photometric import PhotometricModel
@@ -163,13 +163,13 @@ def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_twin_shows_the_sensors_own_picture_and_changes_with_a_dent(bundle: Path) -> None:
-    render = Renderer(sensor_model(bundle), (20e-3, 20e-3))
+    render = Renderer(read_sensor_model(bundle), (20e-3, 20e-3))
     np.testing.assert_array_equal(render(flat()), PICTURE)
     assert np.abs(render(dent()).astype(int) - PICTURE).max() > 10
 
 
 def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
-    normalise = for_camera(camera(bundle), (1.0, 1.0), CanonicalGrid())
+    normalise = normaliser_for_camera(camera(bundle), (1.0, 1.0), CanonicalGrid())
     assert normalise.finds_height
     frame = TactileFrame(image=PICTURE, time=0.0, index=0)
     normalise.take_reference(frame)
@@ -177,7 +177,7 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
     assert not seen.contact.any()
     np.testing.assert_array_equal(seen.height, 0.0)
     assert seen.valid.sum() == 64 * 48
-    assert for_calibrated(read_bundle(bundle)[0], CanonicalGrid()).finds_height
+    assert normaliser_for_calibration(read_bundle(bundle)[0], CanonicalGrid()).finds_height
 
 
 # What older formats wrote, before there was a view (1) or noise (2); their checksum is of that content.
@@ -195,14 +195,14 @@ def test_a_bundle_of_an_older_format_still_loads(tmp_path: Path, old: int, witho
     assert hashlib.sha256(json.dumps(canonical, sort_keys=True).encode()).hexdigest() == checksum
     read, _ = read_bundle(path)
     assert read.format == old and read.view is None and read.noise is None and read.image_shape == (120, 160)
-    assert for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid()).finds_height
-    assert sensor_model(path).noise is None
+    assert normaliser_for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid()).finds_height
+    assert read_sensor_model(path).noise is None
 
 
 def test_a_bundle_keeps_the_noise_and_gives_it_to_the_twin(tmp_path: Path) -> None:
     noise = CameraNoise(deviation=(1.8, 1.5, 2.1), colours=(0.4, 0.4, 0.3), neighbours=(0.7, 0.75))
     write_bundle(tmp_path, calibration().model_copy(update={"noise": noise}), PICTURE)
-    assert read_bundle(tmp_path)[0].noise == noise == sensor_model(tmp_path).noise
+    assert read_bundle(tmp_path)[0].noise == noise == read_sensor_model(tmp_path).noise
 
 
 def seen_askew() -> GelView:
@@ -217,8 +217,8 @@ def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> No
     read, _ = read_bundle(tmp_path)
     assert read.view == view and read.image_shape == (240, 320)
     with pytest.raises(BadBundle, match="calibrated on pictures of 320 x 240 px, this sensor delivers 160 x 120"):
-        for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid())
-    normalise = for_camera(camera(tmp_path, 320, 240), (1.0, 1.0), CanonicalGrid())
+        normaliser_for_camera(camera(tmp_path), (1.0, 1.0), CanonicalGrid())
+    normalise = normaliser_for_camera(camera(tmp_path, 320, 240), (1.0, 1.0), CanonicalGrid())
     native = (
         np.random.default_rng(7).integers(60, 200, (12, 16, 3), dtype=np.uint8).repeat(20, axis=0).repeat(20, axis=1)
     )
@@ -234,7 +234,7 @@ def test_a_bundle_keeps_the_view_and_takes_native_pictures(tmp_path: Path) -> No
     metric = np.rint(to_metric(view)(brighter)).astype(np.uint8)
     assert metric.shape == (120, 160, 3)
     at_once = normalise._rectify(brighter)
-    plain = for_calibrated(calibration(), CanonicalGrid())._rectify(metric)
+    plain = normaliser_for_calibration(calibration(), CanonicalGrid())._rectify(metric)
     assert np.abs(at_once - plain).mean() < 1.5
 
 

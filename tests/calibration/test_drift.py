@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from calibration.drift import THIN, Drift, DriftFinder
-from calibration.height.inverse import to_normal
-from calibration.light.ball_press import normal_angle
-from calibration.normaliser import FrameNormaliser, for_calibrated, for_camera, for_pictures, for_simulated
+from calibration.height.slope_polynomial import to_normal
+from calibration.light.calibrator import normal_angle
+from calibration.normaliser import (
+    FrameNormaliser,
+    normaliser_for_calibration,
+    normaliser_for_camera,
+    normaliser_for_pictures,
+    normaliser_for_simulation,
+)
 from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, exchanged
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
@@ -45,7 +51,7 @@ def bundle(sensor: HiddenSensor):
 
 @pytest.fixture
 def normalise(bundle) -> FrameNormaliser:
-    return for_calibrated(bundle[0], GRID, bundle[1])
+    return normaliser_for_calibration(bundle[0], GRID, bundle[1])
 
 
 def angle(seen: TactileObservation, press: Made) -> float:
@@ -113,7 +119,7 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
 def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
     """Three lights alike: dimmed together they leave the background flat, and heights too low."""
     model = SensorModel()
-    normalise = for_pictures(model, (20e-3, 20e-3), GRID)
+    normalise = normaliser_for_pictures(model, (20e-3, 20e-3), GRID)
     render = Renderer(model, (20e-3, 20e-3))
     normalise.take_reference(frame(render(flat())))
     deep = normalise(frame(render(dent())), 0.0).height.max()
@@ -135,12 +141,12 @@ def test_where_too_little_is_untouched_the_last_word_stays(
 
 def test_a_large_contact_is_no_drift_and_a_simulation_has_none() -> None:
     model = SensorModel()
-    normalise = for_pictures(model, (20e-3, 20e-3), GRID)
+    normalise = normaliser_for_pictures(model, (20e-3, 20e-3), GRID)
     render = Renderer(model, (20e-3, 20e-3))
     normalise.take_reference(frame(render(flat())))
     normalise(frame(render(dent(depth=1e-3))), 0.0)
     assert normalise.background < 0.5 and not normalise.stale
-    known = for_simulated(model, (20e-3, 20e-3), GRID)
+    known = normaliser_for_simulation(model, (20e-3, 20e-3), GRID)
     known.take_reference(frame(render(flat())))
     known(frame(0.7 * render(flat()).astype(float), surface_map(flat(), GRID, None)), 0.0)
     assert known.diagnostics() == {} and not known.stale
@@ -149,7 +155,7 @@ def test_a_large_contact_is_no_drift_and_a_simulation_has_none() -> None:
 def test_a_sensor_without_slopes_is_watched_by_its_colour() -> None:
     corners = ((0.0, 0.0), (319.0, 0.0), (319.0, 239.0), (0.0, 239.0))
     config = CameraSensorConfig(driver="camera", source="x", corners=corners, width=320, height=240)
-    normalise = for_camera(config, (1.0, 1.0), GRID)
+    normalise = normaliser_for_camera(config, (1.0, 1.0), GRID)
     image = Renderer(SensorModel(), (20e-3, 20e-3))(dent()).astype(float)
     normalise.take_reference(frame(Renderer(SensorModel(), (20e-3, 20e-3))(flat())))
     normalise(frame(image), 0.0)
@@ -228,7 +234,7 @@ def test_the_drift_is_taken_off_where_no_slopes_are_known_too() -> None:
     config = CameraSensorConfig(
         driver="camera", source="x", corners=corners, size=(20e-3, 15e-3), width=320, height=240
     )  # fmt: skip
-    normalise = for_camera(config, (1.0, 1.0), GRID)
+    normalise = normaliser_for_camera(config, (1.0, 1.0), GRID)
     render = Renderer(SensorModel(texture=0.0), (20e-3, 15e-3))
     normalise.take_reference(frame(render(flat())))
     plain = normalise(frame(render(dent())), 0.0)
@@ -244,13 +250,13 @@ def test_a_simulated_image_is_what_it_was_to_the_last_bit(sensor: HiddenSensor, 
     model = SensorModel()
     render = Renderer(model, (20e-3, 20e-3))
     changed = 0.95 * render(dent()).astype(float)  # a drift that would be told
-    for make in (for_simulated, for_pictures):
+    for make in (normaliser_for_simulation, normaliser_for_pictures):
         for surface in (surface_map(dent(), GRID, None), None):
             normalise = make(model, (20e-3, 20e-3), GRID)
             normalise.take_reference(frame(render(flat())))
             seen = normalise(frame(changed, surface), 0.0)
             np.testing.assert_array_equal(seen.image, _untreated(normalise, frame(changed)))
-    real = for_calibrated(bundle[0], GRID, bundle[1])
+    real = normaliser_for_calibration(bundle[0], GRID, bundle[1])
     real.take_reference(frame(bundle[1]))
     bright = frame(sensor.press(0.5e-3, 130, 100).image + 10.0, surface_map(dent(), GRID, None))
     np.testing.assert_array_equal(real(bright, 0.0).image, _untreated(real, bright))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.bundle import read_bundle
-from calibration.normaliser import for_calibrated
+from calibration.normaliser import normaliser_for_calibration
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.images import read_image
@@ -22,7 +22,7 @@ def test_a_bundle_of_the_first_release_gives_the_heights_that_it_gave_then() -> 
     calibration, reference = read_bundle(BUNDLE, "fixture-0.1.0")
     assert calibration.provenance.software == "tacsim 0.1.0" and len(calibration.residuals) == 8
     expected = json.loads((BUNDLE / "heights.json").read_text(encoding="utf-8"))
-    normalise = for_calibrated(calibration, CanonicalGrid(), reference)
+    normalise = normaliser_for_calibration(calibration, CanonicalGrid(), reference)
     normalise.take_reference(TactileFrame(reference, 0.0, 0))
     seen = normalise(TactileFrame(read_image(BUNDLE / "press.png"), 0.1, 1), now=0.2)
     assert seen.height is not None and seen.gradient is not None

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.normaliser import FrameNormaliser, NoReference, for_recorded, for_simulated
+from calibration.normaliser import FrameNormaliser, NoReference, normaliser_for_recording, normaliser_for_simulation
 from calibration.reference import UnusableReference
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import SurfaceMap, TactileFrame
@@ -32,7 +32,7 @@ def _simulated(model: SensorModel, surface: GelSurface) -> TactileFrame:
 
 
 def test_the_same_frame_shows_nothing() -> None:
-    normalise = for_simulated(PLAIN, GEL, GRID)
+    normalise = normaliser_for_simulation(PLAIN, GEL, GRID)
     image = Renderer(PLAIN, GEL)(dent())
     normalise.take_reference(_frame(image))
     seen = normalise(_frame(image), now=2.5)
@@ -46,7 +46,7 @@ def test_the_same_frame_shows_nothing() -> None:
 
 
 def test_image_is_128_plus_128_times_the_relative_change() -> None:
-    normalise = for_simulated(PLAIN, GEL, GRID)
+    normalise = normaliser_for_simulation(PLAIN, GEL, GRID)
     normalise.take_reference(_frame(_grey(80)))
     seen = normalise(_frame(_grey(100)), now=2.0)
     assert (seen.image[4:124] == 128 + 32).all()
@@ -57,7 +57,7 @@ def test_image_is_128_plus_128_times_the_relative_change() -> None:
 
 
 def test_brightness_of_the_lamp_cancels() -> None:
-    normalise = for_simulated(PLAIN, GEL, GRID)
+    normalise = normaliser_for_simulation(PLAIN, GEL, GRID)
     render = Renderer(PLAIN, GEL)
     seen = []
     for gain in (1.0, 0.7):
@@ -68,7 +68,7 @@ def test_brightness_of_the_lamp_cancels() -> None:
 
 
 def test_contact_lies_where_the_dent_is_whether_from_height_or_from_the_image() -> None:
-    normalise = for_simulated(PLAIN, GEL, GRID)
+    normalise = normaliser_for_simulation(PLAIN, GEL, GRID)
     normalise.take_reference(_simulated(PLAIN, flat()))
     frame = _simulated(PLAIN, dent(centre=(3e-3, 2e-3)))
     known, seen = normalise(frame, now=2.0), normalise(_frame(frame.image), now=2.0)
@@ -81,7 +81,7 @@ def test_contact_lies_where_the_dent_is_whether_from_height_or_from_the_image() 
 
 
 def test_height_gradient_and_flow_come_from_the_source_or_are_none() -> None:
-    normalise = for_simulated(MODEL, GEL, GRID)
+    normalise = normaliser_for_simulation(MODEL, GEL, GRID)
     normalise.take_reference(_simulated(MODEL, flat()))
     frame = _simulated(MODEL, dent(slide=(0.3e-3, 0.0)))
     seen = normalise(frame, now=2.0)
@@ -97,7 +97,7 @@ def test_height_gradient_and_flow_come_from_the_source_or_are_none() -> None:
 
 
 def test_contact_signal_grows_with_the_press() -> None:
-    normalise = for_simulated(PLAIN, GEL, GRID)
+    normalise = normaliser_for_simulation(PLAIN, GEL, GRID)
     normalise.take_reference(_simulated(PLAIN, flat()))
     signals = [contact_signal(normalise(_simulated(PLAIN, dent(depth=d)), 2.0)) for d in (0.0, 1e-4, 3e-4, 6e-4, 1e-3)]
     assert signals[0] == 0.0
@@ -114,9 +114,9 @@ def test_a_camera_at_an_angle_gives_the_same_observation_as_the_simulation() -> 
     config = ReplaySensorConfig(driver="replay", corners=corners, size=(20e-3, 15e-3))
     seen = []
     for normalise, photograph in (
-        (for_simulated(smooth, (20e-3, 15e-3), GRID), lambda image: image),
+        (normaliser_for_simulation(smooth, (20e-3, 15e-3), GRID), lambda image: image),
         (
-            for_recorded(config, (480, 640), GRID),
+            normaliser_for_recording(config, (480, 640), GRID),
             lambda image: cv2.warpPerspective(image, camera_from_image, (640, 480)),
         ),
     ):
@@ -132,7 +132,7 @@ def test_a_camera_at_an_angle_gives_the_same_observation_as_the_simulation() -> 
 
 
 def test_valid_cells_have_all_their_pixels() -> None:
-    normalise = for_simulated(PLAIN, (10e-3, 6e-3), GRID)
+    normalise = normaliser_for_simulation(PLAIN, (10e-3, 6e-3), GRID)
     normalise.take_reference(_frame(_grey(90)))
     valid = normalise(_frame(_grey(90)), now=2.0).valid
     assert valid.shape == (64, 64)
@@ -141,7 +141,7 @@ def test_valid_cells_have_all_their_pixels() -> None:
 
 
 def test_what_is_missing_or_wrong_is_said() -> None:
-    normalise = for_simulated(PLAIN, GEL, GRID)
+    normalise = normaliser_for_simulation(PLAIN, GEL, GRID)
     with pytest.raises(NoReference, match="call take_reference"):
         normalise(_frame(_grey(90)), now=2.0)
     normalise.take_reference(_frame(_grey(90)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.ball_touch import Touch
+from calibration.poses.ball_touch import BallTouch
 from tacsim import pose as se3
 from tacsim.interface import Pose
 
@@ -19,7 +19,7 @@ def posed(rotation: Rotation, position: object) -> Pose:
 
 def made_touches(
     random: np.random.Generator, number: int = 24, tilt: float = 25.0, noise: tuple[float, float, float] = NOISE
-) -> tuple[list[Touch], Pose, np.ndarray]:
+) -> tuple[list[BallTouch], Pose, np.ndarray]:
     """Touches, tool_from_sensor, and the ball's centre [m]. `tilt`: standard deviation about each axis [degrees]."""
     sensor = posed(Rotation.from_rotvec(np.array([0.2, -0.1, 0.4]) + 0.05 * random.normal(size=3)), [1e-3, 2e-3, 60e-3])
     ball = np.array([0.4, 0.1, 0.05])
@@ -29,5 +29,5 @@ def made_touches(
         turn = Rotation.from_rotvec(np.radians(tilt) * random.normal(size=3))
         tool = ball - turn.apply(se3.transform(sensor, seen)) + noise[2] * random.normal(size=3)
         seen = seen + np.array([noise[0], noise[0], noise[1]]) * random.normal(size=3)
-        touches.append(Touch(posed(turn, tool), (float(seen[0]), float(seen[1])), BALL_RADIUS - float(seen[2])))
+        touches.append(BallTouch(posed(turn, tool), (float(seen[0]), float(seen[1])), BALL_RADIUS - float(seen[2])))
     return touches, sensor, ball

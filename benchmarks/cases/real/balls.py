@@ -24,7 +24,7 @@ from tacsim.record.episode import EpisodeError
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
-    from calibration.light.ball_press import Fit, Score
+    from calibration.light.calibrator import LightFit, PressPrediction
 
 CASE = "ball_presses"
 OWN = "balls.yaml"
@@ -89,21 +89,22 @@ def read_balls(folder: Path, of: BallSet) -> tuple[Image, Frames]:
 
 
 @lru_cache(maxsize=4)
-def calibrated(folder: Path, of: BallSet) -> tuple[Fit, float, float]:
+def calibrated(folder: Path, of: BallSet) -> tuple[LightFit, float, float]:
     """The calibration by all presses of a set, and the wall and processor time it took [s], leaving out included.
     Raises BadData."""
-    from calibration.light.ball_press import BadPresses, calibrate_light
+    from calibration.errors import BadFrames
+    from calibration.light.calibrator import calibrate_light
 
     reference, frames = read_balls(folder, of)
     wall, cpu = perf_counter(), process_time()
     try:
         fit = calibrate_light(reference, frames, of.ball_radius / of.pixel_pitch)
-    except BadPresses as error:
+    except BadFrames as error:
         raise BadData(f"{of.name}: {error}") from None
     return fit, perf_counter() - wall, process_time() - cpu
 
 
-def bundle(of: BallSet, fit: Fit) -> Calibration:
+def bundle(of: BallSet, fit: LightFit) -> Calibration:
     """What the calibrator would write of a fit."""
     from calibration.bundle import FORMAT, Calibration, Provenance
     from tacsim.models.sensor import SensorGeometry
@@ -173,7 +174,7 @@ def cases(folder: Path) -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def _mean(scores: Sequence[Score], what: str) -> float:
+def _mean(scores: Sequence[PressPrediction], what: str) -> float:
     return float(np.mean([getattr(score, what) for score in scores]))
 
 
@@ -185,7 +186,7 @@ def _interval(unit: str, values: Sequence[float]) -> dict[str, float]:
     return {f"median_{unit}": float(np.median(values)), f"low_{unit}": low, f"high_{unit}": high}
 
 
-def _usual_slope(score: Score, of: BallSet) -> float:
+def _usual_slope(score: PressPrediction, of: BallSet) -> float:
     """Slope of the ball half-way between the middle and the rim, by area: what a flat guess misses."""
     ball, r = of.ball_radius / of.pixel_pitch, score.circle.radius / np.sqrt(2)
     return float(r / np.sqrt(ball**2 - r**2))

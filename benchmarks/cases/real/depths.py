@@ -27,7 +27,7 @@ from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.physics.world import World, make_world
 
 if TYPE_CHECKING:
-    from calibration.light.ball_press import Fit
+    from calibration.light.calibrator import LightFit
 
 Mask = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -86,18 +86,18 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
 class Camera:
     """The twin of a calibrated sensor: draws surfaces, and finds them in real frames."""
 
-    def __init__(self, of: BallSet, fit: Fit, gel_size: tuple[float, float], reference: Image) -> None:
-        from calibration.bundle import sensor_model, write_bundle
-        from calibration.normaliser import for_calibrated
+    def __init__(self, of: BallSet, fit: LightFit, gel_size: tuple[float, float], reference: Image) -> None:
+        from calibration.bundle import read_sensor_model, write_bundle
+        from calibration.normaliser import normaliser_for_calibration
         from tacsim.interface import TactileFrame
         from tacsim.optics.render import Renderer
 
         calibration = balls.bundle(of, fit)
         with TemporaryDirectory() as place:
             write_bundle(Path(place), calibration, reference)
-            self.model = sensor_model(Path(place))
+            self.model = read_sensor_model(Path(place))
             self._render = Renderer(self.model, gel_size)
-        self._normalise = for_calibrated(calibration, GRID)
+        self._normalise = normaliser_for_calibration(calibration, GRID)
         self._normalise.take_reference(TactileFrame(reference, 0.0, 0))
 
     def see(self, surface: GelSurface) -> Image:

@@ -31,7 +31,7 @@ BALL, DEPTH = 4e-3, 1e-3  # [m]
 def made_up(width: int) -> Calibration:
     """A calibration of the largest order for pictures of width x 3/4 width; its light is made up."""
     from calibration.bundle import FORMAT, Calibration, Provenance
-    from calibration.height.inverse import InverseModel, fit_inverse, inverse_features, to_normal
+    from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
     from tacsim.models.photometric import PhotometricLight
 
     shape = (3 * width // 4, width)
@@ -95,7 +95,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
 
 def normaliser(repeat: int) -> list[Measurement]:
     """A frame of 320 x 240 to an observation with height and gradient, found in the picture."""
-    from calibration.normaliser import for_calibrated
+    from calibration.normaliser import normaliser_for_calibration
     from tacsim.optics.render import Renderer
     from tacsim.optics.surface import surface_map
 
@@ -104,7 +104,7 @@ def normaliser(repeat: int) -> list[Measurement]:
     surface = world.surface("lower")
     model = SensorModel(geometry=calibration.geometry, photometric=calibration.forward, texture=0.0)
     render = Renderer(model, (20e-3, 20e-3))
-    normalise = for_calibrated(calibration, grid)
+    normalise = normaliser_for_calibration(calibration, grid)
     flat = replace(surface, displacement=np.zeros_like(surface.displacement))
     normalise.take_reference(TactileFrame(render(flat), 0.0, 0))
     frame = TactileFrame(render(surface), 0.0, 0)

@@ -33,7 +33,7 @@ from benchmarks.harness.runner import Case
 from tacsim.models.scene import GelMaterial
 
 if TYPE_CHECKING:
-    from calibration.light.ball_press import Fit
+    from calibration.light.calibrator import LightFit
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -89,7 +89,7 @@ def read_face(path: Path) -> Face:
 class Draw:
     """Draws dents of a punch in calibrated light."""
 
-    def __init__(self, fit: Fit, labels: Presses) -> None:
+    def __init__(self, fit: LightFit, labels: Presses) -> None:
         from tacsim.models.photometric import PhotometricLight, places_in_image
 
         self.reference = fit.reference

@@ -21,11 +21,11 @@ def touch_ball(touches: int, repeat: int) -> list[Measurement]:
     """Touches of one fixed ball from many tilts, with the noise that the fit weighs by."""
     from scipy.spatial.transform import Rotation
 
-    from calibration.poses.ball_touch import Touch, TouchNoise, fit_touches
+    from calibration.poses.ball_touch import BallTouch, TouchNoise, fit_touches
 
     rng, noise, ball = np.random.default_rng(0), TouchNoise(), np.array([0.4, 0.1, 0.05])
 
-    def made_up() -> tuple[Pose, list[Touch]]:
+    def made_up() -> tuple[Pose, list[BallTouch]]:
         turn = Rotation.from_rotvec(np.array([0.2, -0.1, 0.4]) + 0.05 * rng.normal(size=3))
         mount = Pose(np.array([1e-3, 2e-3, 60e-3]), turn.as_quat())
         found = []
@@ -35,7 +35,7 @@ def touch_ball(touches: int, repeat: int) -> list[Measurement]:
             tool = ball - tilt.apply(se3.transform(mount, centre)) + noise.robot * rng.normal(size=3)
             x, y = centre[:2] + noise.centre * rng.normal(size=2)
             depth = BALL - centre[2] + noise.depth * rng.normal()
-            found.append(Touch(Pose(tool, tilt.as_quat()), (float(x), float(y)), float(depth)))
+            found.append(BallTouch(Pose(tool, tilt.as_quat()), (float(x), float(y)), float(depth)))
         return mount, found
 
     errors, bounds = np.empty((SETS, 2)), np.empty((SETS, 2))

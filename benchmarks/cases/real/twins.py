@@ -103,18 +103,19 @@ def _fold(
 ) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
     """Left-out presses by our gel, compared with the real ones in both ways; the calibration that has not seen them;
     wall and processor time of pressing; what to look at."""
-    from calibration.bundle import sensor_model, write_bundle
+    from calibration.bundle import read_sensor_model, write_bundle
     from calibration.compare.compare import compare_frames
-    from calibration.compare.frame_set import Shot, Side
-    from calibration.light.ball_press import BadPresses, calibrate_light
+    from calibration.errors import BadFrames
+    from calibration.frame_set import Frame, FrameSet
+    from calibration.light.calibrator import calibrate_light
     from robot.studies.matched_press import press_like
 
     try:
         fit = calibrate_light(reference, train, of.ball_radius / of.pixel_pitch)
-    except BadPresses as error:
+    except BadFrames as error:
         raise BadData(f"{of.name}: {error}") from None
     calibration = balls.bundle(of, fit)
-    real = Side("real", reference, "as labelled", tuple(Shot(name, image) for name, image in test))
+    real = FrameSet("real", reference, "as labelled", tuple(Frame(name, image) for name, image in test))
     scene = Scene(
         body=None,
         indenter=Indenter(geometry=Sphere(radius=of.ball_radius)),
@@ -125,7 +126,7 @@ def _fold(
     wall, cpu = perf_counter(), process_time()
     with TemporaryDirectory() as place:
         write_bundle(Path(place), calibration, reference)
-        ours, said = press_like(real, scene, sensor_model(Path(place)), GRID)
+        ours, said = press_like(real, scene, read_sensor_model(Path(place)), GRID)
     taken = perf_counter() - wall, process_time() - cpu
     both = {
         "pictures": compare_frames(ours, real, calibration, calibration),

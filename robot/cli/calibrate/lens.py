@@ -151,7 +151,7 @@ def _viewed(camera: str, overrides: list[str], folder: Path, board: Board, views
 def _lens(pictures: Path, board: Board, folder: Path) -> None:
     from calibration.lens.board import BadBoard, find_board
     from calibration.lens.view import BadView, fit_lens
-    from calibration.light.image_folder import PICTURES as ENDINGS
+    from tacsim.record.sources import PICTURES as ENDINGS
 
     paths = sorted(path for path in pictures.iterdir() if path.suffix.lower() in ENDINGS)
     if not 0 < len(paths) <= PICTURES:
@@ -234,15 +234,15 @@ def _tell_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
 
 
 def _picture(path: Path) -> NDArray[np.uint8]:
-    """Raises Unusable."""
-    from calibration.errors import Unusable
+    """Raises CalibrationError."""
+    from calibration.errors import CalibrationError
     from tacsim.record.episode import EpisodeError
     from tacsim.record.images import read_image
 
     try:
         return read_image(path)
     except EpisodeError as error:
-        raise Unusable(str(error)) from None
+        raise CalibrationError(str(error)) from None
 
 
 def _write(path: Path, config: Lens | GelView) -> Path:

@@ -19,7 +19,7 @@ from robot.cli.run import ask
 
 if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise
-    from calibration.poses.records import SightFile, TouchFile
+    from calibration.poses.records import BoardPoseFile, TouchFile
     from robot.procedures.ball_touches import TouchPlan
     from robot.procedures.board_poses import SightPlan
     from tacsim.interface import Pose
@@ -127,11 +127,11 @@ def _touched(rig: str, arm: str, sensor: str, plan: TouchPlan, overrides: list[s
 
 
 @contextmanager
-def _kept(path: Path, command: str) -> Iterator[Callable[[TouchFile | SightFile], None]]:
+def _kept(path: Path, command: str) -> Iterator[Callable[[TouchFile | BoardPoseFile], None]]:
     """Gives what writes each state of a record to `path`, and says at the end where it is, also of a failure."""
     from calibration.poses.records import write_record
 
-    def keep(record: TouchFile | SightFile) -> None:
+    def keep(record: TouchFile | BoardPoseFile) -> None:
         with writing_into(made(path.parent)):
             write_record(path, record)
 
@@ -151,7 +151,7 @@ def _end_if_stopped(interrupt: Interrupt, what: str) -> None:
 
 def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
     from calibration.poses.ball_touch import fit_touches
-    from calibration.poses.records import plain
+    from calibration.poses.records import pose_as_json
 
     with busy(f"fitting {len(record.touches)} touches"):
         fit = fit_touches(record.measurements(), record.ball_radius, noise)
@@ -168,7 +168,7 @@ def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) ->
     )
     _snippet(arm, fit.tool_from_sensor)
     report = {
-        "tool_from_sensor": plain(fit.tool_from_sensor, fit.covariance),
+        "tool_from_sensor": pose_as_json(fit.tool_from_sensor, fit.covariance),
         "bound": fit.bound.tolist(),
         "ball": fit.ball.tolist(),
         "ball_radius": record.ball_radius,
@@ -214,9 +214,9 @@ def hand_eye(
     """
     import math
 
-    from calibration.errors import Unusable
+    from calibration.errors import CalibrationError
     from calibration.poses.hand_eye import HandEyeNoise
-    from calibration.poses.records import read_sights
+    from calibration.poses.records import read_board_poses
 
     noise = HandEyeNoise(
         board=_within(noise_board, 1e-6, 0.1, "--noise-board"),
@@ -225,7 +225,7 @@ def hand_eye(
     _one_source(poses, rig)
     folder = new_directory(out, "hand-eye")
     if poses is not None:
-        _tell_hand_eye(read_sights(poses), noise, folder)
+        _tell_hand_eye(read_board_poses(poses), noise, folder)
         return
     from calibration.lens.board import parse_board
     from calibration.lens.view import Lens
@@ -236,7 +236,7 @@ def hand_eye(
         raise typer.BadParameter("with --rig, give --arm, --camera, --lens and --board")
     described = parse_board(board)
     if described.kind == "dots":
-        raise Unusable("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
+        raise CalibrationError("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
     plan = SightPlan(
         board=described,
         lens=load(Lens, lens),
@@ -249,9 +249,9 @@ def hand_eye(
 
 def _sighted(
     rig: str, arm: str, camera: str, plan: SightPlan, overrides: list[str], folder: Path, *, fixed: bool
-) -> SightFile:
+) -> BoardPoseFile:
     """Looks now; what was recorded is kept in `folder`, whatever ends it."""
-    from calibration.poses.records import sight_file
+    from calibration.poses.records import board_pose_file
     from robot.procedures.board_poses import open_camera, opened, record_sights
     from tacsim.config import load_rig
 
@@ -271,17 +271,17 @@ def _sighted(
             plan,
             interrupt,
             lambda done: bar.update(row, completed=done),
-            lambda sights: keep(sight_file(sights, fixed=fixed)),
+            lambda board_poses: keep(board_pose_file(board_poses, fixed=fixed)),
         )
-    _end_if_stopped(interrupt, f"{len(taken.sights)} poses")
+    _end_if_stopped(interrupt, f"{len(taken.board_poses)} poses")
     for missed in taken.missed:
         notes.print(f"left out: {missed}", markup=False)
-    return sight_file(taken.sights, fixed=fixed)
+    return board_pose_file(taken.board_poses, fixed=fixed)
 
 
-def _tell_hand_eye(record: SightFile, noise: Any, folder: Path) -> None:
+def _tell_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
     from calibration.poses.hand_eye import fit_hand_eye
-    from calibration.poses.records import plain
+    from calibration.poses.records import pose_as_json
 
     fixed = record.camera == "fixed"
     with busy(f"fitting {len(record.poses)} poses"):
@@ -300,8 +300,8 @@ def _tell_hand_eye(record: SightFile, noise: Any, folder: Path) -> None:
     )
     results.print(f"  {name}: {_placed(fit.camera)}", markup=False)
     report = {
-        name: plain(fit.camera, fit.covariance),
-        board: plain(fit.board),
+        name: pose_as_json(fit.camera, fit.covariance),
+        board: pose_as_json(fit.board),
         "residuals": fit.misses.tolist(),
         "used": list(fit.used),
         "scatter": fit.scatter,

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
-    from calibration.light.image_folder import Frames
     from tacsim.models.hardware import CameraSensorConfig
 
 
@@ -33,19 +33,19 @@ def pressed(
     serial: str,
     *,
     markers: bool,
-) -> Frames:
+) -> FrameSet:
     """Frames taken now, native, and kept in `folder`/frames. camera: RIG/SENSOR; ball: its radius [px].
 
-    A signal ends the command; what was taken is kept then, too. Raises CannotPress, BadPresses, DeviceError.
+    A signal ends the command; what was taken is kept then, too. Raises CannotPress, BadFrames, DeviceError.
     """
-    from calibration.light.ball_press import BadPresses
-    from calibration.light.image_folder import Frames, check_size, metric_picture
+    from calibration.errors import BadFrames
+    from calibration.frame_set import Frame, FrameSet, metric_picture, require_view_size
     from robot.camera.camera import Camera
     from robot.procedures.presses import PressPlan, record_presses
 
     config, sensor = named_camera(camera, overrides)
     if view is not None:
-        check_size([(config.height, config.width)], view)
+        require_view_size((config.height, config.width), view)
     frames = folder / "frames"
     with Camera(config, sensor) as eye:
         _await_person()
@@ -69,8 +69,10 @@ def pressed(
         complain(f"stopped by a signal; {len(taken.presses)} presses are kept, nothing is calibrated")
         raise typer.Exit(interrupt.exit_code)
     if taken.reference is None or not taken.presses:
-        raise BadPresses("the source was over before a press was taken")
-    return Frames(taken.reference, tuple(taken.presses), False, taken.untouched)
+        raise BadFrames("the source was over before a press was taken")
+    presses_taken = tuple(Frame(name, image) for name, image in taken.presses)
+    more = tuple(Frame(f"background_{k}.png", image) for k, image in enumerate(taken.untouched[:-1], start=1))
+    return FrameSet(camera, taken.reference, "background.png", presses_taken, more)
 
 
 def named_camera(camera: str, overrides: list[str]) -> tuple[CameraSensorConfig, str]:

@@ -12,10 +12,12 @@ from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, q
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
+    from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
-    from calibration.light.ball_press import Fit
-    from calibration.light.image_folder import Frames
+    from calibration.light.calibrator import LightFit
     from tacsim.models.sensor import CameraNoise, Markers
+
+MAX_PRESSES = 200  # 5 to 8 are enough
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
 
@@ -85,24 +87,27 @@ def sensor(
         raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
     folder = new_directory(out, "calibration")
     with busy("loading"):
-        from calibration.light.ball_press import BadPresses, calibrate_light
-        from calibration.light.image_folder import read_presses, rectified
+        from calibration.errors import BadFrames
+        from calibration.frame_set import read_folder, rectified_by_view
+        from calibration.light.calibrator import calibrate_light
         from calibration.markers.dots import DotEraser
     try:
         if camera is not None:
             read = pressed(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
         else:
             assert frames is not None
-            read = read_presses(frames, reference)
+            read = read_folder(frames, reference, MAX_PRESSES)
         if seen is not None:
-            read = rectified(read, seen)
+            read = rectified_by_view(read, seen)
         if read.estimated:
             notes.print("no picture without contact: the median of all presses stands for it")
         found = _markers(read, pitch) if markers else None
         erase = None if found is None else DotEraser(found.radius / pitch)
-        with busy(f"calibrating from {len(read.presses)} presses"):
-            fit = calibrate_light(read.reference, read.presses, ball / pitch, erase)
-    except BadPresses as error:
+        with busy(f"calibrating from {len(read.frames)} presses"):
+            fit = calibrate_light(
+                read.reference, [(frame.name, frame.image) for frame in read.frames], ball / pitch, erase
+            )
+    except BadFrames as error:
         hint = "FRAMES" if camera is None else "--camera"
         raise typer.BadParameter(str(error), param_hint=hint) from None
     _write(folder, fit, read, serial, ball, pitch, found, view=seen)
@@ -110,8 +115,8 @@ def sensor(
 
 def _write(
     folder: Path,
-    fit: Fit,
-    read: Frames,
+    fit: LightFit,
+    read: FrameSet,
     serial: str,
     ball: float,
     pitch: float,
@@ -132,7 +137,7 @@ def _write(
             f"{found.radius * 1e3:.2g} mm"
         )
     noise = _noise(read)
-    bundle = _bundle(fit, serial, ball, pitch, [name for name, _ in read.presses], found, view, noise)
+    bundle = _bundle(fit, serial, ball, pitch, [frame.name for frame in read.frames], found, view, noise)
     with writing(made(folder)):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
@@ -148,7 +153,7 @@ def _load_view(path: Path) -> GelView:
     return load(GelView, path)
 
 
-def _markers(read: Frames, pitch: float) -> Markers:
+def _markers(read: FrameSet, pitch: float) -> Markers:
     """The lattice of dots in the picture without contact."""
     from calibration.markers.flow import find_markers
     from calibration.markers.lattice import NoLattice
@@ -164,24 +169,25 @@ def _markers(read: Frames, pitch: float) -> Markers:
     return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
 
 
-def _noise(read: Frames) -> CameraNoise | None:
+def _noise(read: FrameSet) -> CameraNoise | None:
     """The camera's noise, and a word on it."""
     from calibration.light.noise import NoiseUnknown, measure_noise
 
+    untouched = read.untouched_images
     try:
-        noise = measure_noise(read.untouched)
+        noise = measure_noise(untouched)
     except NoiseUnknown as why:
         notes.print(f"camera's noise not measured: {why}", markup=False)
         return None
     spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
     notes.print(
-        f"camera's noise, from {len(read.untouched)} pictures without contact: R, G, B {spread} grey levels; "
+        f"camera's noise, from {len(untouched)} pictures without contact: R, G, B {spread} grey levels; "
         f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
     )
     return noise
 
 
-def _look_for_dots(fit: Fit) -> None:
+def _look_for_dots(fit: LightFit) -> None:
     """A word on dots that nobody told of."""
     from calibration.markers.flow import require_no_markers
     from calibration.reference import UnusableReference
@@ -193,7 +199,7 @@ def _look_for_dots(fit: Fit) -> None:
 
 
 def _bundle(
-    fit: Fit,
+    fit: LightFit,
     serial: str,
     ball: float,
     pitch: float,
@@ -244,7 +250,7 @@ def _bundle(
     )
 
 
-def _show(fit: Fit, pitch: float) -> None:
+def _show(fit: LightFit, pitch: float) -> None:
     from rich.console import Console
     from rich.table import Table
 

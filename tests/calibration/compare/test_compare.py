@@ -14,9 +14,10 @@ from PIL import Image
 
 from calibration.compare.alignment import by_geometry, by_size
 from calibration.compare.compare import METRICS, Comparison, Options, Pairing, bootstrap, compare_frames, paired
-from calibration.compare.frame_set import BadSide, Shot, Side, read_side, rectangle, through_corners
 from calibration.compare.report import as_json, figures, write
-from calibration.lens.rectification import BadCorners
+from calibration.errors import BadFrames
+from calibration.frame_set import Frame, FrameSet, read_folder, read_frame_set, rectified_by_corners, rectified_shape
+from calibration.lens.view import BadCorners
 from tacsim.interface import SurfaceMap
 from tacsim.models.sensor import SensorGeometry
 from tests.calibration.presses import COLUMNS, ROWS, HiddenSensor
@@ -24,12 +25,12 @@ from tests.calibration.sources import blank, changed, save, shifted, side
 
 
 @pytest.fixture(scope="module")
-def real() -> Side:
+def real() -> FrameSet:
     return side(HiddenSensor(3), name="real")
 
 
 @pytest.fixture(scope="module")
-def good(real: Side) -> Side:
+def good(real: FrameSet) -> FrameSet:
     """The same light, other noise: as good as a simulation can be."""
     sensor = HiddenSensor(3)
     sensor.empty()  # so that its noise is another
@@ -38,13 +39,13 @@ def good(real: Side) -> Side:
 
 
 @pytest.fixture(scope="module")
-def other(real: Side) -> Side:
+def other(real: FrameSet) -> FrameSet:
     """Another light: what an uncalibrated simulation is."""
     return replace(side(HiddenSensor(8), name="other"), untouched=())
 
 
 @pytest.fixture(scope="module")
-def compared(good: Side, real: Side) -> Comparison:
+def compared(good: FrameSet, real: FrameSet) -> Comparison:
     return compare_frames(good, real)
 
 
@@ -61,7 +62,7 @@ def test_a_good_simulation_surely_beats_the_null_and_comes_near_the_floor(compar
     assert math.hypot(*compared.alignment.shift) < 0.1
 
 
-def test_a_blank_beats_no_null(real: Side) -> None:
+def test_a_blank_beats_no_null(real: FrameSet) -> None:
     result = compare_frames(blank(real), real)
     for key in ("mae", "psnr", "ssim", "contact_mae", "contact_psnr", "contact_ssim", "contact_ncc", "contact_iou"):
         assert result.overall[key].beats_null is False, key
@@ -70,21 +71,21 @@ def test_a_blank_beats_no_null(real: Side) -> None:
     assert "no shift was looked for" in result.alignment.said
 
 
-def test_another_light_is_told_from_the_right_one(other: Side, real: Side, compared: Comparison) -> None:
+def test_another_light_is_told_from_the_right_one(other: FrameSet, real: FrameSet, compared: Comparison) -> None:
     result = compare_frames(other, real)
     assert result.overall["contact_mae"].mean > 5 * compared.overall["contact_mae"].mean
     assert result.overall["contact_ncc"].mean < 0.9
     assert math.hypot(*result.alignment.shift) < 3  # contacts are found in any light
 
 
-def test_the_whole_picture_flatters_where_the_contact_does_not(real: Side) -> None:
+def test_the_whole_picture_flatters_where_the_contact_does_not(real: FrameSet) -> None:
     """A blank scores high on all of the picture: the reason for the null and the contact region."""
     result = compare_frames(blank(real), real)
     assert result.overall["ssim"].mean > result.overall["contact_ssim"].mean + 0.1
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (3.4, -2.7), (-8.25, 5.5)])
-def test_a_known_shift_is_found_and_undone(good: Side, real: Side, shift: tuple[float, float]) -> None:
+def test_a_known_shift_is_found_and_undone(good: FrameSet, real: FrameSet, shift: tuple[float, float]) -> None:
     moved = changed(good, lambda image: shifted(image, *shift), "all")
     result = compare_frames(moved, real)
     assert result.alignment.shift == pytest.approx(shift, abs=0.1)
@@ -95,7 +96,7 @@ def test_a_known_shift_is_found_and_undone(good: Side, real: Side, shift: tuple[
         assert unmoved.overall["contact_mae"].mean > 1.5 * result.overall["contact_mae"].mean
 
 
-def test_a_picture_of_twice_the_size_is_scaled(good: Side, real: Side) -> None:
+def test_a_picture_of_twice_the_size_is_scaled(good: FrameSet, real: FrameSet) -> None:
     twice = changed(good, lambda image: image.repeat(2, axis=0).repeat(2, axis=1), "all")
     result = compare_frames(twice, real)
     assert result.overall["contact_ncc"].mean > 0.98
@@ -121,7 +122,7 @@ def test_geometries_place_both_on_the_gel() -> None:
     assert not covered[39, 59]  # 7.8 mm to the right of the axis; A reaches 5 mm
 
 
-def test_corners_undo_a_slanted_view(real: Side) -> None:
+def test_corners_undo_a_slanted_view(real: FrameSet) -> None:
     import cv2
 
     inset = np.array([(30, 20), (240, 8), (250, 190), (12, 170)], dtype=np.float32)
@@ -129,13 +130,13 @@ def test_corners_undo_a_slanted_view(real: Side) -> None:
     matrix = cv2.getPerspectiveTransform(full.astype(np.float32), inset)
     slanted = changed(real, lambda image: cv2.warpPerspective(image, matrix, (COLUMNS, ROWS)), "all")
     corners = tuple((float(u), float(v)) for u, v in inset)
-    straight = through_corners(slanted, corners, real.shape)
+    straight = rectified_by_corners(slanted, corners, real.shape)
     assert compare_frames(slanted, real).overall["contact_ncc"].mean < 0.8
     assert compare_frames(straight, real).overall["contact_ncc"].mean > 0.97
-    assert rectangle(corners) == (182, 239)  # the longest sides: right and bottom
+    assert rectified_shape(corners) == (182, 239)  # the longest sides: right and bottom
     outside = ((-20.0, 0.0), corners[1], corners[2], corners[3])
     with pytest.raises(BadCorners, match="beyond the picture"):
-        through_corners(slanted, outside, real.shape)
+        rectified_by_corners(slanted, outside, real.shape)
 
 
 def test_surfaces_that_a_simulation_knows_are_compared() -> None:
@@ -146,10 +147,10 @@ def test_surfaces_that_a_simulation_knows_are_compared() -> None:
     gradient = np.stack([by_x, by_y], axis=-1)
     plain = side(sensor, 3)
 
-    def knowing(factor: float, markers: float) -> Side:
+    def knowing(factor: float, markers: float) -> FrameSet:
         flow = np.full((5, 6, 2), markers, dtype=np.float32)
         surface = SurfaceMap(factor * height, factor * gradient, flow)
-        return replace(plain, shots=tuple(replace(shot, surface=surface) for shot in plain.shots))
+        return replace(plain, frames=tuple(replace(shot, surface=surface) for shot in plain.frames))
 
     result = compare_frames(knowing(0.9, 3e-5), knowing(1.0, 0.0))
     assert result.overall["marker_error"].mean == pytest.approx(3e-5 * math.sqrt(2), rel=1e-5)
@@ -167,15 +168,15 @@ def test_without_surfaces_it_says_so(compared: Comparison) -> None:
     assert sum("no surfaces are compared" in note for note in compared.notes) == 2
 
 
-def test_a_lone_reference_has_no_floor(good: Side, real: Side) -> None:
+def test_a_lone_reference_has_no_floor(good: FrameSet, real: FrameSet) -> None:
     result = compare_frames(good, replace(real, untouched=()))
     assert math.isnan(result.overall["contact_mae"].floor)
     assert "noise floor absent: B has no second frame without contact" in result.notes
 
 
-def test_frames_without_contact_on_both_sides_make_the_floor(good: Side, real: Side) -> None:
-    still_a = replace(good, shots=(*good.shots, Shot("still.png", good.reference)))
-    still_b = replace(real, shots=(*real.shots, Shot("still.png", real.untouched[0].image)), untouched=())
+def test_frames_without_contact_on_both_sides_make_the_floor(good: FrameSet, real: FrameSet) -> None:
+    still_a = replace(good, frames=(*good.frames, Frame("still.png", good.reference)))
+    still_b = replace(real, frames=(*real.frames, Frame("still.png", real.untouched[0].image)), untouched=())
     result = compare_frames(still_a, still_b)
     assert result.overall["contact_mae"].floor == pytest.approx(1.69, abs=0.15)
     assert result.pairs[-1].flags == ("A: no contact", "B: no contact")
@@ -183,8 +184,8 @@ def test_frames_without_contact_on_both_sides_make_the_floor(good: Side, real: S
     assert not math.isnan(result.overall["contact_mae"].mean)
 
 
-def test_names_pair_before_the_order_does(real: Side) -> None:
-    turned = replace(real, shots=real.shots[::-1])
+def test_names_pair_before_the_order_does(real: FrameSet) -> None:
+    turned = replace(real, frames=real.frames[::-1])
     couples, said = paired(turned, real, Pairing.auto)
     assert said == []
     assert all(one.name == two.name for one, two in couples)
@@ -192,38 +193,38 @@ def test_names_pair_before_the_order_does(real: Side) -> None:
     assert in_order[0][0].name == "press_4.png" and in_order[0][1].name == "press_0.png"
 
 
-def test_endings_of_names_do_not_matter(real: Side) -> None:
-    jpeg = replace(real, shots=tuple(replace(shot, name=shot.name.replace(".png", ".JPG")) for shot in real.shots))
+def test_endings_of_names_do_not_matter(real: FrameSet) -> None:
+    jpeg = replace(real, frames=tuple(replace(shot, name=shot.name.replace(".png", ".JPG")) for shot in real.frames))
     couples, said = paired(jpeg, real, Pairing.auto)
     assert said == [] and len(couples) == 5
 
 
-def test_other_names_are_paired_in_order_and_it_says_so(real: Side) -> None:
-    named = replace(real, shots=tuple(replace(shot, name=f"x{k}.png") for k, shot in enumerate(real.shots)))
+def test_other_names_are_paired_in_order_and_it_says_so(real: FrameSet) -> None:
+    named = replace(real, frames=tuple(replace(shot, name=f"x{k}.png") for k, shot in enumerate(real.frames)))
     couples, said = paired(named, real, Pairing.auto)
-    assert [two.name for _, two in couples] == [shot.name for shot in real.shots]
+    assert [two.name for _, two in couples] == [shot.name for shot in real.frames]
     assert said == ["paired in order: the names differ"]
 
 
-def test_counts_that_differ_are_refused_unless_names_decide(real: Side) -> None:
-    fewer = replace(real, shots=real.shots[:3])
-    with pytest.raises(BadSide, match=r"has 3 frames, real 5.*3 names are in both.*--pair name"):
+def test_counts_that_differ_are_refused_unless_names_decide(real: FrameSet) -> None:
+    fewer = replace(real, frames=real.frames[:3])
+    with pytest.raises(BadFrames, match=r"has 3 frames, real 5.*3 names are in both.*--pair name"):
         paired(fewer, real, Pairing.auto)
     couples, said = paired(fewer, real, Pairing.name)
     assert len(couples) == 3
     assert said == ["2 frames have no partner of their name and are left out"]
-    with pytest.raises(BadSide, match="--pair order"):
-        paired(replace(fewer, shots=(Shot("else.png", real.reference),)), real, Pairing.name)
+    with pytest.raises(BadFrames, match="--pair order"):
+        paired(replace(fewer, frames=(Frame("else.png", real.reference),)), real, Pairing.name)
 
 
-def test_one_frame_has_numbers_but_no_interval(good: Side, real: Side) -> None:
-    result = compare_frames(replace(good, shots=good.shots[:1]), replace(real, shots=real.shots[:1]))
+def test_one_frame_has_numbers_but_no_interval(good: FrameSet, real: FrameSet) -> None:
+    result = compare_frames(replace(good, frames=good.frames[:1]), replace(real, frames=real.frames[:1]))
     error = result.overall["contact_mae"]
     assert error.mean < 3 and math.isnan(error.low) and error.beats_null is None
     assert "1 pair: too few for intervals; 3 are the least" in result.notes
 
 
-def test_saturated_frames_are_flagged(good: Side, real: Side) -> None:
+def test_saturated_frames_are_flagged(good: FrameSet, real: FrameSet) -> None:
     burnt = changed(real, lambda image: np.clip(image.astype(int) * 2, 0, 255).astype(np.uint8), "all")
     result = compare_frames(good, burnt)
     assert any(flag.startswith("B: saturated: ") for pair in result.pairs for flag in pair.flags)
@@ -231,25 +232,25 @@ def test_saturated_frames_are_flagged(good: Side, real: Side) -> None:
     assert not any("saturated" in flag for pair in clean.pairs for flag in pair.flags)
 
 
-def test_a_stale_reference_is_flagged(good: Side, real: Side) -> None:
+def test_a_stale_reference_is_flagged(good: FrameSet, real: FrameSet) -> None:
     stale = changed(real, lambda image: np.clip(image.astype(int) + 9, 0, 255).astype(np.uint8))
     result = compare_frames(good, stale)
     assert all(any("B: stale reference" in flag and "9 grey" in flag for flag in pair.flags) for pair in result.pairs)
 
 
-def test_swapped_colours_are_noticed(good: Side, real: Side, compared: Comparison) -> None:
+def test_swapped_colours_are_noticed(good: FrameSet, real: FrameSet, compared: Comparison) -> None:
     bgr = changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all")
     assert any("red and blue look swapped" in note for note in compare_frames(bgr, real).notes)
     assert not any("swapped" in note for note in compared.notes)
 
 
-def test_sizes_of_other_proportions_need_a_calibration(good: Side, real: Side) -> None:
+def test_sizes_of_other_proportions_need_a_calibration(good: FrameSet, real: FrameSet) -> None:
     cut = changed(good, lambda image: image[:, :200], "all")
-    with pytest.raises(BadSide, match=r"A is 200 x 200 px, B 260 x 200.*--calibration-a.*--corners-a"):
+    with pytest.raises(BadFrames, match=r"A is 200 x 200 px, B 260 x 200.*--calibration-a.*--corners-a"):
         compare_frames(cut, real)
 
 
-def test_pairs_that_are_none_are_not_shifted(real: Side) -> None:
+def test_pairs_that_are_none_are_not_shifted(real: FrameSet) -> None:
     elsewhere = side(HiddenSensor(3), places=[(190, 140), (70, 60), (60, 150), (200, 60), (130, 50)])
     result = compare_frames(elsewhere, real)
     assert result.alignment.shift == (0.0, 0.0)
@@ -267,85 +268,84 @@ def test_the_bootstrap_has_the_width_of_the_mean() -> None:
 # folders
 
 
-def test_a_folder_is_read_with_its_references(real: Side, tmp_path: Path) -> None:
-    read = read_side(save(real, tmp_path / "real"))
+def test_a_folder_is_read_with_its_references(real: FrameSet, tmp_path: Path) -> None:
+    read = read_frame_set(save(real, tmp_path / "real"))
     assert read.reference_from == "background.png"
-    assert [shot.name for shot in read.shots] == [shot.name for shot in real.shots]
+    assert [shot.name for shot in read.frames] == [shot.name for shot in real.frames]
     assert [shot.name for shot in read.untouched] == ["background_2.png", "background_3.png"]
-    assert np.array_equal(read.shots[2].image, real.shots[2].image)
+    assert np.array_equal(read.frames[2].image, real.frames[2].image)
 
 
-def test_a_named_reference_comes_first(real: Side, tmp_path: Path) -> None:
+def test_a_named_reference_comes_first(real: FrameSet, tmp_path: Path) -> None:
     folder = save(replace(real, untouched=()), tmp_path / "real", reference="first.png")
-    read = read_side(folder, folder / "first.png")
-    assert read.reference_from == "first.png" and len(read.shots) == 5
+    read = read_frame_set(folder, folder / "first.png")
+    assert read.reference_from == "first.png" and len(read.frames) == 5
 
 
-def test_the_median_stands_for_a_missing_reference(real: Side, tmp_path: Path) -> None:
+def test_the_median_stands_for_a_missing_reference(real: FrameSet, tmp_path: Path) -> None:
     folder = save(replace(real, untouched=()), tmp_path / "real")
     (folder / "background.png").unlink()
-    read = read_side(folder)
+    read = read_frame_set(folder)
     assert read.reference_from == "median of 5 frames"
     assert np.abs(read.reference.astype(int) - real.reference).mean() < 3
     (folder / "press_0.png").unlink()
-    with pytest.raises(BadSide, match=r"no frame without contact.*--reference-a.*background\.png"):
-        read_side(folder)
+    with pytest.raises(BadFrames, match=r"no frame without contact.*--reference-a.*background\.png"):
+        read_frame_set(folder)
 
 
-def test_every_unreadable_picture_is_named(real: Side, tmp_path: Path) -> None:
+def test_every_unreadable_picture_is_named(real: FrameSet, tmp_path: Path) -> None:
     folder = save(real, tmp_path / "real")
     whole = (folder / "press_1.png").read_bytes()
     for name in ("press_1.png", "press_3.png"):
         (folder / name).write_bytes(whole[: len(whole) // 2])  # a head, but no body
-    with pytest.raises(BadSide) as caught:
-        read_side(folder)
+    with pytest.raises(BadFrames) as caught:
+        read_frame_set(folder)
     assert "press_1.png" in str(caught.value) and "press_3.png" in str(caught.value)
     (folder / "press_1.png").write_bytes(b"nothing")
-    with pytest.raises(BadSide, match=r"press_1\.png: no readable picture"):
-        read_side(folder)
+    with pytest.raises(BadFrames, match=r"press_1\.png: no readable picture"):
+        read_frame_set(folder)
 
 
-def test_mixed_sizes_empty_folders_and_other_files_are_refused(real: Side, tmp_path: Path) -> None:
+def test_mixed_sizes_empty_folders_and_other_files_are_refused(real: FrameSet, tmp_path: Path) -> None:
     folder = save(real, tmp_path / "real")
     Image.fromarray(real.reference[:100]).save(folder / "press_9.png")
-    with pytest.raises(BadSide, match=r"press_9\.png: 260 x 100 pixels"):
-        read_side(folder)
+    with pytest.raises(BadFrames, match=r"press_9\.png: 260 x 100 pixels"):
+        read_frame_set(folder)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(BadSide, match="no pictures in this folder"):
-        read_side(tmp_path / "empty")
-    with pytest.raises(BadSide, match="no such file or folder"):
-        read_side(tmp_path / "nowhere")
+    with pytest.raises(BadFrames, match="no pictures in this folder"):
+        read_frame_set(tmp_path / "empty")
+    with pytest.raises(BadFrames, match="no such file or folder"):
+        read_frame_set(tmp_path / "nowhere")
     (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(BadSide, match="no recording"):
-        read_side(tmp_path / "notes.txt")
+    with pytest.raises(BadFrames, match="no recording"):
+        read_frame_set(tmp_path / "notes.txt")
     (tmp_path / "bad.mcap").write_bytes(b"\0" * 100)
-    with pytest.raises(BadSide, match=r"bad\.mcap"):
-        read_side(tmp_path / "bad.mcap")
+    with pytest.raises(BadFrames, match=r"bad\.mcap"):
+        read_frame_set(tmp_path / "bad.mcap")
 
 
-def test_a_reference_alone_or_of_another_size_is_refused(real: Side, tmp_path: Path) -> None:
-    folder = save(replace(real, shots=()), tmp_path / "real")
-    with pytest.raises(BadSide, match="no frame beside the one without contact"):
-        read_side(folder)
+def test_a_reference_alone_or_of_another_size_is_refused(real: FrameSet, tmp_path: Path) -> None:
+    folder = save(replace(real, frames=()), tmp_path / "real")
+    with pytest.raises(BadFrames, match="no frame beside the one without contact"):
+        read_frame_set(folder)
     pressed = save(replace(real, untouched=()), tmp_path / "pressed")
     Image.fromarray(real.reference[:150]).save(tmp_path / "small.png")
-    with pytest.raises(BadSide, match=r"press_0\.png is 260 x 200 px.*small\.png\) 260 x 150"):
-        read_side(pressed, tmp_path / "small.png")
-    with pytest.raises(BadSide, match=r"none\.png"):
-        read_side(pressed, tmp_path / "none.png")
+    with pytest.raises(BadFrames, match=r"press_0\.png is 260 x 200 px.*small\.png\) 260 x 150"):
+        read_frame_set(pressed, tmp_path / "small.png")
+    with pytest.raises(BadFrames, match=r"none\.png"):
+        read_frame_set(pressed, tmp_path / "none.png")
 
 
-def test_a_huge_picture_is_refused_before_it_is_decoded(real: Side, tmp_path: Path) -> None:
+def test_a_huge_picture_is_refused_before_it_is_decoded(real: FrameSet, tmp_path: Path) -> None:
     folder = save(real, tmp_path / "real")
     Image.new("1", (5000, 10)).save(folder / "huge.png")
-    with pytest.raises(BadSide, match=r"huge\.png: 5000 x 10 pixels"):
-        read_side(folder)
+    with pytest.raises(BadFrames, match=r"huge\.png: 5000 x 10 pixels"):
+        read_frame_set(folder)
 
 
-def test_too_many_frames_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real: Side) -> None:
-    monkeypatch.setattr("calibration.compare.frame_set.MOST", 3)
-    with pytest.raises(BadSide, match="more than 3 frames"):
-        read_side(save(real, tmp_path / "real"))
+def test_too_many_frames_are_refused(tmp_path: Path, real: FrameSet) -> None:
+    with pytest.raises(BadFrames, match="more than 3 frames"):
+        read_folder(save(real, tmp_path / "real"), max_frames=3)
 
 
 # files
@@ -359,7 +359,7 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
     assert config["overall"]["gradient_angle"]["mean"] is None
     with paths[1].open(encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
-    assert [row["a"] for row in table] == [shot.name for shot in compared.a.shots]
+    assert [row["a"] for row in table] == [shot.name for shot in compared.a.frames]
     assert float(table[2]["contact_mae"]) == compared.pairs[2].numbers["contact_mae"]
     assert float(table[2]["null_contact_mae"]) == compared.pairs[2].null["contact_mae"]
     page = paths[2].read_text(encoding="utf-8")
@@ -371,16 +371,16 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
     )
 
 
-def test_names_of_files_are_no_markup(good: Side, real: Side, tmp_path: Path) -> None:
+def test_names_of_files_are_no_markup(good: FrameSet, real: FrameSet, tmp_path: Path) -> None:
     evil = "<img src=x onerror=alert(1)>.png"
-    shots = (replace(good.shots[0], name=evil), *good.shots[1:])
-    result = compare_frames(replace(good, shots=shots, name="<b>A</b>"), real)
+    frames = (replace(good.frames[0], name=evil), *good.frames[1:])
+    result = compare_frames(replace(good, frames=frames, name="<b>A</b>"), real)
     page = write(tmp_path, result)[2].read_text(encoding="utf-8")
     assert evil not in page and "<b>A</b>" not in page
     assert "&lt;img src=x" in page
 
 
-def test_a_comparison_with_itself_can_be_written(real: Side, tmp_path: Path) -> None:
+def test_a_comparison_with_itself_can_be_written(real: FrameSet, tmp_path: Path) -> None:
     result = compare_frames(real, real)
     assert result.overall["psnr"].mean == math.inf
     config = json.loads(write(tmp_path, result)[0].read_text(encoding="utf-8"))

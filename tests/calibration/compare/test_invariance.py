@@ -11,7 +11,6 @@ import pytest
 
 from calibration.bundle import Calibration
 from calibration.compare.compare import Comparison, compare_frames
-from calibration.compare.frame_set import BadSide, Side
 from calibration.compare.invariance import (
     CHANGES,
     VIEWS,
@@ -22,6 +21,8 @@ from calibration.compare.invariance import (
     ratio,
 )
 from calibration.compare.report import as_json, figures, names, write
+from calibration.errors import BadFrames
+from calibration.frame_set import FrameSet
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import calibrated, side
 
@@ -81,7 +82,7 @@ def test_changes_of_light_are_what_they_say() -> None:
 
 
 @pytest.fixture(scope="module")
-def real() -> Side:
+def real() -> FrameSet:
     return side(HiddenSensor(3), 6, name="real")
 
 
@@ -91,7 +92,7 @@ def calibration() -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def good(real: Side, calibration: Calibration) -> Comparison:
+def good(real: FrameSet, calibration: Calibration) -> Comparison:
     sensor = HiddenSensor(3)
     sensor.empty()
     made = replace(side(sensor, 6, name="good"), reference=real.reference, untouched=())
@@ -113,7 +114,9 @@ def test_a_good_simulation_is_nearer_than_the_next_press(report: Report) -> None
         assert view.distance < view.neighbour < 2
 
 
-def test_another_light_is_seen_in_the_picture_but_hardly_in_the_surface(real: Side, calibration: Calibration) -> None:
+def test_another_light_is_seen_in_the_picture_but_hardly_in_the_surface(
+    real: FrameSet, calibration: Calibration
+) -> None:
     """The claim of all this: each source's own calibration brings them together."""
     sensor = HiddenSensor(8)
     own, _ = calibrated(HiddenSensor(8))
@@ -131,7 +134,7 @@ def test_a_fresh_reference_saves_from_a_change_of_gain(report: Report) -> None:
     assert 0 < report.angle < 5
 
 
-def test_surfaces_and_drift_are_left_out_with_a_word(real: Side) -> None:
+def test_surfaces_and_drift_are_left_out_with_a_word(real: FrameSet) -> None:
     found = invariance(compare_frames(replace(real, untouched=()), real))
     assert [view.view for view in found.views] == ["raw", "difference"]
     assert found.drifts == () and math.isnan(found.angle)
@@ -140,9 +143,9 @@ def test_surfaces_and_drift_are_left_out_with_a_word(real: Side) -> None:
     assert found.patch.endswith("3 radii of the usual contact region")
 
 
-def test_too_few_presses_are_refused(real: Side) -> None:
-    with pytest.raises(BadSide, match="3 pairs show contact in B; 4 are needed"):
-        invariance(compare_frames(replace(real, shots=real.shots[:3]), replace(real, shots=real.shots[:3])))
+def test_too_few_presses_are_refused(real: FrameSet) -> None:
+    with pytest.raises(BadFrames, match="3 pairs show contact in B; 4 are needed"):
+        invariance(compare_frames(replace(real, frames=real.frames[:3]), replace(real, frames=real.frames[:3])))
 
 
 def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.lens.rectification import BadCorners, from_corners, from_geometry
+from calibration.lens.rectification import from_corners, from_geometry
+from calibration.lens.view import BadCorners
 from tacsim.models.sensor import CanonicalGrid, SensorGeometry
 from tacsim.optics.grid import canonical_image
 

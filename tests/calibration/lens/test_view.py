@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calibration.lens.board import BadBoard, Board, find_board, parse_board
-from calibration.lens.rectification import BadCorners, from_corners, from_view, to_metric
-from calibration.lens.view import BadView, Lens, board_pose, fit_lens, fit_view, view_of_corners
+from calibration.lens.rectification import from_corners, from_view, to_metric
+from calibration.lens.view import BadCorners, BadView, Lens, board_pose, fit_lens, fit_view, view_of_corners
 from tacsim import pose as se3
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_image

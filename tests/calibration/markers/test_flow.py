@@ -8,7 +8,12 @@ import pytest
 
 from calibration.lens.rectification import Rectification, from_corners, from_geometry
 from calibration.markers.flow import MarkerFlow, MarkersLost, NoMarkers, find_markers, marker_grid
-from calibration.normaliser import FrameNormaliser, for_camera, for_pictures, for_simulated
+from calibration.normaliser import (
+    FrameNormaliser,
+    normaliser_for_camera,
+    normaliser_for_pictures,
+    normaliser_for_simulation,
+)
 from calibration.reference import UnusableReference
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
@@ -61,7 +66,7 @@ STORIES: dict[str, list[GelSurface]] = {
 def errors(model: SensorModel, story: list[GelSurface], sent: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """(frames, rows, columns) distance between the flow found in the picture and that of the surface [m]."""
     render = Renderer(model, GEL)
-    normalise = for_pictures(model, GEL, GRID)
+    normalise = normaliser_for_pictures(model, GEL, GRID)
     normalise.take_reference(frame(sent(render(flat()))))
     found = []
     for k, surface in enumerate(story):
@@ -97,7 +102,7 @@ def test_without_its_distance_a_pinhole_would_be_seen_as_motion() -> None:
     """The correction above is no formality: a dot 0.8 mm nearer at 20 mm looks 4 % farther out."""
     near = SensorModel(markers=MARKERS, geometry=SensorGeometry(camera_distance=20e-3))
     render = Renderer(near, GEL)
-    normalise = for_pictures(MODEL, GEL, GRID)
+    normalise = normaliser_for_pictures(MODEL, GEL, GRID)
     normalise.take_reference(frame(render(flat())))
     surface = dent(depth=0.8e-3)
     flow = normalise(frame(render(surface), 1), now=0.0).flow
@@ -110,7 +115,10 @@ def test_fast_path_and_picture_have_the_same_lattice() -> None:
     render = Renderer(MODEL, GEL)
     known = TactileFrame(render(surface), 0.0, 1, surface_map(surface, GRID, MARKERS))
     seen = []
-    for normalise, shown in ((for_simulated(MODEL, GEL, GRID), known), (for_pictures(MODEL, GEL, GRID), None)):
+    for normalise, shown in (
+        (normaliser_for_simulation(MODEL, GEL, GRID), known),
+        (normaliser_for_pictures(MODEL, GEL, GRID), None),
+    ):
         normalise.take_reference(frame(render(flat())))
         seen.append(normalise(shown or frame(known.image, 1), now=0.0).flow)
     assert seen[0].shape == seen[1].shape == (9, 11, 2)
@@ -225,7 +233,7 @@ def test_a_rotated_camera_tells_flow_in_the_axes_of_the_sensor(angle: float) -> 
 
 
 def test_a_reference_without_the_lattice_is_refused_and_the_old_one_stays() -> None:
-    normalise = for_pictures(MODEL, GEL, GRID)
+    normalise = normaliser_for_pictures(MODEL, GEL, GRID)
     render = Renderer(MODEL, GEL)
     normalise.take_reference(frame(render(flat())))
     before = normalise.reference
@@ -244,19 +252,19 @@ def test_a_reference_without_the_lattice_is_refused_and_the_old_one_stays() -> N
 
 
 def test_more_dots_than_the_model_knows_are_refused() -> None:
-    few = for_pictures(SensorModel(markers=Markers(rows=5, columns=6)), GEL, GRID)
+    few = normaliser_for_pictures(SensorModel(markers=Markers(rows=5, columns=6)), GEL, GRID)
     with pytest.raises(NoMarkers, match="69 dots more than a lattice of 5 x 6"):
         few.take_reference(frame(Renderer(MODEL, GEL)(flat())))
 
 
 def test_dots_that_no_model_knows_are_refused() -> None:
-    normalise = for_pictures(SensorModel(), GEL, GRID)
+    normalise = normaliser_for_pictures(SensorModel(), GEL, GRID)
     with pytest.raises(UnusableReference, match=r"lattice of 9 x 11 dark dots, 24 px apart, but .* no markers"):
         normalise.take_reference(frame(Renderer(MODEL, GEL)(flat())))
 
 
 def test_dots_that_vanish_all_at_once_are_an_error_and_not_a_flow() -> None:
-    normalise = for_pictures(MODEL, GEL, GRID)
+    normalise = normaliser_for_pictures(MODEL, GEL, GRID)
     render = Renderer(MODEL, GEL)
     normalise.take_reference(frame(render(flat())))
     shown = render(drag((0.4e-3, 0.0)))
@@ -271,13 +279,13 @@ def test_dots_that_vanish_all_at_once_are_an_error_and_not_a_flow() -> None:
 def test_dots_that_the_image_cannot_show_are_refused() -> None:
     coarse = SensorModel(markers=MARKERS, geometry=SensorGeometry(width=64, height=48, pixel_pitch=0.3e-3))
     with pytest.raises(ValueError, match=r"radius 0\.25 mm are 0\.83 px in the image"):
-        for_pictures(coarse, GEL, GRID)
+        normaliser_for_pictures(coarse, GEL, GRID)
 
 
 def test_who_finds_flow_says_so() -> None:
-    assert for_pictures(MODEL, GEL, GRID).finds_flow
-    assert not for_pictures(SensorModel(), GEL, GRID).finds_flow
-    plain = for_camera(CameraSensorConfig(driver="camera", source="x"), GEL, GRID)
+    assert normaliser_for_pictures(MODEL, GEL, GRID).finds_flow
+    assert not normaliser_for_pictures(SensorModel(), GEL, GRID).finds_flow
+    plain = normaliser_for_camera(CameraSensorConfig(driver="camera", source="x"), GEL, GRID)
     assert isinstance(plain, FrameNormaliser)
     assert not plain.finds_flow
     assert plain.markers_seen is None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.ball_touch import Touch, fit_touches, touch_seen
-from calibration.poses.robust_fit import BadMeasurements, swing
+from calibration.poses.ball_touch import BallTouch, fit_touches, locate_ball
+from calibration.poses.robust_fit import BadMeasurements, angular_spread
 from tacsim import pose as se3
 from tests.calibration.touches import BALL_RADIUS, made_touches, posed
 
@@ -19,8 +19,8 @@ def test_without_noise_the_truth_comes_back_from_any_mounting() -> None:
         touches, sensor, ball = made_touches(np.random.default_rng(1), 8, noise=(0.0, 0.0, 0.0))
         # another tool frame: the same touches of a sensor that is mounted quite differently
         other = posed(turned, [0.05, -0.02, 0.1])
-        moved = [replace(touch, tool=se3.compose(touch.tool, se3.inverse(other))) for touch in touches]
-        fit = fit_touches(moved, BALL_RADIUS)
+        perturbed = [replace(touch, tool=se3.compose(touch.tool, se3.inverse(other))) for touch in touches]
+        fit = fit_touches(perturbed, BALL_RADIUS)
         metres, radians = se3.distance(fit.tool_from_sensor, se3.compose(other, sensor))
         assert metres < 1e-8 and radians < 1e-6
         np.testing.assert_allclose(fit.ball, ball, atol=1e-8)
@@ -62,7 +62,7 @@ def test_a_wrong_radius_goes_along_the_sensors_axis_and_nowhere_else() -> None:
     assert wrong.scatter == pytest.approx(right.scatter, rel=1e-3)
 
 
-def _alike(touches: list[Touch], **what: object) -> list[Touch]:
+def _alike(touches: list[BallTouch], **what: object) -> list[BallTouch]:
     return [replace(touch, **what) for touch in touches]  # type: ignore[arg-type]
 
 
@@ -99,15 +99,17 @@ def test_a_ball_that_moves_and_millimetres_by_mistake_are_refused() -> None:
         fit_touches(_scaled(touches), BALL_RADIUS)
 
 
-def _scaled(touches: list[Touch]) -> list[Touch]:
+def _scaled(touches: list[BallTouch]) -> list[BallTouch]:
     return [replace(touch, tool=replace(touch.tool, position=1e3 * touch.tool.position)) for touch in touches]
 
 
 def test_swing_is_that_of_the_direction_that_turns_least() -> None:
     angles = np.radians(30.0) * np.sqrt(3.0) * np.linspace(-1, 1, 401)
-    assert swing(Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()) == pytest.approx(0.0, abs=1e-6)
+    assert angular_spread(Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()) == pytest.approx(0.0, abs=1e-6)
     both = np.concatenate([np.outer(angles, [1, 0, 0]), np.outer(angles, [0, 1, 0])]) / 10.0
-    assert np.degrees(swing(Rotation.from_rotvec(both).as_matrix())) == pytest.approx(3.0 / np.sqrt(2.0), rel=0.02)
+    assert np.degrees(angular_spread(Rotation.from_rotvec(both).as_matrix())) == pytest.approx(
+        3.0 / np.sqrt(2.0), rel=0.02
+    )
 
 
 GRID = np.stack(np.meshgrid(*(0.25e-3 * (np.arange(64) - 31.5),) * 2), axis=-1)
@@ -126,7 +128,7 @@ def _hertz(x: float, y: float, depth: float, ball: float) -> np.ndarray:
 @pytest.mark.parametrize(("x", "y", "depth"), [(0.0, 0.0, 0.4e-3), (2.13e-3, -1.57e-3, 0.3e-3), (-3e-3, 1e-3, 0.8e-3)])
 def test_the_ball_is_found_in_the_surface(x: float, y: float, depth: float) -> None:
     noise = 5e-6 * np.random.default_rng(0).normal(size=(64, 64))
-    (found_x, found_y), found = touch_seen(_hertz(x, y, depth, BALL_RADIUS) + noise, EVERYWHERE, 0.25e-3, BALL_RADIUS)
+    (found_x, found_y), found = locate_ball(_hertz(x, y, depth, BALL_RADIUS) + noise, EVERYWHERE, 0.25e-3, BALL_RADIUS)
     assert np.hypot(found_x - x, found_y - y) < 0.02e-3
     assert found == pytest.approx(depth, rel=0.02)
 
@@ -134,11 +136,11 @@ def test_the_ball_is_found_in_the_surface(x: float, y: float, depth: float) -> N
 def test_what_is_no_ball_or_not_wholly_seen_is_refused() -> None:
     surface = _hertz(0.0, 0.0, 0.4e-3, BALL_RADIUS)
     with pytest.raises(BadMeasurements, match="nothing is pressed"):
-        touch_seen(0.0 * surface, EVERYWHERE, 0.25e-3, BALL_RADIUS)
+        locate_ball(0.0 * surface, EVERYWHERE, 0.25e-3, BALL_RADIUS)
     with pytest.raises(BadMeasurements, match="reaches the rim"):
-        touch_seen(_hertz(7.5e-3, 0.0, 0.4e-3, BALL_RADIUS), EVERYWHERE, 0.25e-3, BALL_RADIUS)
+        locate_ball(_hertz(7.5e-3, 0.0, 0.4e-3, BALL_RADIUS), EVERYWHERE, 0.25e-3, BALL_RADIUS)
     box = 0.4e-3 * (np.abs(GRID) < (3e-3, 1e-3)).all(axis=-1)
     with pytest.raises(BadMeasurements, match="no ball of 4 mm"):
-        touch_seen(box, EVERYWHERE, 0.25e-3, BALL_RADIUS)
+        locate_ball(box, EVERYWHERE, 0.25e-3, BALL_RADIUS)
     with pytest.raises(BadMeasurements, match="press deeper"):
-        touch_seen(np.where(np.abs(GRID).max(axis=-1) < 0.3e-3, 1e-4, 0.0), EVERYWHERE, 0.25e-3, BALL_RADIUS)
+        locate_ball(np.where(np.abs(GRID).max(axis=-1) < 0.3e-3, 1e-4, 0.0), EVERYWHERE, 0.25e-3, BALL_RADIUS)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.poses.hand_eye import HandEyeNoise, Sight, _whitening, closed_form, fit_hand_eye, park
-from calibration.poses.robust_fit import BadMeasurements, invert
+from calibration.poses.hand_eye import BoardPose, HandEyeNoise, _whitening, closed_form, fit_hand_eye, park
+from calibration.poses.robust_fit import BadMeasurements, inverse
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tests.calibration.touches import posed
@@ -28,23 +28,23 @@ def made_sights(
     fixed: bool = False,
     noise: float = 1.0,
     stated: HandEyeNoise = NOISE,
-) -> list[Sight]:
+) -> list[BoardPose]:
     """`spread`: standard deviation of the flange's rotation about each axis [degrees]; `noise`: of NOISE."""
 
     def shaken(pose: Pose, metres: float, radians: float) -> Pose:
         turn = Rotation.from_rotvec(noise * radians * random.normal(size=3))
         return se3.compose(pose, posed(turn, noise * metres * random.normal(size=3)))
 
-    sights = []
+    found = []
     for _ in range(number):
         turn = Rotation.from_rotvec(np.radians(spread) * random.normal(size=3))
         flange = posed(turn, np.array([0.5, 0.1, 0.3]) + 0.05 * random.normal(size=3))
         carried = se3.compose(flange, BOARD if fixed else CAMERA)
         seen = se3.relative(CAMERA, carried) if fixed else se3.relative(carried, BOARD)
-        sights.append(
-            Sight(shaken(flange, stated.robot, stated.robot_turn), shaken(seen, stated.board, stated.board_turn))
+        found.append(
+            BoardPose(shaken(flange, stated.robot, stated.robot_turn), shaken(seen, stated.board, stated.board_turn))
         )
-    return sights
+    return found
 
 
 @pytest.mark.parametrize("fixed", [False, True])
@@ -73,11 +73,11 @@ def test_errors_with_the_noise_of_the_notes_are_as_stated(fixed: bool) -> None:
 @pytest.mark.parametrize("fixed", [False, True])
 def test_weights_know_the_lever_of_a_robots_rotation(fixed: bool) -> None:
     stated = HandEyeNoise(board=0.3e-3, board_turn=np.radians(0.05), robot_turn=np.radians(0.2))
-    sights = made_sights(np.random.default_rng(5), 900, fixed=fixed, stated=stated)
-    flange, board = (np.stack([se3.to_matrix(getattr(each, name)) for each in sights]) for name in ("flange", "board"))
-    arm = invert(flange) if fixed else flange
+    seen = made_sights(np.random.default_rng(5), 900, fixed=fixed, stated=stated)
+    flange, board = (np.stack([se3.to_matrix(getattr(each, name)) for each in seen]) for name in ("flange", "board"))
+    arm = inverse(flange) if fixed else flange
     camera, mount = se3.to_matrix(CAMERA), se3.to_matrix(BOARD)
-    predicted = invert(camera) @ invert(arm) @ mount
+    predicted = inverse(camera) @ inverse(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).as_rotvec()
     missed = np.concatenate([predicted[:, :3, 3] - board[:, :3, 3], turn], axis=1)
     even = np.einsum("nij,nj->ni", _whitening(camera, mount, arm, stated, fixed=fixed), missed)
@@ -85,39 +85,39 @@ def test_weights_know_the_lever_of_a_robots_rotation(fixed: bool) -> None:
 
 
 def test_bad_poses_are_found_and_left_out() -> None:
-    sights = made_sights(np.random.default_rng(1), 20)
+    seen = made_sights(np.random.default_rng(1), 20)
     for index in (3, 11, 17):
         off = posed(Rotation.from_rotvec([0.3, 0.2, 0.0]), [0.05, 0.0, 0.02])
-        sights[index] = replace(sights[index], board=se3.compose(sights[index].board, off))
-    fit = fit_hand_eye(sights)
+        seen[index] = replace(seen[index], board=se3.compose(seen[index].board, off))
+    fit = fit_hand_eye(seen)
     assert [i for i, used in enumerate(fit.used) if not used] == [3, 11, 17]
     metres, radians = se3.distance(fit.camera, CAMERA)
     assert metres < 1.5e-3 and np.degrees(radians) < 0.25
 
 
 def test_what_tells_too_little_is_refused() -> None:
-    sights = made_sights(np.random.default_rng(2))
+    seen = made_sights(np.random.default_rng(2))
     with pytest.raises(BadMeasurements, match="5 poses are too few; at least 6"):
-        fit_hand_eye(sights[:5])
+        fit_hand_eye(seen[:5])
     with pytest.raises(BadMeasurements, match="turns too little: one direction swings by only"):
         fit_hand_eye(made_sights(np.random.default_rng(2), spread=8.0))
 
 
 def test_poses_that_disagree_are_refused() -> None:
-    sights = made_sights(np.random.default_rng(3))
-    shifted = [Sight(one.flange, other.board) for one, other in zip(sights, sights[1:] + sights[:1], strict=True)]
+    seen = made_sights(np.random.default_rng(3))
+    shifted = [BoardPose(one.flange, other.board) for one, other in zip(seen, seen[1:] + seen[:1], strict=True)]
     with pytest.raises(BadMeasurements, match="disagree"):
         fit_hand_eye(shifted)  # pictures and poses of different moments
     with pytest.raises(BadMeasurements, match="disagree"):
-        fit_hand_eye(sights, fixed=True)  # the other mounting
+        fit_hand_eye(seen, fixed=True)  # the other mounting
 
 
 def test_the_own_closed_form_takes_the_place_of_a_missing_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    sights = made_sights(np.random.default_rng(4))
-    arm, board = (np.stack([se3.to_matrix(getattr(sight, name)) for sight in sights]) for name in ("flange", "board"))
-    theirs, with_opencv = closed_form(arm, board), fit_hand_eye(sights)
+    seen = made_sights(np.random.default_rng(4))
+    arm, board = (np.stack([se3.to_matrix(getattr(each, name)) for each in seen]) for name in ("flange", "board"))
+    theirs, with_opencv = closed_form(arm, board), fit_hand_eye(seen)
     np.testing.assert_allclose(park(arm, board), theirs, atol=2e-4)
     monkeypatch.delattr(cv2, "calibrateHandEye")  # as in OpenCV 5.0
     np.testing.assert_array_equal(closed_form(arm, board), park(arm, board))
-    metres, radians = se3.distance(fit_hand_eye(sights).camera, with_opencv.camera)
+    metres, radians = se3.distance(fit_hand_eye(seen).camera, with_opencv.camera)
     assert metres < 1e-6 and radians < 1e-6

@@ -61,9 +61,9 @@ def test_the_uncertainty_is_that_of_the_errors() -> None:
 
 def test_neither_scale_nor_offset_matter() -> None:
     times, depth, seen_at, touch = record(2)
-    plain = estimate_latency(times, depth, seen_at, touch).seconds
+    pose_as_json = estimate_latency(times, depth, seen_at, touch).seconds
     other = estimate_latency(times + 5.0, 1e-3 * depth + 0.4, seen_at + 5.0, 20.0 * touch - 3.0).seconds
-    assert other == pytest.approx(plain, abs=1e-5)
+    assert other == pytest.approx(pose_as_json, abs=1e-5)
 
 
 def test_an_arm_later_than_the_camera_is_negative() -> None:

@@ -12,7 +12,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from calibration.bundle import write_bundle
-from calibration.compare.frame_set import Side, read_side
+from calibration.frame_set import FrameSet, read_frame_set
 from robot.cli import app
 from tacsim.interface import RigSpec, SensorSpec, SurfaceMap, TactileFrame
 from tacsim.record.episode import EpisodeMeta, Step
@@ -23,19 +23,19 @@ from tests.calibration.sources import blank, calibrated, changed, save, side
 
 
 @pytest.fixture(scope="module")
-def real() -> Side:
+def real() -> FrameSet:
     return side(HiddenSensor(3), name="real")
 
 
 @pytest.fixture(scope="module")
-def good(real: Side) -> Side:
+def good(real: FrameSet) -> FrameSet:
     sensor = HiddenSensor(3)
     sensor.empty()
     return replace(side(sensor, name="good"), reference=real.reference, untouched=())
 
 
 @pytest.fixture(autouse=True)
-def folders(real: Side, good: Side, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def folders(real: FrameSet, good: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TERM", "dumb")
     save(real, Path("real"))
@@ -73,7 +73,7 @@ def test_limits_decide_the_exit_code() -> None:
     assert below.exit_code == 1 and "below 0.9999" in said(below)
 
 
-def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: Side) -> None:
+def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: FrameSet) -> None:
     save(blank(real), Path("blank"))
     assert tacsim("blank", "real", "--fail-below", "ssim=0.8", "--out", "a").exit_code == 0
     assert tacsim("blank", "real", "--fail-below", "contact_ncc=0.5", "--out", "b").exit_code == 1
@@ -120,7 +120,7 @@ def test_what_cannot_be_compared_is_said_without_a_traceback(words: tuple[str, .
     assert not Path("out").exists()
 
 
-def test_counts_that_differ_and_the_way_out(real: Side) -> None:
+def test_counts_that_differ_and_the_way_out(real: FrameSet) -> None:
     Path("sim/press_4.png").unlink()
     refused = tacsim("sim", "real", "--out", "out")
     assert refused.exit_code == 2 and "--pair name" in said(refused)
@@ -128,7 +128,7 @@ def test_counts_that_differ_and_the_way_out(real: Side) -> None:
     assert named.exit_code == 0 and "no partner of their name" in said(named)
 
 
-def test_warnings_reach_the_person(good: Side, real: Side) -> None:
+def test_warnings_reach_the_person(good: FrameSet, real: FrameSet) -> None:
     save(changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all"), Path("bgr"))
     assert "red and blue look swapped" in said(tacsim("bgr", "real", "--out", "a"))
     save(blank(real), Path("blank"))
@@ -156,7 +156,7 @@ def test_calibrations_bring_surfaces_and_invariance() -> None:
     assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in said(wrong)
 
 
-def test_an_episode_is_a_side_with_its_surfaces(real: Side) -> None:
+def test_an_episode_is_a_side_with_its_surfaces(real: FrameSet) -> None:
     surface = SurfaceMap(
         height=np.full((64, 64), 1e-4, dtype=np.float32), gradient=np.zeros((64, 64, 2), dtype=np.float32), flow=None
     )
@@ -167,13 +167,13 @@ def test_an_episode_is_a_side_with_its_surfaces(real: Side) -> None:
         attachments=reference_attachments(references),
     )  # fmt: skip
     with Recorder(Path("e.mcap"), meta) as recorder:
-        for k, shot in enumerate(real.shots):
+        for k, shot in enumerate(real.frames):
             frames = {"left": TactileFrame(shot.image, 0.1 * k, k, surface)}
             assert recorder.write(Step(index=k, time=0.1 * k, frames=frames, arms={}))
-    read = read_side(Path("e.mcap"))
+    read = read_frame_set(Path("e.mcap"))
     assert read.reference_from == "the recording's own"
     assert np.array_equal(read.reference, real.reference)
-    assert len(read.shots) == 5 and read.shots[0].surface is not None
+    assert len(read.frames) == 5 and read.frames[0].surface is not None
     result = tacsim("e.mcap", "real", "--out", "out")
     assert result.exit_code == 0, result.output
     assert json.loads(Path("out/compare.json").read_text())["overall"]["mae"]["mean"] == 0.0

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from calibration.poses.records import sight_file, write_record
+from calibration.poses.records import board_pose_file, write_record
 from robot.cli import app
 from robot.mock import FaultClient, MockCamera
 from robot.mock.fixtures import mock_host
@@ -56,8 +56,8 @@ def run(*words: object) -> tuple[int, str, str]:
 
 @pytest.mark.parametrize("fixed", [False, True])
 def test_a_file_of_poses_tells_where_the_camera_sits(fixed: bool, tmp_path: Path) -> None:
-    sights = made_sights(np.random.default_rng(0), fixed=fixed)
-    path = write_record(tmp_path / "poses.yaml", sight_file(sights, fixed=fixed))
+    board_poses = made_sights(np.random.default_rng(0), fixed=fixed)
+    path = write_record(tmp_path / "poses.yaml", board_pose_file(board_poses, fixed=fixed))
     code, said, err = run(path, "--out", tmp_path / "out")
     assert code == 0, err
     name = "base_from_camera" if fixed else "flange_from_camera"
@@ -71,7 +71,7 @@ def test_a_file_of_poses_tells_where_the_camera_sits(fixed: bool, tmp_path: Path
 
 def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
     alike = write_record(
-        tmp_path / "alike.yaml", sight_file(made_sights(np.random.default_rng(0), 9, 3.0), fixed=False)
+        tmp_path / "alike.yaml", board_pose_file(made_sights(np.random.default_rng(0), 9, 3.0), fixed=False)
     )
     (tmp_path / "lens.yaml").write_text(yaml.safe_dump(LENS.model_dump(mode="json")))
     live = ["--rig", "mock", "--arm", "upper", "--camera", "nowhere", "--lens", tmp_path / "lens.yaml"]

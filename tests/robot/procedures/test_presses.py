@@ -19,8 +19,8 @@ import yaml
 from typer.testing import CliRunner
 
 from calibration.bundle import FILE, read_bundle
+from calibration.errors import BadFrames
 from calibration.lens.view import view_of_corners
-from calibration.light.ball_press import BadPresses
 from calibration.light.noise import measure_noise
 from robot.cli import app
 from robot.mock import MockCamera
@@ -153,7 +153,7 @@ def test_presses_on_a_gel_with_dots_are_judged_without_them() -> None:
     marked = Person([dotted(PRESSES[0], 2.0)], empty=dotted(EMPTY, 0.0))
     record, _ = marked.led(1, markers=True)
     assert record.refused == [] and len(record.presses) == 1
-    with pytest.raises(BadPresses, match="leave --markers out"):
+    with pytest.raises(BadFrames, match="leave --markers out"):
         Person([PRESSES[0]]).led(1, markers=True)
 
 
@@ -195,7 +195,7 @@ def test_a_person_who_does_nothing_is_not_waited_for_for_ever() -> None:
 def test_a_dark_picture_without_contact_is_refused() -> None:
     person = Person([])
     person._shown = np.zeros_like(EMPTY)
-    with pytest.raises(BadPresses, match="is dark"):
+    with pytest.raises(BadFrames, match="is dark"):
         person.led(1)
 
 

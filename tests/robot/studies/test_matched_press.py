@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration.bundle import write_bundle
-from calibration.compare.frame_set import BadSide, Shot, Side
+from calibration.errors import BadFrames
+from calibration.frame_set import Frame, FrameSet
 from robot.cli import app
 from robot.studies.matched_press import press_like
 from tacsim.config import load_scene
@@ -24,15 +25,15 @@ DEPTHS, PLACES = (0.5e-3, 0.65e-3), ((90, 110), (170, 80))
 
 
 @pytest.fixture
-def frames() -> Side:
+def frames() -> FrameSet:
     """Two presses by Hertz, and one frame without contact."""
     sensor = HiddenSensor(3)
     made = [sensor.press(depth, *place) for depth, place in zip(DEPTHS, PLACES, strict=True)]
-    shots = [Shot(f"press_{k}.png", press.image) for k, press in enumerate(made)]
-    return Side("real", sensor.empty(), "made up", (*shots, Shot("still.png", sensor.empty())))
+    frames = [Frame(f"press_{k}.png", press.image) for k, press in enumerate(made)]
+    return FrameSet("real", sensor.empty(), "made up", (*frames, Frame("still.png", sensor.empty())))
 
 
-def test_a_scene_against_frames(frames: Side, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save(frames, Path("real"))
     calibration, reference = calibrated(HiddenSensor(3))
@@ -54,15 +55,15 @@ def test_a_scene_against_frames(frames: Side, tmp_path: Path, monkeypatch: pytes
     assert config["pairs"][2]["flags"] == ["A: no contact", "B: no contact"]
 
 
-def test_what_cannot_be_pressed_is_refused(frames: Side) -> None:
+def test_what_cannot_be_pressed_is_refused(frames: FrameSet) -> None:
     scene = load_scene("press", list(SCENE))
     sensor = SensorModel(geometry=SensorGeometry(width=260, height=200, pixel_pitch=0.08e-3))
     box = load_scene("press", ["indenter.geometry={shape: box, size: [5 mm, 5 mm, 5 mm]}"])
-    with pytest.raises(BadSide, match="'press' presses no ball"):
+    with pytest.raises(BadFrames, match="'press' presses no ball"):
         press_like(frames, box, sensor, CanonicalGrid())
     smaller = SensorModel(geometry=SensorGeometry(width=200, height=200, pixel_pitch=0.08e-3))
-    with pytest.raises(BadSide, match="real is 260 x 200 px, the calibration is of 200 x 200"):
+    with pytest.raises(BadFrames, match="real is 260 x 200 px, the calibration is of 200 x 200"):
         press_like(frames, scene, smaller, CanonicalGrid())
-    still = replace(frames, shots=(Shot("still.png", np.array(frames.reference)),))
-    with pytest.raises(BadSide, match="no frame shows a ball's contact"):
+    still = replace(frames, frames=(Frame("still.png", np.array(frames.reference)),))
+    with pytest.raises(BadFrames, match="no frame shows a ball's contact"):
         press_like(still, scene, sensor, CanonicalGrid())

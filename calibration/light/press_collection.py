@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.ball_press import BadPresses, find_press, untouched_mean
+from calibration.errors import BadFrames
+from calibration.light.calibrator import find_press, untouched_mean
 from calibration.light.circle import NoCircle
 from calibration.light.dent import ContactCircle
 
@@ -26,7 +27,7 @@ class PressCollection:
         ball: radius of the ball [px of the metric picture].
         rectify: native picture -> metric one; None: they are the same.
 
-    Raises BadPresses for a picture that nothing can be measured against.
+    Raises BadFrames for a picture that nothing can be measured against.
     """
 
     def __init__(self, reference: Image, ball: float, rectify: Callable[[Image], Image] | None = None) -> None:
@@ -42,17 +43,17 @@ class PressCollection:
         return tuple(self._circles)
 
     def offer(self, image: Image) -> ContactCircle:
-        """Takes a native picture and returns its contact, or raises BadPresses with why it is not taken."""
+        """Takes a native picture and returns its contact, or raises BadFrames with why it is not taken."""
         try:
             circle = find_press("press", self._rectify(image), self._reference, self._mean, self._ball).circle
         except NoCircle as none:
-            raise BadPresses(str(none)) from none
+            raise BadFrames(str(none)) from none
         height, width = self._reference.shape[:2]
         if min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) < circle.radius:
-            raise BadPresses("the contact is cut off by the border of the picture; press nearer to the middle")
+            raise BadFrames("the contact is cut off by the border of the picture; press nearer to the middle")
         for number, other in enumerate(self._circles, start=1):
             if math.hypot(circle.x - other.x, circle.y - other.y) < APART * max(circle.radius, other.radius):
-                raise BadPresses(f"it is in the same place as press {number}; press elsewhere")
+                raise BadFrames(f"it is in the same place as press {number}; press elsewhere")
         self._circles.append(circle)
         return circle
 

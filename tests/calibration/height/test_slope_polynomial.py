@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from calibration.height.inverse import GAIN, TERMS, inverse_features
+from calibration.height.slope_polynomial import GAIN, TERMS, inverse_features
 
 
 def test_the_terms_are_all_products_of_at_most_three() -> None:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calibration.height.depth import Integrator
+from calibration.height.integration import Integrator
 
 PITCH = 0.1e-3
 

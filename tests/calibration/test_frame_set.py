@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from calibration.errors import BadFrames
+from calibration.frame_set import read_folder, rectified_by_view
 from calibration.lens.view import view_of_corners
-from calibration.light.ball_press import BadPresses
-from calibration.light.image_folder import read_presses, rectified
 from tests.calibration.presses import BALL, PITCH, HiddenSensor
 
 
@@ -27,62 +27,62 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_frame_without_contact_is_told_by_its_name(folder: Path) -> None:
-    frames = read_presses(folder)
-    assert [name for name, _ in frames.presses] == [f"press_{i}.png" for i in range(5)]
+    frames = read_folder(folder)
+    assert [frame.name for frame in frames.frames] == [f"press_{i}.png" for i in range(5)]
     assert not frames.estimated
 
 
 def test_more_frames_without_contact_have_its_name_and_a_number(folder: Path) -> None:
     for number in (10, 2):
-        save(folder / f"background_{number}.png", np.full_like(read_presses(folder).reference, number))
-    frames = read_presses(folder)
-    assert [name for name, _ in frames.presses] == [f"press_{i}.png" for i in range(5)]
-    assert sorted(int(image.max()) for image in frames.untouched[1:]) == [2, 10]
-    np.testing.assert_array_equal(frames.untouched[0], frames.reference)
+        save(folder / f"background_{number}.png", np.full_like(read_folder(folder).reference, number))
+    frames = read_folder(folder)
+    assert [frame.name for frame in frames.frames] == [f"press_{i}.png" for i in range(5)]
+    assert sorted(int(image.max()) for image in frames.untouched_images[1:]) == [2, 10]
+    np.testing.assert_array_equal(frames.untouched_images[0], frames.reference)
     # presses are presses, though the reference that is named has their name
     (folder / "Background.png").rename(folder / "press.png")
-    named = read_presses(folder, folder / "press.png")
-    assert len(named.presses) == 5 and len(named.untouched) == 3
+    named = read_folder(folder, folder / "press.png")
+    assert len(named.frames) == 5 and len(named.untouched_images) == 3
     np.testing.assert_array_equal(named.reference, frames.reference)
 
 
 def test_all_frames_are_rectified_and_must_fit_the_view(folder: Path) -> None:
     view = view_of_corners(((20.0, 10.0), (240.0, 15.0), (235.0, 190.0), (15.0, 185.0)), (16e-3, 12e-3), (200, 260))
     save(folder / "background_2.png", HiddenSensor(5).empty())
-    frames = read_presses(folder)
-    seen = rectified(frames, view)
+    frames = read_folder(folder)
+    seen = rectified_by_view(frames, view)
     shape = (view.geometry.height, view.geometry.width, 3)
-    assert {image.shape for image in (*seen.untouched, *(image for _, image in seen.presses))} == {shape}
-    np.testing.assert_array_equal(seen.untouched[0], seen.reference)
-    assert (seen.untouched[1] != seen.reference).any()
+    assert {image.shape for image in (*seen.untouched_images, *(frame.image for frame in seen.frames))} == {shape}
+    np.testing.assert_array_equal(seen.untouched_images[0], seen.reference)
+    assert (seen.untouched_images[1] != seen.reference).any()
     save(folder / "background_2.png", HiddenSensor(5).empty()[:100])
-    with pytest.raises(BadPresses, match="260 x 200"):
-        rectified(read_presses(folder), view)
+    with pytest.raises(BadFrames, match="260 x 200"):
+        rectified_by_view(read_folder(folder), view)
 
 
 def test_or_is_named_or_is_the_median(folder: Path) -> None:
-    untouched = read_presses(folder).reference
+    untouched = read_folder(folder).reference
     moved = folder.parent / "elsewhere.png"
     (folder / "Background.png").rename(moved)
-    np.testing.assert_array_equal(read_presses(folder, moved).reference, untouched)
-    median = read_presses(folder)
+    np.testing.assert_array_equal(read_folder(folder, moved).reference, untouched)
+    median = read_folder(folder)
     assert median.estimated
     assert np.abs(median.reference.astype(int) - untouched).mean() < 2.5
     (folder / "press_0.png").unlink()
-    with pytest.raises(BadPresses, match="--reference"):
-        read_presses(folder)
+    with pytest.raises(BadFrames, match="--reference"):
+        read_folder(folder)
 
 
 def test_what_cannot_be_read_is_named(folder: Path) -> None:
     (folder / "press_9.png").write_bytes(b"no picture")
-    with pytest.raises(BadPresses, match=r"press_9\.png"):
-        read_presses(folder)
-    with pytest.raises(BadPresses, match="is no folder"):
-        read_presses(folder / "press_0.png")
+    with pytest.raises(BadFrames, match=r"press_9\.png"):
+        read_folder(folder)
+    with pytest.raises(BadFrames, match="is no folder"):
+        read_folder(folder / "press_0.png")
     empty = folder.parent / "empty"
     empty.mkdir()
-    with pytest.raises(BadPresses, match="holds no frame of a press"):
-        read_presses(empty)
+    with pytest.raises(BadFrames, match="no pictures in this folder"):
+        read_folder(empty)
 
 
 def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
 def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) -> None:
     from typer.testing import CliRunner
 
-    from calibration.bundle import read_bundle, sensor_model
+    from calibration.bundle import read_bundle, read_sensor_model
     from robot.cli import app
     from tacsim.interface import SensorSpec
     from tacsim.optics.noise import noise_source
@@ -148,7 +148,7 @@ def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) ->
         def surface(self, frame: str) -> object:
             return flat()
 
-    model, world = sensor_model(tmp_path / "out"), Still()
+    model, world = read_sensor_model(tmp_path / "out"), Still()
     spec = SensorSpec((model.geometry.height, model.geometry.width), height=False, flow=False, arm=None)
     render = Renderer(model, (40e-3, 40e-3))
     sensor = SimSensor(world, world, "s", spec, render, lambda at: None, noise_source(model, "s"))  # type: ignore[arg-type, return-value]
@@ -176,7 +176,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     from typer.testing import CliRunner
 
     from calibration.bundle import read_bundle
-    from calibration.normaliser import for_calibrated
+    from calibration.normaliser import normaliser_for_calibration
     from robot.cli import app
     from tacsim.interface import TactileFrame
     from tacsim.models.sensor import CanonicalGrid
@@ -194,7 +194,7 @@ def test_markers_are_measured_when_asked_for_and_noticed_when_not(tmp_path: Path
     markers = calibration.markers
     assert markers is not None and (markers.rows, markers.columns) == (7, 9)
     assert markers.pitch == pytest.approx(1.9e-3, rel=0.01) and markers.radius == pytest.approx(0.3e-3, rel=0.15)
-    normalise = for_calibrated(calibration, CanonicalGrid(), reference)
+    normalise = normaliser_for_calibration(calibration, CanonicalGrid(), reference)
     normalise.take_reference(TactileFrame(image=reference, time=0.0, index=0))
     pressed = dotted(sensor, sensor.press(0.5e-3, 130, 100).image)
     seen = normalise(TactileFrame(image=pressed, time=0.1, index=1), 0.1)

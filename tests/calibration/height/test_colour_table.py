@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calibration.height.gradient import STEEPEST, from_lighting, from_model
+from calibration.height.colour_table import STEEPEST, from_lighting, from_model
 from tacsim.models.sensor import Light, Lighting, SensorModel
 from tacsim.optics.render import shade
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from calibration.height.depth import Integrator
-from calibration.height.inverse import PolynomialSlopes, to_normal
-from calibration.light.ball_press import BadPresses, Fit, calibrate_light, normal_angle
+from calibration.errors import BadFrames
+from calibration.height.integration import Integrator
+from calibration.height.slope_polynomial import PolynomialSlopes, to_normal
+from calibration.light.calibrator import LightFit, calibrate_light, normal_angle
 from calibration.light.dent import ContactCircle, Skirt, dent_gradient
 from calibration.markers.dots import DotEraser
 from tacsim.models.photometric import PhotometricLight, place_in_image, places_in_image
@@ -17,7 +18,7 @@ def named(presses: list[Made]) -> list[tuple[str, np.ndarray]]:
     return [(f"press {i}", press.image) for i, press in enumerate(presses)]
 
 
-def found_slopes(fit: Fit, image: np.ndarray) -> np.ndarray:
+def found_slopes(fit: LightFit, image: np.ndarray) -> np.ndarray:
     """(H, W, 2) by the inverse model."""
     import cv2
 
@@ -28,7 +29,7 @@ def found_slopes(fit: Fit, image: np.ndarray) -> np.ndarray:
     return slopes
 
 
-def angle_in_contact(fit: Fit, unseen: Made) -> float:
+def angle_in_contact(fit: LightFit, unseen: Made) -> float:
     v, u = np.mgrid[:ROWS, :COLUMNS]
     inside = np.hypot(u - unseen.circle[0], v - unseen.circle[1]) < unseen.circle[2]
     angles = normal_angle(to_normal(found_slopes(fit, unseen.image).astype(float)), to_normal(unseen.gradient))
@@ -41,12 +42,12 @@ def sensor(request: pytest.FixtureRequest) -> HiddenSensor:
 
 
 @pytest.fixture(scope="module")
-def calibrated(sensor: HiddenSensor) -> tuple[Fit, list[Made]]:
+def calibrated(sensor: HiddenSensor) -> tuple[LightFit, list[Made]]:
     presses = sensor.presses(6)
     return calibrate_light(sensor.empty(), named(presses), BALL_PX), presses
 
 
-def test_circles_are_found_without_a_click(calibrated: tuple[Fit, list[Made]]) -> None:
+def test_circles_are_found_without_a_click(calibrated: tuple[LightFit, list[Made]]) -> None:
     fit, presses = calibrated
     assert fit.left_out == ()
     assert fit.warnings == ()
@@ -56,12 +57,12 @@ def test_circles_are_found_without_a_click(calibrated: tuple[Fit, list[Made]]) -
 
 
 def test_normals_of_an_unseen_press_come_back_within_a_degree(
-    sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]
+    sensor: HiddenSensor, calibrated: tuple[LightFit, list[Made]]
 ) -> None:
     assert angle_in_contact(calibrated[0], sensor.press(0.5e-3, 150, 90)) < 1.1
 
 
-def test_depth_of_an_unseen_press_comes_back(sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]) -> None:
+def test_depth_of_an_unseen_press_comes_back(sensor: HiddenSensor, calibrated: tuple[LightFit, list[Made]]) -> None:
     """Within 4 %: the true surface is Hertz's, whose skirt reaches farther than the one that is assumed."""
     unseen = sensor.press(0.5e-3, 150, 90)
     found = Integrator((ROWS, COLUMNS), PITCH)(found_slopes(calibrated[0], unseen.image))
@@ -90,7 +91,7 @@ def test_skirt_and_depth_come_back_where_the_gel_is_as_assumed() -> None:
     assert float(found.max()) == pytest.approx(depth, rel=0.03)
 
 
-def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: tuple[Fit, list[Made]]) -> None:
+def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: tuple[LightFit, list[Made]]) -> None:
     fit, _ = calibrated
     unseen = sensor.press(0.45e-3, 140, 110)
     places = places_in_image(COLUMNS, ROWS)
@@ -104,7 +105,7 @@ def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: t
     assert error < 3.0  # two frames with a noise of 1.5 differ by 1.7
 
 
-def test_left_out_scores_are_those_of_presses_nobody_has_seen(calibrated: tuple[Fit, list[Made]]) -> None:
+def test_left_out_scores_are_those_of_presses_nobody_has_seen(calibrated: tuple[LightFit, list[Made]]) -> None:
     for score in calibrated[0].scores:
         assert score.error < 0.25 * score.nothing
         assert score.correlation > 0.97
@@ -183,7 +184,7 @@ def test_a_picture_without_contact_of_another_light_is_doubted(sensor: HiddenSen
 
 def test_a_picture_without_contact_that_shows_one_is_doubted(sensor: HiddenSensor) -> None:
     presses = sensor.presses(5)
-    with pytest.raises(BadPresses, match="second contact"):
+    with pytest.raises(BadFrames, match="second contact"):
         calibrate_light(presses[0].image, named(presses), BALL_PX)
     frames = [("empty", sensor.empty()), ("again", sensor.empty()), *named(presses[1:2])]
     fit = calibrate_light(sensor.empty(), frames, BALL_PX)
@@ -197,7 +198,7 @@ def test_exchanged_colours_are_called_by_their_name(sensor: HiddenSensor, which:
         frames = [(name, image[..., ::-1].copy()) for name, image in frames]
     else:
         reference = reference[..., ::-1].copy()
-    with pytest.raises(BadPresses, match="only with red and blue exchanged"):
+    with pytest.raises(BadFrames, match="only with red and blue exchanged"):
         calibrate_light(reference, frames, BALL_PX)
 
 
@@ -222,15 +223,15 @@ def test_a_wrong_radius_scales_every_slope_and_nothing_gives_it_away(sensor: Hid
 
 
 def test_nothing_usable_is_refused_with_every_reason(sensor: HiddenSensor) -> None:
-    with pytest.raises(BadPresses, match=r"(?s)a: no ball's contact.*b: no ball's contact"):
+    with pytest.raises(BadFrames, match=r"(?s)a: no ball's contact.*b: no ball's contact"):
         calibrate_light(sensor.empty(), [("a", sensor.empty()), ("b", sensor.empty())], BALL_PX)
-    with pytest.raises(BadPresses, match="no frame of a press"):
+    with pytest.raises(BadFrames, match="no frame of a press"):
         calibrate_light(sensor.empty(), [], BALL_PX)
 
 
 def test_frames_of_another_size_are_named(sensor: HiddenSensor) -> None:
     small = sensor.press(0.5e-3, 70, 60).image[:100]
-    with pytest.raises(BadPresses, match=r"small \(260 x 100\)"):
+    with pytest.raises(BadFrames, match=r"small \(260 x 100\)"):
         calibrate_light(sensor.empty(), [*named(sensor.presses(1)), ("small", small)], BALL_PX)
 
 
@@ -257,10 +258,10 @@ def test_printed_dots_that_move_are_erased() -> None:
         assert (press.circle.x, press.circle.y) == pytest.approx(truth.circle[:2], abs=1.0)
         assert press.circle.radius == pytest.approx(truth.circle[2], abs=1.5)
 
-    def left_out_error(fit: Fit) -> float:
+    def left_out_error(fit: LightFit) -> float:
         return float(np.mean([score.error for score in fit.scores]))
 
     assert left_out_error(erased) < 1.5 * left_out_error(plain)
     np.testing.assert_array_equal(erased.reference, reference)
-    with pytest.raises(BadPresses, match="no frame can be used"):
+    with pytest.raises(BadFrames, match="no frame can be used"):
         calibrate_light(reference, frames, BALL_PX)

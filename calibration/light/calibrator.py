@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.height.inverse import InverseModel, fit_inverse, inverse_features, to_normal
+from calibration.errors import BadFrames
+from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.light.circle import NoCircle, contact_circle
 from calibration.light.dent import STEEPEST_RIM, ContactCircle, Skirt, dent_gradient, rim_slope
 from calibration.light.photometry import FEW, Equations, Order, choose_order, equations, solve
-from calibration.light.refine import BLUR as RIM_BLUR
-from calibration.light.refine import Refined, Window, refine
+from calibration.light.refinement import BLUR as RIM_BLUR
+from calibration.light.refinement import Refined, Window, refine
 from calibration.reference import SATURATED, STALE_COLOUR, UnusableReference, exchanged, make_reference
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
 
@@ -43,10 +44,6 @@ ODD_ANGLE = 8.0  # [degrees]
 SECOND = 0.7  # a second patch as strong as this share of the first is a second contact
 
 
-class BadPresses(ValueError):
-    """Frames that no calibration can be made from: what is wrong, with which, and what to do."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Press:
     """One frame that takes part."""
@@ -64,7 +61,7 @@ class Press:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Score:
+class PressPrediction:
     """How well one press is predicted by a calibration that has not seen it."""
 
     name: str
@@ -79,14 +76,14 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class LightFit:
     """A calibrated light."""
 
     forward: PhotometricModel
     inverse: InverseModel
     order: Order
     skirt: Skirt  # [px]
-    scores: tuple[Score, ...]
+    scores: tuple[PressPrediction, ...]
     left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
     warnings: tuple[str, ...]
     reference: Image
@@ -102,7 +99,7 @@ def calibrate_light(
     frames: Sequence[tuple[str, Image]],
     ball: float,
     erase: Callable[[Image], Image] | None = None,
-) -> Fit:
+) -> LightFit:
     """Calibrates the light of one sensor.
 
     Args:
@@ -111,7 +108,7 @@ def calibrate_light(
         ball: radius of the ball [px].
         erase: takes away the dots that are printed on the gel.
 
-    Raises BadPresses, with what is wrong in every frame, when no press can be used.
+    Raises BadFrames, with what is wrong in every frame, when no press can be used.
     """
     _check_frames(reference, frames)
     _check_order(reference, frames)
@@ -124,7 +121,7 @@ def calibrate_light(
     for name, image in frames:
         try:
             found.append(find_press(name, image, reference, mean, ball))
-        except (NoCircle, BadPresses) as error:
+        except (NoCircle, BadFrames) as error:
             refused.append((name, str(error)))
     presses, refined = _refined(found, refused, ball)
     labels = [_gradient(press, refined.skirt, ball) for press in presses]
@@ -146,7 +143,7 @@ def calibrate_light(
         if len(presses) > 1
     )
     warnings = [*_doubts(presses, ball, mean, len(refused)), *_doubts_of(scores)]
-    return Fit(
+    return LightFit(
         forward=_forward_model(every, order, steepest),
         inverse=_inverse_model(inverse_sets, steepest),
         order=order,
@@ -164,29 +161,29 @@ def _check_frames(reference: Image, frames: Sequence[tuple[str, Image]]) -> None
         f"{name} ({image.shape[1]} x {image.shape[0]})" for name, image in frames if image.shape != reference.shape
     ]
     if other:
-        raise BadPresses(
+        raise BadFrames(
             f"frames of another size than the one without contact ({reference.shape[1]} x {reference.shape[0]} px): "
             f"{', '.join(other)}; all must be of one camera and one setting"
         )
     if not frames:
-        raise BadPresses("no frame of a press; give at least one, better 5 to 8, beside the one without contact")
+        raise BadFrames("no frame of a press; give at least one, better 5 to 8, beside the one without contact")
 
 
 def _check_order(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
     """The median of the frames shows the gel nearly without contact."""
     few = np.median(np.stack([image for _, image in frames[:MEDIAN_OF]]), axis=0)
     if exchanged(few.astype(np.float32), reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_)):
-        raise BadPresses(
+        raise BadFrames(
             "the frames are like the picture without contact only with red and blue exchanged: give all in one order"
         )
 
 
 def untouched_mean(reference: Image) -> Float64:
-    """(3,) mean colour of a picture without contact. Raises BadPresses for one that is dark or saturated."""
+    """(3,) mean colour of a picture without contact. Raises BadFrames for one that is dark or saturated."""
     try:
         base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
     except UnusableReference as error:
-        raise BadPresses(str(error)) from None
+        raise BadFrames(str(error)) from None
     return base.mean.astype(np.float64)
 
 
@@ -197,7 +194,7 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
         image, reference: (H, W, 3) uint8 RGB with and without contact; `mean` (3,) of the reference.
         ball: radius of the ball [px].
 
-    Raises NoCircle, BadPresses.
+    Raises NoCircle, BadFrames.
     """
     raw = image.astype(np.float64) - reference
     coarse = [_halved(picture) for picture in (image, reference)]
@@ -205,7 +202,7 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
     start = ContactCircle(2 * circle.x + 0.5, 2 * circle.y + 0.5, min(2 * circle.radius, 0.95 * STEEPEST_RIM * ball))
     height, width = reference.shape[:2]
     if not (0 <= start.x < width and 0 <= start.y < height):
-        raise BadPresses("the middle of the contact lies outside the picture")
+        raise BadFrames("the middle of the contact lies outside the picture")
     v, u = np.mgrid[:height, :width].astype(np.float64)
     away = np.hypot(u - start.x, v - start.y)
     lit = (image < SATURATED) & (reference < SATURATED)
@@ -213,12 +210,12 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
     contact = away < start.radius
     dull = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
     if dull > MOST_SATURATED:
-        raise BadPresses(f"{dull:.0%} of the contact is saturated: shorten the exposure or press less")
+        raise BadFrames(f"{dull:.0%} of the contact is saturated: shorten the exposure or press less")
     change = (raw - drift) / mean
     strength = np.abs(_smooth(change, 3.0)).max(axis=2)
     inside, outside = strength[away < 1.5 * start.radius].max(), strength[away > FAR * start.radius].max(initial=0.0)
     if outside > SECOND * inside:
-        raise BadPresses("there is a second contact in the picture; press one ball at a time")
+        raise BadFrames("there is a second contact in the picture; press one ball at a time")
     return Press(name, start, change, drift, lit)
 
 
@@ -237,7 +234,7 @@ def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:
 
 
 def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) -> tuple[list[Press], Refined]:
-    """Refines all circles, leaves outliers out, and refines again. Raises BadPresses when nothing is left."""
+    """Refines all circles, leaves outliers out, and refines again. Raises BadFrames when nothing is left."""
     while found:
         refined = refine([_window(press) for press in found], [press.circle for press in found], ball)
         usual = float(np.median(refined.unexplained))
@@ -254,7 +251,7 @@ def _refined(found: list[Press], refused: list[tuple[str, str]], ball: float) ->
         )
         del found[worst]
     why = "; ".join(f"{name}: {reason}" for name, reason in refused)
-    raise BadPresses(f"no frame can be used. {why}")
+    raise BadFrames(f"no frame can be used. {why}")
 
 
 def _doubts(presses: Sequence[Press], ball: float, mean: Float64, refused: int) -> list[str]:
@@ -282,7 +279,7 @@ def _doubts(presses: Sequence[Press], ball: float, mean: Float64, refused: int) 
     return doubts
 
 
-def _doubts_of(scores: Sequence[Score]) -> list[str]:
+def _doubts_of(scores: Sequence[PressPrediction]) -> list[str]:
     """Presses that the others do not predict."""
     angles = [score.angle for score in scores]
     odd = [s for s in scores if s.angle > max(ODD_ANGLE, ODD * float(np.median(angles)))] if len(scores) > 2 else []
@@ -351,7 +348,7 @@ def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> 
 
 def _score(
     press: Press, gradient: Float64, model: PhotometricModel, inverse: Float64, mean: Float64, reference: Image
-) -> Score:
+) -> PressPrediction:
     """A press, labelled `gradient` (H, W, 2), by a forward model and the inverse's weights that are not of it."""
     shape = press.shape
     v, u = np.mgrid[: shape[0], : shape[1]]
@@ -370,7 +367,7 @@ def _score(
         terms = inverse_features(smooth[where], 2 * at_u[columns], 2 * at_v[rows])
         return float(normal_angle(terms @ inverse, to_normal(gradient[where])).mean())
 
-    return Score(
+    return PressPrediction(
         press.name,
         press.circle,
         error=float(np.abs(predicted - real)[contact].mean()),

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.drift import THIN, DriftFinder, size_of
-from calibration.height.depth import Integrator
-from calibration.height.gradient import GradientModel
+from calibration.height.colour_table import GradientModel
+from calibration.height.integration import Integrator
+from calibration.lens.rectification import seen_box
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
 
@@ -142,14 +143,6 @@ def view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
         for length, cells in ((gel_size[1], grid.rows), (gel_size[0], grid.columns))
     )
     return canonical_image(grid).extended(extra_y * grid.image_scale, extra_x * grid.image_scale)
-
-
-def seen_box(valid: Mask) -> tuple[slice, slice]:
-    """Rows and columns of a view in which gel is seen. Raises ValueError when there are none."""
-    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
-    if len(rows) < 2 or len(columns) < 2:
-        raise ValueError("the camera sees no gel: check corners, size or geometry of the sensor")
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def window(view: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:

@@ -6,9 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.height.gradient import from_model
-from calibration.height.surface import SurfaceFinder, view
-from calibration.normaliser import FrameNormaliser, for_camera, for_pictures, for_simulated
+from calibration.height.colour_table import from_model
+from calibration.height.surface_finder import SurfaceFinder, view
+from calibration.normaliser import (
+    FrameNormaliser,
+    normaliser_for_camera,
+    normaliser_for_pictures,
+    normaliser_for_simulation,
+)
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.scene import GelSurface
@@ -60,7 +65,10 @@ def both(surface: GelSurface, model: SensorModel = MODEL, sent=lambda image: ima
     """The observation that knows the surface, and the one that sees only the picture as it is `sent`."""
     render = Renderer(model, GEL)
     seen: list[TactileObservation] = []
-    for normalise, shown in ((for_simulated(model, GEL, GRID), surface), (for_pictures(model, GEL, GRID), None)):
+    for normalise, shown in (
+        (normaliser_for_simulation(model, GEL, GRID), surface),
+        (normaliser_for_pictures(model, GEL, GRID), None),
+    ):
         normalise.take_reference(frame(sent(render(flat()))))
         seen.append(normalise(frame(sent(render(surface)), shown, model), now=0.0))
         assert normalise.beyond == 0.0
@@ -118,7 +126,7 @@ def test_printed_dots_are_no_dents(surface: GelSurface) -> None:
 
 
 def test_a_frame_that_knows_its_surface_is_believed() -> None:
-    normalise = for_pictures(MODEL, GEL, GRID)
+    normalise = normaliser_for_pictures(MODEL, GEL, GRID)
     render = Renderer(MODEL, GEL)
     normalise.take_reference(frame(render(flat())))
     known = frame(render(ball(0.3e-3)), ball(0.3e-3))
@@ -141,10 +149,10 @@ def test_another_camera_of_the_same_gel() -> None:
 
 
 def test_a_camera_with_a_model_finds_height_and_one_with_corners_does_not() -> None:
-    normalise = for_camera(CameraSensorConfig(driver="camera", source="x", model=MODEL), GEL, GRID)
+    normalise = normaliser_for_camera(CameraSensorConfig(driver="camera", source="x", model=MODEL), GEL, GRID)
     assert normalise.finds_height
     corners = ((0.0, 0.0), (639.0, 0.0), (639.0, 479.0), (0.0, 479.0))
-    blind = for_camera(CameraSensorConfig(driver="camera", source="x", corners=corners), GEL, GRID)
+    blind = normaliser_for_camera(CameraSensorConfig(driver="camera", source="x", corners=corners), GEL, GRID)
     assert not blind.finds_height
     image = np.full((480, 640, 3), 90, dtype=np.uint8)
     blind.take_reference(frame(image))
@@ -152,7 +160,7 @@ def test_a_camera_with_a_model_finds_height_and_one_with_corners_does_not() -> N
 
 
 def test_colours_that_no_slope_has_are_counted() -> None:
-    normalise = for_pictures(MODEL, GEL, GRID)
+    normalise = normaliser_for_pictures(MODEL, GEL, GRID)
     image = Renderer(MODEL, GEL)(flat())
     normalise.take_reference(frame(image))
     normalise(frame(image), now=0.0)
@@ -166,7 +174,7 @@ def test_colours_that_no_slope_has_are_counted() -> None:
 
 def test_a_lamp_that_drifts_is_no_dent() -> None:
     """A sensor that was calibrated has a real lamp: a change that is smooth over all the gel is taken for its drift."""
-    wide = for_pictures(MODEL, GEL, GRID)
+    wide = normaliser_for_pictures(MODEL, GEL, GRID)
     valid = wide._rectify.valid
     slopes = from_model(MODEL)
     found = []
@@ -187,4 +195,4 @@ def test_the_view_is_the_canonical_image_made_wider() -> None:
     assert wide.shape == (160, 160)
     assert view(GRID, (10e-3, 6e-3)).shape == (128, 128)
     with pytest.raises(ValueError, match="canonical image has"):
-        FrameNormaliser(for_pictures(MODEL, GEL, GRID)._rectify, GRID)
+        FrameNormaliser(normaliser_for_pictures(MODEL, GEL, GRID)._rectify, GRID)

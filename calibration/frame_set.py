@@ -1,0 +1,255 @@
+"""Frames of one sensor beside what it shows without contact: a folder of pictures, a video, or an episode's sensor.
+
+A calibration takes its presses from one, a comparison each of its two sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import BadFrames
+from calibration.lens.rectification import from_corners, to_metric
+from calibration.lens.view import BadCorners, Corners, GelView
+from calibration.reference import SATURATED
+from tacsim.interface import SurfaceMap
+from tacsim.optics.grid import PixelGrid
+from tacsim.record.episode import EpisodeError
+from tacsim.record.images import read_image, reference_image
+from tacsim.record.sources import (
+    EPISODES,
+    VIDEOS,
+    episode_frames,
+    episode_meta,
+    list_pictures,
+    only_or_named,
+    unknown_source,
+    video_images,
+)
+
+Image = NDArray[np.uint8]
+
+UNTOUCHED_NAMES = ("background", "reference", "ref", "empty", "no_contact", "bg", "frame0")  # of pictures, best first
+MAX_FRAMES = 500
+MAX_MEMORY = 2 << 30  # of all pictures together [bytes]
+MEDIAN_FRAMES = 5  # so many frames with contacts in different places have the untouched gel as their median
+MAX_SATURATED_SHARE = 0.05  # of a contact
+STALE_CHANGE = 4.0  # median change of the gel outside contact that makes a reference stale [grey levels]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture."""
+
+    name: str
+    image: Image  # (H, W, 3) RGB
+    surface: SurfaceMap | None = None  # known by simulations only
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSet:
+    """The frames of one sensor, all of one size."""
+
+    name: str
+    reference: Image  # (H, W, 3) RGB without contact
+    reference_from: str  # its source in words
+    frames: tuple[Frame, ...]
+    untouched: tuple[Frame, ...] = ()  # more frames without contact
+    estimated: bool = False  # the reference is the median of `frames`
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (self.reference.shape[0], self.reference.shape[1])
+
+    @property
+    def untouched_images(self) -> tuple[Image, ...]:
+        """All pictures without contact, the reference first; none if it is only estimated."""
+        return () if self.estimated else (self.reference, *(frame.image for frame in self.untouched))
+
+
+def read_frame_set(path: Path, reference: Path | None = None, sensor: str = "") -> FrameSet:
+    """Reads a folder of pictures, a video, or an episode's `sensor` (not needed where there is one only).
+
+    `reference`: the picture without contact; None: the episode's own, a picture of the folder with one of
+    UNTOUCHED_NAMES, or the median of all frames. Raises BadFrames.
+    """
+    if path.is_dir():
+        return read_folder(path, reference)
+    try:
+        if path.is_file() and path.suffix.lower() in EPISODES:
+            meta = episode_meta(path)
+            name = only_or_named(list(meta.spec.sensors), sensor, path, "sensor")
+            recorded = (frame for frame, _ in episode_frames(path, name))
+            frames = _limited(path, (Frame(f"step {k}", each.image, each.surface) for k, each in enumerate(recorded)))
+            return _frame_set(path, frames, reference, reference_image(meta.attachments, name))
+        if path.is_file() and path.suffix.lower() in VIDEOS:
+            frames = _limited(path, (Frame(f"frame {k}", image) for k, image in enumerate(video_images(path))))
+            return _frame_set(path, frames, reference, None)
+        raise unknown_source(path)
+    except EpisodeError as error:
+        raise BadFrames(str(error)) from None
+
+
+def read_folder(folder: Path, reference: Path | None = None, max_frames: int = MAX_FRAMES) -> FrameSet:
+    """Reads all pictures of a folder. `reference` as for :func:`read_frame_set`; all other pictures with one of
+    UNTOUCHED_NAMES show no contact either. Raises BadFrames, which names the pictures that cannot be read."""
+    if not folder.is_dir():
+        raise BadFrames(f"{folder} is no folder; name the folder that holds the frames")
+    try:
+        paths = list_pictures(folder)
+        untouched = untouched_among(paths)
+        if reference is None and untouched:
+            reference = untouched[0]
+        given = None if reference is None else reference.resolve()
+        untouched = [path for path in untouched if path.resolve() != given]
+        others = [path for path in paths if path.resolve() != given and path not in untouched]
+        frames = _read(folder, others, max_frames)
+        return _frame_set(folder, frames, reference, None, tuple(_read(folder, untouched, max_frames)))
+    except EpisodeError as error:
+        raise BadFrames(str(error)) from None
+
+
+def untouched_among(paths: Iterable[Path]) -> list[Path]:
+    """Pictures without contact by their names: background.png, background_2.png, ...; frame0.png only with just this
+    name. In the order of UNTOUCHED_NAMES, those with a number last."""
+    rank = {name: place for place, name in enumerate(UNTOUCHED_NAMES)}
+    numbered = UNTOUCHED_NAMES[: rank["frame0"]]
+    found = [
+        path for path in paths
+        if (stem := path.stem.lower()) in rank or stem.rstrip("0123456789").rstrip("_- ") in numbered
+    ]  # fmt: skip
+    return sorted(found, key=lambda path: (rank.get(path.stem.lower(), len(rank)), path))
+
+
+def frame_warnings(
+    image: NDArray[np.floating], reference: NDArray[np.floating], contact: NDArray[np.bool_]
+) -> list[str]:
+    """What is wrong with a frame, in words: its picture and reference (H, W, 3) [grey levels], its contact (H, W)."""
+    found = []
+    if not contact.any():
+        found.append("no contact")
+    else:
+        saturated = float((image[contact] >= SATURATED).any(axis=1).mean())
+        if saturated > MAX_SATURATED_SHARE:
+            found.append(f"saturated: {saturated:.0%} of the contact")
+    change = (image - reference)[~contact]
+    if len(change) and (drift := float(np.abs(np.median(change, axis=0)).max())) > STALE_CHANGE:
+        found.append(f"stale reference: the untouched gel has changed by {drift:.0f} grey levels")
+    return found
+
+
+def metric_picture(view: GelView) -> Callable[[Image], Image]:
+    """Native picture (H, W, 3) -> metric picture of the gel, both uint8."""
+    rectify = to_metric(view)
+    return lambda image: np.rint(rectify(image)).astype(np.uint8)
+
+
+def require_view_size(image_shape: tuple[int, int], view: GelView) -> None:
+    """Raises BadFrames unless pictures of `image_shape` (rows, columns) are those of the view."""
+    if image_shape != view.image_shape:
+        raise BadFrames(
+            f"the frames are {image_shape[1]} x {image_shape[0]} px, the view was calibrated on {view.lens.width} x "
+            f"{view.lens.height} px; use the same sensor and one setting of its camera"
+        )
+
+
+def rectified_by_view(frame_set: FrameSet, view: GelView) -> FrameSet:
+    """The same as metric pictures of the gel. Raises BadFrames for pictures of another size than the view's."""
+    require_view_size(frame_set.shape, view)
+    return _mapped(frame_set, metric_picture(view))
+
+
+def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int, int]) -> FrameSet:
+    """The same seen straight on: the quadrangle of the gel's corners becomes a picture of `shape` (rows, columns).
+
+    Raises BadCorners.
+    """
+    import cv2
+
+    rows, columns = shape
+    grid = PixelGrid(rows, columns, 1.0, -(columns - 1) / 2, -(rows - 1) / 2)
+    rectify = from_corners(corners, (float(columns), float(rows)), frame_set.shape, grid)
+    if not rectify.valid.all():
+        raise BadCorners(f"corners {corners!r} reach beyond the picture; all of the gel must be seen")
+    return _mapped(frame_set, lambda image: np.asarray(cv2.convertScaleAbs(rectify(image)), dtype=np.uint8))
+
+
+def rectified_shape(corners: Corners) -> tuple[int, int]:
+    """Rows and columns of the picture that the quadrangle of a gel's corners fills, without loss of detail."""
+    points = np.array(corners, dtype=np.float64)
+    sides = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    return max(16, round(max(sides[1], sides[3]))), max(16, round(max(sides[0], sides[2])))
+
+
+def _mapped(of: FrameSet, change: Callable[[Image], Image]) -> FrameSet:
+    """All pictures changed."""
+    frames, untouched = (
+        tuple(Frame(frame.name, change(frame.image), frame.surface) for frame in part)
+        for part in (of.frames, of.untouched)
+    )
+    return FrameSet(of.name, change(of.reference), of.reference_from, frames, untouched, of.estimated)
+
+
+def _read(folder: Path, paths: list[Path], max_frames: int) -> list[Frame]:
+    """Raises BadFrames that names every picture which cannot be read."""
+    unreadable: list[str] = []
+
+    def frames() -> Iterator[Frame]:
+        for path in paths:
+            try:
+                yield Frame(path.name, read_image(path))
+            except EpisodeError as error:
+                unreadable.append(str(error))
+
+    read = _limited(folder, frames(), max_frames)
+    if unreadable:
+        raise BadFrames("\n".join(unreadable))
+    return read
+
+
+def _limited(path: Path, frames: Iterable[Frame], max_frames: int = MAX_FRAMES) -> list[Frame]:
+    """All frames; raises BadFrames as soon as they are too many."""
+    read: list[Frame] = []
+    memory = 0
+    for frame in frames:
+        read.append(frame)
+        memory += frame.image.nbytes
+        if len(read) > max_frames or memory > MAX_MEMORY:
+            raise BadFrames(
+                f"{path} holds more than {max_frames} frames, or {MAX_MEMORY >> 30} GiB of them; give a part of it"
+            )
+    return read
+
+
+def _frame_set(
+    path: Path, frames: list[Frame], reference: Path | None, own: Image | None, untouched: tuple[Frame, ...] = ()
+) -> FrameSet:
+    """The reference is the picture that was named, the recording's `own`, or the median."""
+    if not frames:
+        raise BadFrames(f"{path} holds no frame beside the one without contact")
+    estimated = reference is None and own is None
+    if reference is not None:
+        picture, source = read_image(reference), reference.name
+    elif own is not None:
+        picture, source = own, "the recording's own"
+    elif len(frames) >= MEDIAN_FRAMES:
+        picture = np.median(np.stack([frame.image for frame in frames]), axis=0).astype(np.uint8)
+        source = f"median of {len(frames)} frames"
+    else:
+        raise BadFrames(
+            f"{path} holds no frame without contact; name one (--reference; of two sources --reference-a, "
+            f"--reference-b), or call it {UNTOUCHED_NAMES[0]}.png. Without, {MEDIAN_FRAMES} frames with contacts in "
+            "different places are needed, whose median stands for it"
+        )
+    other = next((frame for frame in (*frames, *untouched) if frame.image.shape != picture.shape), None)
+    if other is not None:
+        raise BadFrames(
+            f"{path}: {other.name} is {other.image.shape[1]} x {other.image.shape[0]} px, the picture without contact "
+            f"({source}) {picture.shape[1]} x {picture.shape[0]}; all must be of one camera and one setting"
+        )
+    return FrameSet(str(path), picture, source, tuple(frames), untouched, estimated)

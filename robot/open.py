@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from tacsim.models.sensor import CanonicalGrid
     from tacsim.physics.world import World
     from tacsim.record.replay import ReplayClock, ReplaySensor
-    from tacsim.sim.sensor import SimClock, SimSensor
+    from tacsim.sim.clock import SimClock
+    from tacsim.sim.sensor import SimSensor
 
 RIG_ATTACHMENT = "rig.yaml"  # of an episode: the resolved rig file it was recorded with
 
@@ -143,7 +144,9 @@ def _open_sim(config: RigConfig) -> Rig:
     from calibration.normaliser import normaliser_for_simulation
     from tacsim.compute.threads import map_parallel
     from tacsim.physics.world import make_world
-    from tacsim.sim.sensor import SimArm, SimClock, SimReset
+    from tacsim.sim.arm import SimArm
+    from tacsim.sim.clock import SimClock
+    from tacsim.sim.reset import SimReset
 
     scene = config.scene
     if scene is None:

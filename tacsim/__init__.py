@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from tacsim.config import load_scene as load_scene
     from tacsim.config import load_sensor as load_sensor
     from tacsim.config import load_task as load_task
+    from tacsim.control.approach import NoTouch as NoTouch
     from tacsim.control.contact_signal import contact_signal as contact_signal
     from tacsim.gym.env import TacsimEnv as TacsimEnv
     from tacsim.interface import Action as Action

@@ -60,6 +60,11 @@ def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
     return Pose(position, (turn * rotation(b_from_c)).as_quat())
 
 
+def along_z(pose: Pose, distance: float) -> Pose:
+    """`pose`, moved by `distance` [m] along its own z axis."""
+    return compose(pose, Pose(np.array([0.0, 0.0, distance])))
+
+
 def inverse(a_from_b: Pose) -> Pose:
     """b_from_a."""
     back = rotation(a_from_b).inv()

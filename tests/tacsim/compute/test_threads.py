@@ -69,7 +69,7 @@ def test_a_wrong_number_of_threads_is_refused(wanted: str, monkeypatch: pytest.M
 FORKED = """
 import multiprocessing
 from functools import partial
-from tacsim import threads
+from tacsim.compute import threads
 threads.cores = lambda: 2
 def work():
     assert threads.map_parallel([partial(abs, -1), partial(abs, -2)]) == [1, 2]

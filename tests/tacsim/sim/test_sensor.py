@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacsim.control.approach import NoTouch
 from tacsim.interface import Action, Pose, SensorSpec
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
 from tacsim.physics.world import MoveStats
-from tacsim.sim.sensor import TOUCH_TOLERANCE, NoTouch, SimArm, SimClock, SimReset, SimSensor, approach
+from tacsim.sim.arm import SimArm
+from tacsim.sim.clock import SimClock
+from tacsim.sim.reset import TOUCH_TOLERANCE, SimReset, approach_force
+from tacsim.sim.sensor import SimSensor
 
 
 def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
@@ -20,7 +24,7 @@ def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
 
 @pytest.mark.parametrize("touch_force", [0.01, 0.05, 0.3, 3.0, 10.0])
 def test_approach_ends_in_gentle_contact_on_both_gels(spring_world: Any, touch_force: float) -> None:
-    stats = approach(spring_world, touch_force)
+    stats = approach_force(spring_world, touch_force)
     forces = [-spring_world.wrench(name)[2] for name in spring_world.sensors]
     assert all(touch_force <= force <= touch_force * (1 + TOUCH_TOLERANCE) for force in forces)
     assert spring_world.worst <= touch_force * (1 + TOUCH_TOLERANCE)  # what pressed harder was taken back
@@ -37,14 +41,14 @@ def test_contact_that_begins_at_a_distance_is_gentle_too(spring_world: Any, monk
         return float(max(0.0, (10.6e-3 - gap) * 2e3))
 
     monkeypatch.setattr(type(spring_world), "force", property(reach))
-    approach(spring_world, 0.05)
+    approach_force(spring_world, 0.05)
     assert 0.05 <= spring_world.force <= 0.06
     assert spring_world.worst <= 0.06
 
 
 def test_approach_moves_both_sensors_alike(spring_world: Any) -> None:
     before = {name: spring_world.pose(name).position[2] for name in spring_world.sensors}
-    approach(spring_world, 0.05)
+    approach_force(spring_world, 0.05)
     moved = {name: spring_world.pose(name).position[2] - before[name] for name in spring_world.sensors}
     assert moved["lower"] > 0.4e-3
     assert moved["lower"] == pytest.approx(-moved["upper"], abs=1e-9)
@@ -53,7 +57,7 @@ def test_approach_moves_both_sensors_alike(spring_world: Any) -> None:
 def test_approach_gives_up_where_nothing_is(spring_world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(spring_world), "force", 0.0)
     with pytest.raises(NoTouch, match=r"normal force 0 N, 0.05 N wanted, after 80 moves"):
-        approach(spring_world, 0.05)
+        approach_force(spring_world, 0.05)
 
 
 def test_approach_gives_up_at_a_force_that_jumps(spring_world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,7 +67,7 @@ def test_approach_gives_up_at_a_force_that_jumps(spring_world: Any, monkeypatch:
 
     monkeypatch.setattr(type(spring_world), "force", property(jump))
     with pytest.raises(NoTouch, match="settling tolerance"):
-        approach(spring_world, 0.05)
+        approach_force(spring_world, 0.05)
 
 
 def make_arms(world: Any, longest: float = 1.0) -> tuple[SimClock, SimArm, SimArm]:
@@ -204,7 +208,7 @@ def test_a_dynamic_clock_gives_every_period_its_own_time(spring_world: Any) -> N
     """Also one in which nothing is commanded: what moves goes on moving."""
     clock = SimClock(spring_world, 0.1, motion="dynamic")
     clock.tick()
-    clock.target("lower", shifted(Pose(), z=1e-4), limited=False)
+    clock.command("lower", shifted(Pose(), z=1e-4), limited=False)
     clock.tick()
     assert spring_world.durations == [0.1, 0.1]
     assert clock.now() == pytest.approx(0.2)
@@ -212,7 +216,7 @@ def test_a_dynamic_clock_gives_every_period_its_own_time(spring_world: Any) -> N
 
 def test_a_flowing_clock_waits_for_rest_once_nothing_is_commanded(spring_world: Any) -> None:
     clock = SimClock(spring_world, 0.1, motion="flowing")
-    clock.target("lower", shifted(Pose(), z=1e-4), limited=False)
+    clock.command("lower", shifted(Pose(), z=1e-4), limited=False)
     clock.tick()
     assert clock.diagnostics()["settled"] == 0.0
     clock.tick()
@@ -238,7 +242,7 @@ def test_a_simulated_arm_stays_inside_its_workspace_and_away_from_the_other(spri
     aside = upper.command(shifted(start, x=0.02))
     assert aside is not None
     assert aside.position[0] == pytest.approx(0.01)  # the wall
-    clock.forget()
+    clock.drop_commands()
     gap = float(start.position[2]) - 8e-3
     assert gap > 0
     near = [lower.command(shifted(Pose(), z=0.8 * gap)), upper.command(shifted(start, z=-0.8 * gap))]
@@ -251,7 +255,7 @@ def test_a_simulated_arm_stays_inside_its_workspace_and_away_from_the_other(spri
 
 def test_a_simulated_arm_that_feels_too_much_follows_nothing(spring_world: Any) -> None:
     clock, lower, upper = guarded(spring_world, force=3.0)
-    approach(spring_world, 4.0)
+    approach_force(spring_world, 4.0)
     with pytest.raises(LimitExceeded, match=r"arm of 'upper' felt more than limits.force .* of 3 N"):
         upper.command(shifted(spring_world.pose("upper"), z=-1e-4))
     moved = len(spring_world.moves)

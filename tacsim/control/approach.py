@@ -1,0 +1,34 @@
+"""Approaches until touch, on any rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+
+class NoTouch(RuntimeError):
+    """An approach met nothing, or found no gentle contact."""
+
+
+def approach(
+    touches: Callable[[], bool], advance: Callable[[float], None], step: float, longest: float, advice: str
+) -> float:
+    """Moves ahead in equal steps until something is touched. Returns the distance travelled [m].
+
+    The law of all sensors that cannot take a motion back; a simulated world can (tacsim.sim.reset.approach_force).
+
+    Args:
+        touches: whether the gels touch by now; asked before every step.
+        advance: goes this far [m] from where the approach began, and returns once the gels were seen there.
+        step: between two questions [m].
+        longest: the approach ends here [m].
+        advice: what a person may do about it when nothing was touched.
+
+    Raises NoTouch at the end of the approach, and what `touches` and `advance` raise.
+    """
+    distance = 0.0
+    while not touches():
+        distance += step
+        if distance > longest:
+            raise NoTouch(f"no touch after an approach of {1e3 * longest:.3g} mm; {advice}")
+        advance(distance)
+    return distance

@@ -1,0 +1,107 @@
+"""One frame of a simulated world as an arm."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from tacsim import pose as se3
+from tacsim.interface import ArmState, FloatArray, Pose
+from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_step
+from tacsim.models.hardware import ArmLimits
+from tacsim.physics.world import World
+from tacsim.sim.clock import SimClock
+
+
+class SimArm:
+    """Carries one frame of the world (a sensor, or "indenter") exactly to its commanded pose.
+
+    Args:
+        max_step, max_turn: longest motion of one control period [m, rad]; longer ones are shortened, and counted.
+        limits: guards the arm as a real one is guarded (robot.arm.ur), by the same functions: targets are shortened at
+            the faces of its workspace, and too much force or torque stops it. None: no guard.
+        keep_out: frames to stay away from, and how far [m]; targets are shortened at these spheres.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        clock: SimClock,
+        frame: str,
+        max_step: float,
+        max_turn: float,
+        limits: ArmLimits | None = None,
+        keep_out: Iterable[tuple[str, float]] = (),
+    ) -> None:
+        self._world, self._clock, self._frame = world, clock, frame
+        self._max_step, self._max_turn = max_step, max_turn
+        self._limits, self._keep_out = limits, tuple(keep_out)
+        self._region = None if limits is None else limits.region
+
+    def state(self, at: float | None = None) -> ArmState:
+        """The state now: simulated pictures and arms are of one instant, so `at` makes no difference."""
+        return ArmState(
+            pose=self._world.pose(self._frame),
+            twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
+            wrench=self._wrench(),
+            joints=None,
+            time=self._clock.now(),
+        )
+
+    def _wrench(self) -> FloatArray:
+        """(6,) on the sensor; on the indenter, the reaction of all sensors. About its origin, in its axes [N, N m]."""
+        world = self._world
+        if self._frame in world.sensors:
+            return np.array(world.wrench(self._frame), dtype=np.float64)
+        here = world.pose(self._frame)
+        parts = [
+            se3.transform_wrench(se3.relative(here, world.pose(name)), world.wrench(name)) for name in world.sensors
+        ]
+        reaction: FloatArray = -np.sum(parts, axis=0)
+        return reaction
+
+    def command(self, target: Pose | None) -> Pose | None:
+        """Takes effect at the next tick; None holds. Returns the pose after the limits. Raises LimitExceeded."""
+        self._check_wrench()
+        if target is None:
+            return None
+        now, allowed = self._world.pose(self._frame), target
+        if self._region is not None or self._keep_out:
+            allowed, _ = clip_to_region(target, now, self._region, self._spheres())
+        allowed = limit_step(allowed, now, self._max_step, self._max_turn)
+        self._clock.command(self._frame, allowed, limited=allowed is not target)
+        return allowed
+
+    def stop(self) -> None:
+        self._clock.drop_commands()
+
+    def recover(self) -> None:
+        """Drops its command; an arm that feels too much stays stopped as long as it does."""
+        self.stop()
+
+    def _spheres(self) -> list[tuple[FloatArray, float]]:
+        """Around the frames to stay away from: where they are, and where they are commanded to."""
+        return [
+            (pose.position, distance)
+            for frame, distance in self._keep_out
+            for pose in (self._world.pose(frame), self._clock.commanded(frame))
+            if pose is not None
+        ]
+
+    def _check_wrench(self) -> None:
+        limits = self._limits
+        if limits is None:
+            return
+        wrench = self._wrench()
+        if exceeds_wrench(wrench, limits.force, limits.torque):
+            self.stop()
+            force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1)
+            raise LimitExceeded(
+                f"arm of '{self._frame}' felt more than limits.force or limits.torque and stopped ({force:.1f} of "
+                f"{limits.force:g} N, {torque:.2f} of {limits.torque:g} N m); begin a new episode, or move the other "
+                "sensor away"
+            )
+
+    def close(self) -> None:
+        """Nothing is held open."""

@@ -1,0 +1,84 @@
+"""Simulated time: each period drives the world's frames to where the arms were commanded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.rig import SimMotion
+from tacsim.physics.world import MoveStats, World
+
+
+class SimClock:
+    """Simulated time. `tick` drives every frame to its commanded pose and advances time by one period.
+
+    `motion`: "settled": each period ends at rest; "flowing": frames pass their targets at speed, and the world comes to
+    rest once no command is given any more; "dynamic": each period takes its own time, with true inertia
+    (tacsim.physics.motion.inertia).
+    `version` counts the states of the world, so that each state is rendered once.
+    """
+
+    def __init__(self, world: World, period: float, motion: SimMotion = "settled") -> None:
+        self._world = world
+        self._period = period
+        self._motion = motion
+        self._targets: dict[str, Pose] = {}
+        self._limited: dict[str, bool] = {}  # by frame: a guard changed the last command
+        self._time = 0.0
+        self.version = 0
+        self.stats: MoveStats | None = None  # of the last motion
+        self.velocities: Mapping[
+            str, FloatArray
+        ] = {}  # (6,) by frame: mean of the last period, world axes [m/s, rad/s]
+
+    @property
+    def period(self) -> float:
+        return self._period
+
+    def now(self) -> float:
+        return self._time
+
+    def command(self, frame: str, pose: Pose, limited: bool) -> None:
+        """Sets the pose of `frame` at the end of the period; `limited`: a guard has changed what was asked."""
+        self._targets[frame] = pose
+        self._limited[frame] = limited
+
+    def commanded(self, frame: str) -> Pose | None:
+        """The pose of `frame` at the end of this period; None if nothing was commanded."""
+        return self._targets.get(frame)
+
+    def drop_commands(self) -> None:
+        """Forgets the commands of this period."""
+        self._targets = {}
+
+    def tick(self) -> None:
+        """One period. A world at rest without commands is left as it is. Raises SimulationDiverged."""
+        targets, self._targets = self._targets, {}
+        before = {frame: self._world.pose(frame) for frame in targets}
+        if self._motion == "dynamic":
+            self.stats = self._world.move(targets, duration=self._period)
+        elif targets or (self.stats is not None and not self.stats.settled):
+            self.stats = self._world.move(targets, flow=self._motion == "flowing")
+        elif self.stats is not None:
+            self.stats = replace(self.stats, substeps=0, hold=0)
+        self.velocities = {
+            frame: se3.difference(old, self._world.pose(frame)) / self._period for frame, old in before.items()
+        }
+        self._time += self._period
+        self.version += 1
+
+    def restart(self, stats: MoveStats | None = None) -> None:
+        """Time zero, in a world whose state was restored."""
+        self._time, self._targets, self._limited, self.velocities, self.stats = 0.0, {}, {}, {}, stats
+        self.version += 1
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """The MoveStats of the last motion, and `shortened`: how many commands the limits changed."""
+        stats = self.stats
+        if stats is None:
+            return {}
+        return {name: float(value) for name, value in asdict(stats).items()} | {
+            "shortened": float(sum(self._limited.values()))
+        }

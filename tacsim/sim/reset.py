@@ -1,0 +1,157 @@
+"""How a simulated episode begins: the initial state of the world, then the approach to gentle contact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.control.approach import NoTouch
+from tacsim.interface import FloatArray, Pose, TactileFrame, Truth
+from tacsim.physics.world import MoveStats, World
+from tacsim.sim.clock import SimClock
+from tacsim.sim.sensor import SimSensor
+
+CLEARANCE = 0.05e-3  # gap that the first, fast part of an approach leaves [m]
+FIRST_STEP = 0.1e-3  # of the slow part [m]
+TOUCH_TOLERANCE = 0.2  # the touch force may be exceeded by this fraction
+MOST_MOVES = 80  # of one approach
+SMALLEST_STEP = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
+
+
+class SimReset:
+    """Starts a simulated episode: restores the world's initial state, then approaches until gentle contact.
+
+    Args:
+        touch_force: normal force that ends the approach [N]; None leaves the gels clear.
+        placement: the gels start at most this far beside the body in world x and y, drawn from the seed [m].
+    """
+
+    def __init__(
+        self,
+        world: World,
+        clock: SimClock,
+        sensors: Mapping[str, SimSensor],
+        touch_force: float | None,
+        placement: float = 0.0,
+    ) -> None:
+        self._world, self._clock, self._sensors = world, clock, sensors
+        self._touch_force, self._placement = touch_force, placement
+        self._initial = world.snapshot()
+        self._offset = np.zeros(2)
+        # The last approach: its offset, the state and the move it ended with. The same start gives the same end.
+        self._touched: tuple[FloatArray, Mapping[str, NDArray[Any]], MoveStats | None] | None = None
+
+    def clear(self, seed: int) -> Mapping[str, TactileFrame]:
+        self._world.restore(self._initial)
+        self._offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
+        if self._offset.any():
+            shift = np.append(self._offset, 0.0)
+            poses = {name: self._world.pose(name) for name in self._world.sensors}
+            self._world.move({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
+        self._clock.restart()
+        for sensor in self._sensors.values():
+            sensor.restart(seed)
+        return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}
+
+    def touch(self) -> None:
+        """Raises NoTouch when no gentle contact is found."""
+        if self._touch_force is None:
+            return
+        if self._touched is None or not np.array_equal(self._touched[0], self._offset):
+            stats = approach_force(self._world, self._touch_force)
+            self._touched = (self._offset, self._world.snapshot(), stats)
+        else:
+            self._world.restore(self._touched[1])
+        self._clock.restart(self._touched[2])
+
+
+def approach_force(world: World, touch_force: float) -> MoveStats | None:
+    """Moves all sensors along their own z until the least normal force is at least `touch_force` [N].
+
+    A fast part closes the known gaps; small steps follow. A step after which a force exceeds
+    touch_force * (1 + TOUCH_TOLERANCE) is undone by restoring the world, so that the body keeps no trace of it, and its
+    end bounds the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
+    """
+    most = touch_force * (1 + TOUCH_TOLERANCE)
+    stats = _close_gaps(world, most)
+    here, bound = 0.0, math.inf  # travelled by each sensor; where the force is too large [m]
+    tried = [(here, _least_force(world))]  # (distance, force) of every state tried
+    step = 0.0
+    for _ in range(MOST_MOVES):
+        if tried[-1][0] == here and tried[-1][1] >= touch_force:
+            return stats
+        step = _next_distance(tried, here, bound, touch_force * (1 + TOUCH_TOLERANCE / 2)) - here
+        if step < SMALLEST_STEP:
+            break
+        before = world.snapshot()
+        stats = _advance(world, dict.fromkeys(world.sensors, step))
+        tried.append((here + step, _least_force(world)))
+        if tried[-1][1] > most:
+            world.restore(before)
+            bound = here + step
+        else:
+            here += step
+    raise NoTouch(
+        f"approach found no gentle contact: normal force {tried[-1][1]:.4g} N, {touch_force:.4g} N wanted, after "
+        f"{len(tried) - 1} moves, the last by {step:.3g} m. Is there a body between the gels, and is touch_force "
+        "within what the scene's settling tolerance resolves?"
+    )
+
+
+def _next_distance(tried: list[tuple[float, float]], here: float, bound: float, wanted: float) -> float:
+    """The distance [m] at which the force `wanted` [N] is expected, between `here` and `bound`: on the secant through
+    the last two states in contact. With one such state, contact is taken to begin half-way to it."""
+    farthest = min(bound, here + FIRST_STEP)
+    contacts = [(distance, force) for distance, force in tried if force > 0][-2:]
+    if not contacts:
+        return farthest
+    x, force = contacts[-1]
+    if len(contacts) == 2 and (force - contacts[0][1]) * (x - contacts[0][0]) > 0:
+        aim = x + (wanted - force) * (x - contacts[0][0]) / (force - contacts[0][1])
+    else:
+        aim = here + (x - here) * (0.5 + 0.5 * wanted / force) if force > wanted else farthest
+    margin = 0.05 * (farthest - here)
+    return min(max(aim, here + margin), farthest if bound > farthest else farthest - margin)
+
+
+def _close_gaps(world: World, most: float) -> MoveStats | None:
+    """Drives each sensor to CLEARANCE before the body's nearest particle, if there is a body and a gap.
+
+    Undone if the force exceeds `most` [N]: on a shared grid, contact begins at a distance.
+    """
+    truth = world.truth()
+    if truth is None:
+        return None
+    gaps = {name: _gap(truth, world.pose(name)) - CLEARANCE for name in world.sensors}
+    wanted = {name: gap for name, gap in gaps.items() if gap > 0}
+    if not wanted:
+        return None
+    before = world.snapshot()
+    stats = _advance(world, wanted)
+    if _least_force(world) > most:
+        world.restore(before)
+        return None
+    return stats
+
+
+def _gap(truth: Truth, sensor: Pose) -> float:
+    """From the gel's rest surface to the nearest face of the body, along the sensor's z [m]."""
+    points = truth.points.astype(np.float64)
+    radius = 0.5 * (truth.height - float(np.ptp(points[:, 2])))
+    axis = se3.rotation(sensor).as_matrix()[:, 2]
+    return float(((points - sensor.position) @ axis).min()) - radius
+
+
+def _advance(world: World, steps: Mapping[str, float]) -> MoveStats:
+    """Moves each named sensor along its own z by its step [m]."""
+    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()})
+
+
+def _least_force(world: World) -> float:
+    """Smallest normal force over the sensors, positive when pressed [N]."""
+    return min(-float(world.wrench(name)[2]) for name in world.sensors)

@@ -51,7 +51,7 @@ def second_commander(repeat: int) -> list[Measurement]:
         except DeviceBusyError:
             told = time.monotonic()
         records = watcher.records()
-        disturbed = bool((records["status"][records["beat"] > asked] != ArmStatus.OK).any())
+        disturbed = bool((records["status"][records["written"] > asked] != ArmStatus.OK).any())
         until(lambda: arm.arrived(target), "arrival")
         return {"told": told - asked, "disturbed": float(disturbed)}
 
@@ -199,7 +199,7 @@ def keep_out(repeat: int) -> list[Measurement]:
         faults = []
         for watcher, status in ((left_watcher, ArmStatus.PARTNER_STOPPED), (right_watcher, ArmStatus.PROTECTIVE_STOP)):
             records = watcher.records()
-            faults.append(float(records[records["status"] == status][0]["beat"]))
+            faults.append(float(records[records["status"] == status][0]["written"]))
         until(lambda: still(left_mock.faults.state()) and right_mock.faults.state().rests, "rest")
         right.recover()
         left.recover()

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.reliability.repeated import Disturbed
 from robot.arm import shared_ring
-from robot.arm.channel import HISTORY, Link
+from robot.arm.channel import HISTORY, Channel
 from robot.arm.shared_ring import Record
 from robot.arm.ur import URArm
 from robot.common.kinematics import Kinematics
@@ -100,7 +100,7 @@ class Watcher:
 
     def __init__(self, name: str) -> None:
         self._segment = shared_ring.attach(shared_ring.segment_name(os.getpid(), name))
-        self.link: Link | None = Link(self._segment)
+        self.link: Channel | None = Channel(self._segment)
 
     def newest(self) -> Record:
         assert self.link is not None

@@ -33,7 +33,7 @@ from benchmarks.reliability.rehearsal import (
     until,
 )
 from benchmarks.reliability.repeated import COUNT, Disturbed, Figure, repeated
-from robot.arm.channel import STATE, ArmStatus, Kind, command
+from robot.arm.channel import STATE, ArmStatus, CommandKind, command_record
 from robot.arm.servo import HARD
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import matrix
@@ -70,9 +70,9 @@ def box_wire(repeat: int) -> list[Measurement]:
             assert watcher.link is not None
             since = mock.faults.received().last
             for row in hostile(np.random.default_rng(7), WIRED, bad=0.02, run=500):
-                watcher.link.commands.write(command(time.monotonic(), Kind.TARGET, row))
+                watcher.link.commands.write(command_record(time.monotonic(), CommandKind.TARGET, row))
                 time.sleep(5e-4)
-            watcher.link.commands.write(command(time.monotonic(), Kind.HOLD))
+            watcher.link.commands.write(command_record(time.monotonic(), CommandKind.HOLD))
             until(lambda: sound(arm) and arm.at_rest(), "rest")
             page = mock.faults.received(since)
         if page.lost:
@@ -147,7 +147,7 @@ def force(repeat: int) -> list[Measurement]:
         return {
             "approach commands": float((sensor_path(joints[late])[:, 2] < deepest).sum()),
             "standstill": 1e3 * float(rest["stamp"] - first["stamp"]),
-            "status published": 1e3 * float(told["beat"] - first["time"]),
+            "status published": 1e3 * float(told["written"] - first["time"]),
             "overshoot": max(0.0, float(felt.max()) - limit),
         }
 
@@ -203,7 +203,7 @@ def late_policy(repeat: int) -> list[Measurement]:
             time.sleep(0.1)
             until(lambda: arm.status() == ArmStatus.HOLD, "hold")
             records = watcher.records()
-            holds = records[(records["status"] == ArmStatus.HOLD) & (records["beat"] > asked + 0.1)]
+            holds = records[(records["status"] == ArmStatus.HOLD) & (records["written"] > asked + 0.1)]
             until(arm.at_rest, "rest")
             time.sleep(0.1)
             mark = mock.faults.received().last
@@ -212,7 +212,7 @@ def late_policy(repeat: int) -> list[Measurement]:
             _, joints = servo_targets(mock.faults.received(mark).entries)
         steps = np.linalg.norm(np.diff(sensor_path(joints), axis=0), axis=1)
         return {
-            "hold": 1e3 * (float(holds[0]["beat"]) - asked),
+            "hold": 1e3 * (float(holds[0]["written"]) - asked),
             "first step": 100 * float(steps[steps > 1e-9][0]) / (arm.config.limits.acceleration * PERIOD**2),
         }
 

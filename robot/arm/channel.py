@@ -1,4 +1,4 @@
-"""What the driver of an arm and its worker process tell each other: orders at the start, then records, both ways."""
+"""What the driver of an arm and its worker process exchange: a configuration at the start, then records both ways."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from enum import IntEnum
 import numpy as np
 
 from robot.arm import shared_ring
+from robot.common.tcp import ArmFrames
 from robot.errors import (
     DeviceError,
     DeviceNotConnectedError,
@@ -20,23 +21,23 @@ from robot.errors import (
 from tacsim.interface import FloatArray
 
 HISTORY = 1024  # state records that are kept: two seconds
-COMMANDS = 8
-TOUCHES = 8
+COMMAND_SLOTS = 8
+TACTILE_SLOTS = 8
 
 
 class ArmStatus(IntEnum):
-    """How an arm is. What stands below FORCE_LIMIT ends by itself; the rest lasts until `recover`."""
+    """What an arm is doing. States below FORCE_LIMIT end by themselves; the others are faults, until `recover`."""
 
     CONNECTING = 0
     OK = 1  # follows its target
-    HOLD = 2  # stands: nothing was asked, or stop() was, or no action came within action_timeout
-    OUT_OF_REACH = 3  # stands, or slows down: joints, their speed or a singularity keep it from its target
-    WAITING = 4  # stands: the other arm of a keep-out is not connected, or not well
-    BLIND = 5  # stands: what its sensors showed last is older than observation_timeout
+    HOLD = 2  # at rest: no command yet, stop(), or no action within action_timeout
+    OUT_OF_REACH = 3  # at rest or braking: a joint limit or a singularity blocks the path to the target
+    WAITING = 4  # at rest: the other arm of a keep-out is not connected, or has a fault
+    OBSERVATION_STALE = 5  # at rest: the last observation is older than observation_timeout
     FORCE_LIMIT = 10
     WORKSPACE_LIMIT = 11
     KEEP_OUT = 12  # came too near to the other arm
-    PARTNER_STOPPED = 13  # the other arm of a keep-out stopped, or cannot be seen
+    PARTNER_STOPPED = 13  # the other arm of a keep-out stopped, or its state is unknown
     GEL_LIMIT = 14  # its gel was pressed or dragged too far
     PROGRAM_STOPPED = 20  # on the controller: its watchdog, the pendant, or power
     PROTECTIVE_STOP = 21
@@ -65,18 +66,19 @@ _TEXTS = {
     ArmStatus.OK: "follows its target",
     ArmStatus.HOLD: "stands still: no fresh action",
     ArmStatus.OUT_OF_REACH: "cannot go on towards its target: a joint, its speed or a singularity forbids it",
-    ArmStatus.WAITING: "stands still: the other arm of a keep-out is not connected, or not well",
-    ArmStatus.BLIND: "stands still: the last observation is older than observation_timeout; see the cameras",
+    ArmStatus.WAITING: "stands still: the other arm of a keep-out is not connected, or has a fault",
+    ArmStatus.OBSERVATION_STALE: "stands still: the last observation is older than observation_timeout; "
+    "check the cameras",
     ArmStatus.FORCE_LIMIT: "felt more than limits.force or limits.torque and stopped; look why, then recover()",
     ArmStatus.WORKSPACE_LIMIT: "is outside its workspace and stopped; bring it back with the pendant, then recover()",
     ArmStatus.KEEP_OUT: "came too near to the other arm and stopped; look why, then recover()",
     ArmStatus.PARTNER_STOPPED: "stopped because the other arm did; recover() that one, then this",
     ArmStatus.GEL_LIMIT: "pressed or dragged its gel farther than limits.depth or limits.shear and stopped; move it "
     "away, then recover()",
-    ArmStatus.PROGRAM_STOPPED: "has no running program any more (watchdog, pendant or power); look why, then recover()",
+    ArmStatus.PROGRAM_STOPPED: "has no running program (watchdog, pendant or power); look why, then recover()",
     ArmStatus.PROTECTIVE_STOP: "made a protective stop; look why, then recover()",
     ArmStatus.EMERGENCY_STOP: "has an emergency or safeguard stop; a person must release it, then recover()",
-    ArmStatus.LINK_LOST: "sends no packages any more; the controller stops by its own watchdog; see the cable, then "
+    ArmStatus.LINK_LOST: "sends no packages any more; the controller stops by its own watchdog; check the cable, then "
     "recover()",
     ArmStatus.WORKER_DEAD: "lost its worker process; the controller stops by its watchdog; recover() starts another",
     ArmStatus.CLOSED: "is closed",
@@ -92,7 +94,7 @@ _ERRORS: dict[ArmStatus, type[DeviceError]] = {
 }
 
 
-class Kind(IntEnum):
+class CommandKind(IntEnum):
     """What a command asks for."""
 
     HOLD = 0
@@ -101,37 +103,37 @@ class Kind(IntEnum):
     CLOSE = 3
 
 
-# One controller package and what the worker makes of it. Written each period, and once more when a fault is found.
+# One controller package and the worker's judgement of it. Written every period, and again as soon as a fault is found.
 STATE = np.dtype(
     [
-        ("time", np.float64),  # when the package was first seen, monotonic [s]
-        ("beat", np.float64),  # when the record was written [s]
-        ("stamp", np.float64),  # the controller's own clock [s]
+        ("time", np.float64),  # when the package was read, monotonic clock [s]
+        ("written", np.float64),  # when this record was written, monotonic clock [s]
+        ("stamp", np.float64),  # time on the controller's own clock [s]
         ("joints", np.float64, 6),  # [rad]
         ("joint_speeds", np.float64, 6),  # [rad/s]
         ("tcp_pose", np.float64, 6),  # base axes, position and rotation vector [m, rad]
         ("tcp_speed", np.float64, 6),  # [m/s, rad/s]
         ("tcp_force", np.float64, 6),  # [N, N m]
         ("position", np.float64, 3),  # of the sensor in the world [m]
-        ("stop", np.float64, 3),  # where the sensor would come to rest [m]
-        ("target", np.float64, 3),  # where the servo target is now [m]
+        ("stopping_point", np.float64, 3),  # where the sensor would come to rest if it braked now [m]
+        ("target", np.float64, 3),  # position of the servo target [m]
         ("top_speed", np.float64),  # limits.speed [m/s]
         ("status", np.int64),
         ("resting", np.int64),  # the servo target is at rest
-        ("taken", np.int64),  # commands taken so far
-        ("zeroed", np.int64),  # wrench zeroings done by this worker
-        ("rejected", np.int64),  # commands that were no poses
-        ("shortened", np.int64),  # targets that were cut at the workspace
-        ("busy_until", np.float64),  # the worker waits for the controller, at the latest until then [s]
+        ("commands_read", np.int64),  # commands read so far
+        ("zeroed", np.int64),  # how often this worker has zeroed the wrench
+        ("rejected", np.int64),  # commands that were not poses
+        ("shortened", np.int64),  # targets clipped to the workspace
+        ("busy_until", np.float64),  # the worker waits for the controller until then at most [s]
         ("cycles", np.int64),  # periods of this worker
-        ("overruns", np.int64),  # periods that were missed
-        ("period", np.float64, 3),  # median, 99th percentile, maximum of the last ones [s]
+        ("overruns", np.int64),  # missed periods
+        ("period", np.float64, 3),  # median, 99th percentile and maximum of the last 500 [s]
     ]
 )
 COMMAND = np.dtype([("time", np.float64), ("kind", np.int64), ("pose", np.float64, 7)])  # position, quaternion x y z w
-# What the sensors show, told by the driver after every observation: when the oldest picture was exposed, and how deep
-# and how far the arm's own gel is pressed and dragged (NaN: it cannot tell). A `seen` of NaN: not watched by now.
-TOUCH = np.dtype([("seen", np.float64), ("depth", np.float64), ("shear", np.float64)])
+# What the driver reports after every observation: exposure time of the oldest picture (NaN: do not guard by pictures
+# now), indentation depth and shear of the arm's own gel (NaN: unknown).
+TACTILE = np.dtype([("exposed", np.float64), ("depth", np.float64), ("shear", np.float64)])
 
 
 @dataclass(frozen=True)
@@ -143,15 +145,15 @@ class Partner:
 
 
 @dataclass(frozen=True)
-class Orders:
-    """All that a worker is told, in plain numbers: it loads neither pydantic nor SciPy and so is ready soon."""
+class WorkerConfig:
+    """Everything a worker needs, in plain numbers: it imports neither pydantic nor SciPy, so it starts quickly."""
 
     name: str
     host: str
     model: str
-    refused_serial: str | None  # of a controller that is a mock, while the arm is to be a real one
+    refused_serial: str | None  # serial number of a mock controller; set for a real arm
     realtime: bool  # ask for real-time priority
-    parent: int  # process number of the driver
+    parent: int  # process id of the driver
     segment: str
     world_from_base: list[list[float]]
     flange_from_tool: list[list[float]]
@@ -179,31 +181,36 @@ class Orders:
     gain: float
     partners: list[Partner]
 
+    @property
+    def frames(self) -> ArmFrames:
+        fixed = (self.world_from_base, self.flange_from_tool, self.tool_from_sensor)
+        return ArmFrames(*map(np.array, fixed))
+
     def to_json(self) -> str:
         return json.dumps(asdict(self))
 
     @staticmethod
-    def from_json(text: str) -> Orders:
+    def from_json(text: str) -> WorkerConfig:
         given = json.loads(text)
-        return Orders(**{**given, "partners": [Partner(**partner) for partner in given["partners"]]})
+        return WorkerConfig(**{**given, "partners": [Partner(**partner) for partner in given["partners"]]})
 
 
-class Link:
-    """The shared memory of one arm: states from its worker; commands, and what its sensors show, from its driver."""
+class Channel:
+    """The shared memory of one arm: states from its worker; commands and tactile reports from its driver."""
 
     _STATES = shared_ring.Ring.size(STATE, HISTORY)
-    _BOTH = _STATES + shared_ring.Ring.size(COMMAND, COMMANDS)
-    SIZE = _BOTH + shared_ring.Ring.size(TOUCH, TOUCHES)
+    _BOTH = _STATES + shared_ring.Ring.size(COMMAND, COMMAND_SLOTS)
+    SIZE = _BOTH + shared_ring.Ring.size(TACTILE, TACTILE_SLOTS)
 
     def __init__(self, segment: shared_ring.Segment) -> None:
         view = memoryview(segment.memory)
         self.states = shared_ring.Ring(view[: self._STATES], STATE, HISTORY)
-        self.commands = shared_ring.Ring(view[self._STATES : self._BOTH], COMMAND, COMMANDS)
-        self.touches = shared_ring.Ring(view[self._BOTH :], TOUCH, TOUCHES)
+        self.commands = shared_ring.Ring(view[self._STATES : self._BOTH], COMMAND, COMMAND_SLOTS)
+        self.tactile = shared_ring.Ring(view[self._BOTH :], TACTILE, TACTILE_SLOTS)
 
 
-def command(time: float, kind: Kind, pose: FloatArray | None = None) -> shared_ring.Record:
-    """A command record; `pose` (7,) for Kind.TARGET."""
+def command_record(time: float, kind: CommandKind, pose: FloatArray | None = None) -> shared_ring.Record:
+    """A command record; `pose` (7,) for CommandKind.TARGET."""
     record = np.zeros((), COMMAND)
     record["time"], record["kind"] = time, kind
     if pose is not None:
@@ -211,8 +218,8 @@ def command(time: float, kind: Kind, pose: FloatArray | None = None) -> shared_r
     return record
 
 
-def touch(seen: float, depth: float, shear: float) -> shared_ring.Record:
-    """A touch record; see TOUCH."""
-    record = np.zeros((), TOUCH)
-    record["seen"], record["depth"], record["shear"] = seen, depth, shear
+def tactile_record(exposed: float, depth: float, shear: float) -> shared_ring.Record:
+    """A tactile report; see TACTILE."""
+    record = np.zeros((), TACTILE)
+    record["exposed"], record["depth"], record["shear"] = exposed, depth, shear
     return record

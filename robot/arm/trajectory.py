@@ -1,9 +1,9 @@
-"""From where an arm is to where it shall be, one short period at a time, within limits of speed and acceleration.
+"""Trajectories from the present pose to a target, one servo period at a time, within limits of speed and acceleration.
 
-The way is planned for the sensor's origin and its axes, each with limits of its own: in every period the velocity
-changes by no more than acceleration times period, and the speed is never higher than what still allows to stop on the
-target. The laws are those of discrete time, so they hold for the poses that are sent, to the last digit and not only
-on average: the second difference of the positions is within the acceleration, and the end is met without overshoot.
+The sensor's origin and its axes are planned separately, each with limits of its own: in every period the velocity
+changes by at most acceleration times period, and the speed still allows a stop on the target. The laws are in discrete
+time, so they hold exactly for the poses that are sent: the second difference of the positions is within the
+acceleration, and the target is met without overshoot.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Rates(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """Where a frame is and how it moves, in the axes of the world."""
+class MotionState:
+    """Pose and velocity of a frame, in the axes of the world."""
 
     position: FloatArray  # (3,) [m]
     rotation: FloatArray  # (3, 3) world_from_sensor
@@ -49,13 +49,15 @@ class Motion:
         return not self.velocity.any() and not self.spin.any()
 
 
-def resting(position: FloatArray, rotation: FloatArray) -> Motion:
+def resting(position: FloatArray, rotation: FloatArray) -> MotionState:
     """At rest at `position` (3,) [m] with axes `rotation` (3, 3)."""
-    return Motion(np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64), np.zeros(3), np.zeros(3))
+    return MotionState(
+        np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64), np.zeros(3), np.zeros(3)
+    )
 
 
 def landing_speed(distance: float, acceleration: float, period: float = PERIOD) -> float:
-    """The highest speed of the next period that still stops `distance` [m] ahead, exactly there [m/s].
+    """The highest speed of the next period that still allows a stop `distance` [m] ahead, exactly there [m/s].
 
     n periods that each brake by a = acceleration * period cover, from speed u, period * (n u - a n (n - 1) / 2). The
     least n whose last speed is at most a gives u; between whole n the law is linear, so it has no steps.
@@ -65,31 +67,31 @@ def landing_speed(distance: float, acceleration: float, period: float = PERIOD) 
     return distance / (n * period) + 0.5 * slowing * (n - 1)
 
 
-def stopping_way(speed: float, acceleration: float, period: float = PERIOD) -> float:
-    """How far it goes on from `speed` when every further period brakes as hard as allowed; at most v^2 / 2a [m]."""
+def stopping_distance(speed: float, acceleration: float, period: float = PERIOD) -> float:
+    """Distance [m] covered from `speed` when every further period brakes as hard as allowed; at most v^2 / 2a."""
     slowing = acceleration * period
     n = math.floor(speed / slowing)
     return period * (n * speed - 0.5 * slowing * n * (n + 1))
 
 
 def towards(
-    now: Motion,
+    now: MotionState,
     position: FloatArray,
     rotation: FloatArray,
     rates: Rates,
-    admissible: Callable[[Motion], bool] | None = None,
+    admissible: Callable[[MotionState], bool] | None = None,
     period: float = PERIOD,
-) -> Motion:
+) -> MotionState:
     """One period nearer to the target `position` (3,) [m] and `rotation` (3, 3).
 
-    `admissible` says whether a motion may be begun, judged by where it could still be stopped; what may not be is
-    braked instead, straight on, which only comes back to a stopping point that was admissible before.
+    `admissible` says whether a motion state is allowed, judged by where it could still be stopped. Where it is not, the
+    origin brakes straight on instead: its stopping point stays the one that was admissible before.
     """
     velocity, moved, arrived = _approach(position - now.position, now.velocity, rates.speed, rates.acceleration, period)
     spin, turned, facing = _approach(
         rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration, period
     )
-    step = Motion(
+    step = MotionState(
         position.copy() if arrived else now.position + moved,
         rotation.copy() if facing else turn(turned) @ now.rotation,
         velocity,
@@ -98,29 +100,29 @@ def towards(
     if admissible is None or admissible(step):
         return step
     held = braking(now, rates.acceleration, rates.turn_acceleration, period)
-    return replace(held, rotation=step.rotation, spin=step.spin)  # walls stop the origin; it may still turn
+    return replace(held, rotation=step.rotation, spin=step.spin)  # limits hold for the origin; it may still turn
 
 
-def braking(now: Motion, deceleration: float, turn_deceleration: float, period: float = PERIOD) -> Motion:
+def braking(now: MotionState, deceleration: float, turn_deceleration: float, period: float = PERIOD) -> MotionState:
     """One period nearer to rest, straight on."""
     velocity = _slower(now.velocity, deceleration * period)
     spin = _slower(now.spin, turn_deceleration * period)
-    return Motion(now.position + velocity * period, turn(spin * period) @ now.rotation, velocity, spin)
+    return MotionState(now.position + velocity * period, turn(spin * period) @ now.rotation, velocity, spin)
 
 
-def stopping_point(motion: Motion, deceleration: float, period: float = PERIOD) -> FloatArray:
+def stopping_point(motion: MotionState, deceleration: float, period: float = PERIOD) -> FloatArray:
     """(3,) where the origin comes to rest when it brakes from now on [m]."""
     speed = math.sqrt(float(motion.velocity @ motion.velocity))
     if speed == 0.0:
         return motion.position
-    point: FloatArray = motion.position + motion.velocity * (stopping_way(speed, deceleration, period) / speed)
+    point: FloatArray = motion.position + motion.velocity * (stopping_distance(speed, deceleration, period) / speed)
     return point
 
 
 def _approach(
     error: FloatArray, velocity: FloatArray, top: float, acceleration: float, period: float
 ) -> tuple[FloatArray, FloatArray, bool]:
-    """The next velocity (3,) towards a point `error` (3,) away, the way of one period, and whether that ends there."""
+    """The next velocity (3,) towards a point `error` (3,) away, its displacement, and whether that arrives."""
     distance = math.sqrt(float(error @ error))
     speed = min(top, landing_speed(distance, acceleration, period))
     wanted = error * (speed / distance) if distance > 0.0 else np.zeros(3)

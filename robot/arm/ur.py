@@ -25,9 +25,17 @@ import numpy as np
 
 from robot import errors
 from robot.arm import shared_ring
-from robot.arm.channel import HISTORY, ArmStatus, Kind, Link, Orders, Partner, command, touch
+from robot.arm.channel import (
+    HISTORY,
+    ArmStatus,
+    Channel,
+    CommandKind,
+    Partner,
+    WorkerConfig,
+    command_record,
+    tactile_record,
+)
 from robot.arm.dashboard import Dashboard
-from robot.arm.servo import frames_of, measured
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import Kinematics, pose
 from robot.common.tcp import pose_of
@@ -94,13 +102,13 @@ class URArm:
         self._errors: IO[bytes] | None = None
         shared_ring.sweep()
         try:
-            self._segment = shared_ring.create(shared_ring.segment_name(os.getpid(), name), Link.SIZE)
+            self._segment = shared_ring.create(shared_ring.segment_name(os.getpid(), name), Channel.SIZE)
         except FileExistsError as failure:
             raise DeviceAlreadyConnectedError(f"arm '{name}' is open already; close it first") from failure
-        self._link = Link(self._segment)
-        self._orders = _orders(config, name, self._segment.name, keep_out or {})
-        self._frames = frames_of(self._orders)
-        self._others: dict[str, Link] = {}
+        self._channel = Channel(self._segment)
+        self._worker_config = _worker_config(config, name, self._segment.name, keep_out or {})
+        self._frames = self._worker_config.frames
+        self._others: dict[str, Channel] = {}
         try:
             self._start()
             status = self.status()
@@ -117,7 +125,7 @@ class URArm:
         if self._closed:
             return ArmStatus.CLOSED
         ended = self._process is None or self._process.poll() is not None
-        record = self._link.states.latest()
+        record = self._channel.states.latest()
         last = ArmStatus.WORKER_DEAD if record is None else ArmStatus(int(record["status"]))
         if ended:
             return last if last == ArmStatus.LINK_LOST else ArmStatus.WORKER_DEAD
@@ -171,7 +179,7 @@ class URArm:
         with self._lock:
             self._require_able()
             if target is None:
-                self._send(Kind.HOLD)
+                self._send(CommandKind.HOLD)
                 return None
             check_action(Action({self.name: target}), (self.name,), self.name)
             state = self.state()
@@ -183,22 +191,22 @@ class URArm:
                     f"target of arm '{self.name}' at {np.round(allowed.position, 4).tolist()} m is out of its reach; "
                     "ask for a pose nearer to the arm, or turned less"
                 )
-            self._send(Kind.TARGET, allowed)
+            self._send(CommandKind.TARGET, allowed)
             return allowed
 
     def stop(self) -> None:
         """Brakes to rest within the limits; the next command goes on from there. A faulty arm stands already."""
         with self._lock:
             if not self._closed:
-                self._send(Kind.HOLD)
+                self._send(CommandKind.HOLD)
 
-    def tell(self, shown: GelReading | None) -> None:
+    def report_tactile(self, shown: GelReading | None) -> None:
         """What the sensors show by now: beyond limits.depth or limits.shear the arm stops, and it stands once the last
         picture is older than `observation_timeout`. None: nobody looks by now, and neither is watched."""
         with self._lock:
             if not self._closed:
                 known = GelReading(math.nan) if shown is None else shown
-                self._link.touches.write(touch(known.seen, known.depth, known.shear))
+                self._channel.tactile.write(tactile_record(known.seen, known.depth, known.shear))
 
     def zero_wrench(self) -> None:
         """Makes the present force the zero. The arm must stand, and touch nothing.
@@ -212,7 +220,7 @@ class URArm:
             before = int(self._record()["zeroed"])
             if not self.at_rest():
                 raise DeviceError(f"arm '{self.name}' moves; stop it before its wrench is zeroed")
-            self._send(Kind.ZERO_WRENCH)
+            self._send(CommandKind.ZERO_WRENCH)
             self._await(lambda: int(self._record()["zeroed"]) > before, 5.0, "its wrench was not zeroed")
 
     def recover(self) -> None:
@@ -239,7 +247,7 @@ class URArm:
             self._end_worker()
             self._closed = True
             self._others.clear()
-            del self._link
+            del self._channel
             self._segment.close()
 
     def __enter__(self) -> Self:
@@ -255,7 +263,7 @@ class URArm:
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the worker
-        written = self._link.states.count
+        written = self._channel.states.count
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "robot.arm.worker"],
             stdin=subprocess.PIPE,
@@ -265,14 +273,14 @@ class URArm:
         )
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(self._orders.to_json().encode())
+            self._process.stdin.write(self._worker_config.to_json().encode())
             self._process.stdin.close()
         except BrokenPipeError:
             pass  # it is dead already, which is found below
         deadline = time.monotonic() + self._timeout
         while True:
             ended = self._process.poll() is not None
-            record = self._link.states.latest() if self._link.states.count > written else None
+            record = self._channel.states.latest() if self._channel.states.count > written else None
             if record is not None and record["status"] != ArmStatus.CONNECTING:
                 return
             if ended:
@@ -291,9 +299,9 @@ class URArm:
         if process is None:
             return
         if process.poll() is None:
-            record = self._link.states.latest()
+            record = self._channel.states.latest()
             if record is not None and record["status"] != ArmStatus.CONNECTING:
-                self._send(Kind.CLOSE)
+                self._send(CommandKind.CLOSE)
                 deadline = time.monotonic() + CLOSE_TIMEOUT
                 while process.poll() is None and time.monotonic() < deadline:
                     time.sleep(POLL)
@@ -320,9 +328,9 @@ class URArm:
         failure: DeviceError = kind(text)
         return failure
 
-    def _send(self, kind: Kind, target: Pose | None = None) -> None:
+    def _send(self, kind: CommandKind, target: Pose | None = None) -> None:
         vector = None if target is None else np.concatenate([target.position, target.quaternion])
-        self._link.commands.write(command(time.monotonic(), kind, vector))
+        self._channel.commands.write(command_record(time.monotonic(), kind, vector))
 
     def _await(self, done: Callable[[], bool], timeout: float, otherwise: str) -> None:
         deadline = time.monotonic() + timeout
@@ -339,7 +347,7 @@ class URArm:
     def _record(self) -> shared_ring.Record:
         """The newest record, if it may be believed."""
         status = self.status()
-        record = None if self._closed else self._link.states.latest()
+        record = None if self._closed else self._channel.states.latest()
         if status == ArmStatus.LINK_LOST and record is not None:
             age = time.monotonic() - float(record["time"])
             raise StaleObservationError(
@@ -354,14 +362,14 @@ class URArm:
         """The newest records, one a package, oldest first."""
         if self._closed:
             raise self._error(ArmStatus.CLOSED)
-        records = self._link.states.recent(HISTORY - 1)
+        records = self._channel.states.recent(HISTORY - 1)
         records = records[records["stamp"] != 0.0]
         first = np.flatnonzero(np.diff(records["time"], prepend=-np.inf) > 0.0)
         kept: shared_ring.Record = records[first][-number:]
         return kept
 
     def _state(self, record: shared_ring.Record) -> ArmState:
-        now = measured(record, self._frames)
+        now = self._frames.measure(record)
         return ArmState(
             pose=pose_of(now.sensor),
             twist=now.twist,
@@ -381,9 +389,9 @@ class URArm:
     def _spheres(self) -> list[tuple[np.ndarray, float]]:
         """Where the other arms are, and how far to stay away."""
         spheres = []
-        for partner in self._orders.partners:
+        for partner in self._worker_config.partners:
             if partner.segment not in self._others:
-                self._others[partner.segment] = Link(shared_ring.attach(partner.segment))
+                self._others[partner.segment] = Channel(shared_ring.attach(partner.segment))
             record = self._others[partner.segment].states.latest()
             if record is not None:
                 spheres.append((record["position"], partner.distance))
@@ -394,10 +402,10 @@ class URArm:
 
     def _explain(self, status: ArmStatus) -> str:
         text = f"arm '{self.name}' {status.text}"
-        record = None if self._closed else self._link.states.latest()
+        record = None if self._closed else self._channel.states.latest()
         if record is not None and record["stamp"] != 0.0:
             if status == ArmStatus.FORCE_LIMIT:
-                force, torque = np.linalg.norm(measured(record, self._frames).wrench.reshape(2, 3), axis=1)
+                force, torque = np.linalg.norm(self._frames.measure(record).wrench.reshape(2, 3), axis=1)
                 limits = self.config.limits
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
@@ -431,9 +439,9 @@ def _check_host(config: UrArmConfig, name: str) -> None:
         )
 
 
-def _orders(config: UrArmConfig, name: str, segment: str, keep_out: Mapping[str, float]) -> Orders:
+def _worker_config(config: UrArmConfig, name: str, segment: str, keep_out: Mapping[str, float]) -> WorkerConfig:
     limits, tool = config.limits, se3.to_matrix(config.flange_from_tool.pose)
-    return Orders(
+    return WorkerConfig(
         name=name,
         host=config.host,
         model=config.model,

@@ -1,12 +1,12 @@
-"""The process that talks to one UR arm: `python -m robot.arm.worker`, started by robot.arm.ur with orders on its stdin.
+"""The process that talks to one UR arm: `python -m robot.arm.worker`, with its WorkerConfig as JSON on stdin.
 
-The only importer of ur_rtde, and for that reason a process of its own: the library may crash, hang, or hold the
-interpreter's lock while it waits for a silent controller. It is never asked to reconnect; a worker that lost its link
-ends, and another one is started. For a real arm it asks for real-time priority, and runs on without.
+The only importer of ur_rtde, in a process of its own because the library may crash, hang, or hold the interpreter's
+lock while it waits for a silent controller. It is never asked to reconnect: a worker that has lost its connection ends,
+and the driver starts another one. For a real arm it asks for real-time priority, and runs on without it.
 
-The loop, each 2 ms and in this order: read the newest package as one snapshot, publish it; is the driver alive; is the
-package fresh; safety bits, force, gels; a fault is published before anything that may wait; the newest command; limits,
-trajectory, walls, other arms, reach; the servo call.
+The loop, every 2 ms, in this order: read the newest package and publish it; end if the driver or the connection is
+gone; check safety bits, force, region, other arms and gels, and publish a fault before anything that may block; read
+the newest command; compute the next servo target and send it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from robot.arm import shared_ring
-from robot.arm.channel import STATE, ArmStatus, Link, Orders
+from robot.arm.channel import STATE, ArmStatus, Channel, WorkerConfig
 from robot.arm.dashboard import Dashboard
-from robot.arm.servo import Servo, frames_of, measured, well
+from robot.arm.servo import Servo, is_healthy
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, motion
 from robot.common.realtime import WORKER, ask_for_realtime
@@ -34,7 +34,7 @@ from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 
 PORTS = {30004: "RTDE", 30003: "script"}
 PROBE_TIMEOUT = 2.0  # of a TCP connection [s]
-VARIABLES = [  # one package; every name is in the library's own table (any other would shift the rest)
+VARIABLES = [  # of one package; a name that the library does not know would shift the others
     "timestamp",
     "actual_q",
     "actual_qd",
@@ -46,96 +46,96 @@ VARIABLES = [  # one package; every name is in the library's own table (any othe
 ]
 PLAYING = 2  # of runtime_state
 PROTECTIVE_BIT = 1 << 2
-STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # recovery, safeguard, e-stops, fault
+STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # recovery, safeguard, emergency stops, fault
 MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
-CLOSING = 0.6  # longest ramp when the driver closes [s]
-PARENTLESS = 0.5  # the same when it is gone [s]
-LIBRARY_PATIENCE = 4.5  # after so long the library gives a call up by itself [s]
-STUCK = 10.0  # after so long without a period the process is ended: the library may wait for ever [s]
-ORPHANED = 3.0  # the same when nobody is there who could kill it [s]
-GRACE = 5  # periods in which a package may tell why the controller takes no more commands
-FAILED = 3  # exit status: the reason stands on stdout as JSON
+CLOSING = 0.6  # longest braking when the driver closes [s]
+PARENTLESS = 0.5  # longest braking when the driver is gone [s]
+LIBRARY_PATIENCE = 4.5  # the library gives a call up after this time [s]
+STUCK = 10.0  # the process is ended after this time without a period: the library may wait for ever [s]
+ORPHANED = 3.0  # the same when no driver is left to kill it [s]
+GRACE = 5  # periods in which a package may say why the controller takes no more commands
+FAILED = 3  # exit status; the reason is on stdout, as JSON
 WINDOW = 500  # periods in the statistics
 
 
 class Worker:
     """One connection, from the first probe to the last servo call."""
 
-    def __init__(self, orders: Orders) -> None:
-        self.orders = orders
-        self.frames = frames_of(orders)
-        self.segment = shared_ring.attach(orders.segment)
-        self.link = Link(self.segment)
+    def __init__(self, config: WorkerConfig) -> None:
+        self.config = config
+        self.frames = config.frames
+        self.segment = shared_ring.attach(config.segment)
+        self.channel = Channel(self.segment)
         self.record = np.zeros((), STATE)
-        self.record["top_speed"] = orders.speed
-        self.partners: list[Link | None] = [None] * len(orders.partners)
-        self.servo = Servo(orders, taken=self.link.commands.count, touches=self.link.touches.count)
+        self.record["top_speed"] = config.speed
+        self.partners: list[Channel | None] = [None] * len(config.partners)
+        self.servo = Servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(WINDOW, PERIOD)
         self._last = 0.0  # when the last period ended
-        self._looks = 0  # at one package
-        self._refused = 0  # periods since the controller took no more commands
-        self._words = (0, 0)  # runtime_state, safety_status_bits
-        self.state = measured(self.record, self.frames)
+        self._rereads = 0  # of the same package
+        self._refused = 0  # periods since the controller refused a command; 0: it did not
+        self._controller_bits = (0, 0)  # runtime_state, safety_status_bits
+        self.state = self.frames.measure(self.record)
         self._publish(ArmStatus.CONNECTING)
 
     # -- connecting ----------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Raises a DeviceError that says what is wrong; a controller that falls silent half way holds it for ever, and
+        """Raises a DeviceError that says what is wrong. Blocks for ever if the controller falls silent half way; then
         the driver kills the process."""
-        orders = self.orders
+        config = self.config
         for port, what in PORTS.items():
             try:
-                socket.create_connection((orders.host, port), PROBE_TIMEOUT).close()
+                socket.create_connection((config.host, port), PROBE_TIMEOUT).close()
             except OSError as failure:
                 raise DeviceNotConnectedError(
-                    f"no controller at {orders.host}: port {port} ({what}): {failure}; is it on, and the address right?"
+                    f"no controller at {config.host}: port {port} ({what}): {failure}; is it on, and the address right?"
                 ) from failure
-        with Dashboard(orders.host, PROBE_TIMEOUT) as dashboard:
+        with Dashboard(config.host, PROBE_TIMEOUT) as dashboard:
             self._check_identity(dashboard)
-            dashboard.require_ready(f"arm '{orders.name}'")
+            dashboard.require_ready(f"arm '{config.name}'")
         try:
             import rtde_control
             import rtde_receive
         except ImportError as failure:
             raise DeviceNotConnectedError(
-                f"arm '{orders.name}' needs ur_rtde, which has no wheel for this Python ({failure}); use Python "
+                f"arm '{config.name}' needs ur_rtde, which has no wheel for this Python ({failure}); use Python "
                 "3.11 or 3.12 on x86-64 Linux or Windows"
             ) from failure
         try:
-            self.receive: Any = rtde_receive.RTDEReceiveInterface(orders.host, 500.0, VARIABLES)
-            self.control: Any = rtde_control.RTDEControlInterface(orders.host, 500.0)
-        except Exception as failure:  # the library raises RuntimeError for all that can happen
+            self.receive: Any = rtde_receive.RTDEReceiveInterface(config.host, 500.0, VARIABLES)
+            self.control: Any = rtde_control.RTDEControlInterface(config.host, 500.0)
+        except Exception as failure:  # the library raises RuntimeError for everything
             if "in use" in str(failure).lower():
                 raise DeviceBusyError(
-                    f"arm '{orders.name}' at {orders.host} is controlled by another program; end that one first"
+                    f"arm '{config.name}' at {config.host} is controlled by another program; end that one first"
                 ) from failure
-            raise DeviceNotConnectedError(f"arm '{orders.name}' at {orders.host}: {failure}") from failure
-        self._call("the watchdog", self.control.setWatchdog, orders.watchdog)
-        self._call("the TCP", self.control.setTcp, orders.tcp)
-        self._call("the payload", self.control.setPayload, orders.mass, orders.mass_centre)
+            raise DeviceNotConnectedError(f"arm '{config.name}' at {config.host}: {failure}") from failure
+        self._call("the watchdog", self.control.setWatchdog, config.watchdog)
+        self._call("the TCP", self.control.setTcp, config.tcp)
+        self._call("the payload", self.control.setPayload, config.mass, config.mass_centre)
         self._check_model()
 
     def _check_identity(self, dashboard: Dashboard) -> None:
-        orders = self.orders
-        if dashboard.serial() == orders.refused_serial:
+        config = self.config
+        if dashboard.serial() == config.refused_serial:
             raise DeviceNotConnectedError(
-                f"{orders.host} is a mock controller, but arm '{orders.name}' has no `mock:` block"
+                f"{config.host} is a mock controller, but arm '{config.name}' has no `mock:` block"
             )
         model = dashboard.model()
-        if model is not None and not orders.model.startswith(model):
+        if model is not None and not config.model.startswith(model):
             raise DeviceNotConnectedError(
-                f"arm '{orders.name}' is a {model.upper()}, but its file says model: {orders.model}"
+                f"arm '{config.name}' is a {model.upper()}, but its file says model: {config.model}"
             )
 
     def _call(self, what: str, method: Any, *arguments: Any) -> None:
         if not method(*arguments):
-            raise DeviceNotConnectedError(f"arm '{self.orders.name}': the controller did not take {what} {arguments}")
+            raise DeviceNotConnectedError(f"arm '{self.config.name}': the controller did not take {what} {arguments}")
 
     def _check_model(self) -> None:
-        """The controller's pose at these joints is the one that the model and the TCP give."""
-        kinematics = Kinematics(self.orders.model)  # type: ignore[arg-type]  # a Model, from JSON
-        tool = np.array(self.orders.flange_from_tool)
+        """Raises unless the controller's pose agrees with the forward kinematics of the model and the TCP."""
+        kinematics = Kinematics(self.config.model)  # type: ignore[arg-type]  # a Model, from JSON
+        tool = np.array(self.config.flange_from_tool)
         deadline = time.monotonic() + 1.0
         while True:
             if self._read():
@@ -144,48 +144,48 @@ class Worker:
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
                 if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
                     return
-                found = f"{1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.orders.model} would have it"
+                found = f"{1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would have it"
             else:
                 found = "not told"
             if time.monotonic() > deadline:
                 raise DeviceNotConnectedError(
-                    f"arm '{self.orders.name}': its tool is {found}; check model and flange_from_tool"
+                    f"arm '{self.config.name}': its tool is {found}; check model and flange_from_tool"
                 )
             time.sleep(PERIOD)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
     def run(self) -> NoReturn:
-        gc.freeze()  # what is loaded stays: the collector need not look at it in the middle of a period
+        gc.freeze()  # keeps what is loaded out of collections in the middle of a period
         self._last = time.monotonic()
         deadline = self._last + PERIOD
-        ending: float | None = None  # when the last ramp is cut off
+        ending: float | None = None  # when the last braking is cut off
         while True:
-            self._looks = 0 if self._read() else self._looks + 1
+            self._rereads = 0 if self._read() else self._rereads + 1
             self._publish(self.servo.status)
-            orphan = os.getppid() != self.orders.parent
+            orphan = os.getppid() != self.config.parent
             _end_if_stuck(ORPHANED if orphan else STUCK)
             now = time.monotonic()
-            # A process that slept looks again: the packages may lie there unread.
-            if self._looks > 5 and now - float(self.record["time"]) > self.orders.link_timeout:
+            # A process that was suspended reads again first: packages may be waiting.
+            if self._rereads > 5 and now - float(self.record["time"]) > self.config.link_timeout:
                 self._publish(ArmStatus.LINK_LOST)
                 self._leave(orphan)
-            partners = self._look_at_partners(now)
+            partners = self._read_partners(now)
             before = self.servo.status
             stopped = self._controller_stop()
             if stopped is None and self._refused > GRACE:
                 stopped = ArmStatus.PROGRAM_STOPPED
             if stopped is not None:
-                self.servo.fault(stopped, None)
-            self.servo.watch(self.state, partners)
-            self.servo.look(*self.link.touches.newest(), self.state)
+                self.servo.trip(stopped, None)
+            self.servo.check_faults(self.state, partners)
+            self.servo.on_tactile(*self.channel.tactile.newest(), self.state)
             if self.servo.status != before:
                 self._publish(self.servo.status)
-            self.servo.hear(*self.link.commands.newest())
-            if ending is None and (orphan or self.servo.close_asked):
+            self.servo.on_command(*self.channel.commands.newest())
+            if ending is None and (orphan or self.servo.close_requested):
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:
-                    self.servo.fault(ArmStatus.CLOSED, self.state)
+                    self.servo.trip(ArmStatus.CLOSED, self.state)
             if stopped is not None or self.servo.status in _CONTROLLER_STOPS:
                 if ending is not None:
                     self._leave(orphan)
@@ -197,19 +197,19 @@ class Worker:
             deadline = self._sleep(deadline)
 
     def _act(self, now: float, partners: list[Any]) -> None:
-        if self._refused:  # the next packages tell why
+        if self._refused:  # the next packages say why
             self._refused += 1
             return
         joints = self.servo.step(now, self.state, partners)
-        orders, control = self.orders, self.control
+        config, control = self.config, self.control
         if joints is None:
             alive = control.kickWatchdog()
         else:
-            alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, orders.lookahead, orders.gain)
+            alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, config.lookahead, config.gain)
         if not alive:
             self._refused = 1
-        elif self.servo.zero_asked and self.servo.resting:
-            self.servo.zero_asked = False
+        elif self.servo.zero_requested and self.servo.resting:
+            self.servo.zero_requested = False
             self.record["busy_until"] = time.monotonic() + LIBRARY_PATIENCE
             self._publish(self.servo.status)
             if control.zeroFtSensor():
@@ -217,8 +217,8 @@ class Worker:
             self.record["busy_until"] = 0.0
 
     def _read(self) -> bool:
-        """The newest package into the record; True if there was one. All fields are of one package: its time stamp is
-        the same before and after. A package with numbers that are none counts as none."""
+        """Reads the newest package into the record; True if it is new. All fields are of one package: its time stamp is
+        the same before and after. A package with a NaN or an infinity is ignored."""
         receive, record = self.receive, self.record
         while True:
             stamp = receive.getTimestamp()
@@ -229,51 +229,55 @@ class Worker:
                 receive.getActualTCPSpeed(),
                 receive.getActualTCPForce(),
             )
-            words = receive.getRuntimeState(), receive.getSafetyStatusBits()
+            bits = receive.getRuntimeState(), receive.getSafetyStatusBits()
             if receive.getTimestamp() == stamp:
                 break
         if stamp == float(record["stamp"]) or not np.isfinite(fields).all():
             return False
         record["joints"], record["joint_speeds"], record["tcp_pose"], record["tcp_speed"], record["tcp_force"] = fields
         record["stamp"], record["time"] = stamp, time.monotonic()
-        self.state = measured(record, self.frames)
+        self.state = self.frames.measure(record)
         record["position"] = self.state.sensor[:3, 3]
-        self._words = words
+        self._controller_bits = bits
         return True
 
     def _controller_stop(self) -> ArmStatus | None:
-        runtime, bits = self._words
+        runtime, bits = self._controller_bits
         if bits & STOP_BITS:
             return ArmStatus.EMERGENCY_STOP
         if bits & PROTECTIVE_BIT:
             return ArmStatus.PROTECTIVE_STOP
         return None if runtime == PLAYING else ArmStatus.PROGRAM_STOPPED
 
-    def _look_at_partners(self, now: float) -> list[Any]:
-        """The newest record of each other arm; None where there is none, or an old one."""
+    def _read_partners(self, now: float) -> list[Any]:
+        """The newest record of each other arm; None where it is missing, too old, or not healthy."""
         seen: list[Any] = []
-        for index, partner in enumerate(self.orders.partners):
-            link = self.partners[index]
-            if link is None and int(self.record["cycles"]) % 25 == 0:
-                with contextlib.suppress(OSError, ValueError):  # not there, or not whole yet
-                    link = self.partners[index] = Link(shared_ring.attach(partner.segment))
-            record = None if link is None else link.states.latest()
-            if record is not None and now - float(record["beat"]) > self.orders.link_timeout:
+        for index, partner in enumerate(self.config.partners):
+            channel = self.partners[index]
+            if channel is None and int(self.record["cycles"]) % 25 == 0:
+                with contextlib.suppress(OSError, ValueError):  # not there yet, or not complete
+                    channel = self.partners[index] = Channel(shared_ring.attach(partner.segment))
+            record = None if channel is None else channel.states.latest()
+            if record is not None and now - float(record["written"]) > self.config.link_timeout:
                 record = None
-                self.partners[index] = None  # it may come again under the same name
-            seen.append(record if well(record) else None)
+                self.partners[index] = None  # its driver may make it again under the same name
+            seen.append(record if is_healthy(record) else None)
         return seen
 
     def _publish(self, status: ArmStatus) -> None:
         record, servo = self.record, self.servo
-        record["beat"], record["status"], record["resting"] = time.monotonic(), status, servo.resting
-        record["taken"], record["rejected"], record["shortened"] = servo.taken, servo.rejected, servo.shortened
+        record["written"], record["status"], record["resting"] = time.monotonic(), status, servo.resting
+        record["commands_read"], record["rejected"], record["shortened"] = (
+            servo.commands_read,
+            servo.rejected,
+            servo.shortened,
+        )
         record["target"] = record["position"] if servo.motion is None else servo.motion.position
-        record["stop"] = record["position"] if servo.stop is None else servo.stop
-        self.link.states.write(record)
+        record["stopping_point"] = record["position"] if servo.stop is None else servo.stop
+        self.channel.states.write(record)
 
     def _sleep(self, deadline: float) -> float:
-        """Until the absolute deadline; returns the next one. Periods that are missed are not made up for."""
+        """Sleeps until the absolute deadline and returns the next one. Missed periods are skipped, and counted."""
         record, cycle = self.record, int(self.record["cycles"])
         late = time.monotonic() - deadline
         if late < 0.0:
@@ -292,37 +296,37 @@ class Worker:
     # -- ending --------------------------------------------------------------------------------------------------
 
     def _end_program(self) -> None:
-        """Both calls wait for the controller; the driver kills a worker that takes too long."""
+        """Both calls block on the controller; the driver kills a worker that takes too long."""
         if self.servo.motion is not None:
             self.control.servoStop(10.0)
         self.control.stopScript()
 
     def _leave(self, orphan: bool) -> NoReturn:
-        """Without the library's destructors: they sleep, and may wait for an answer that never comes."""
+        """Ends the process without the library's destructors, which may wait for an answer that never comes."""
         if orphan:
             self.segment.remove()
         os._exit(0)
 
 
 def _end_if_stuck(seconds: float) -> None:
-    """The kernel ends this process unless it is asked again within `seconds`, even in the middle of a library call."""
+    """The kernel kills this process unless this is called again within `seconds`, even inside a library call."""
     if sys.platform != "win32":
-        signal.setitimer(signal.ITIMER_REAL, seconds)  # SIGALRM is not caught
+        signal.setitimer(signal.ITIMER_REAL, seconds)  # SIGALRM has no handler
 
 
 _CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP)
 
 
 def main() -> NoReturn:
-    # The library prints; stdout is for the one line that says why it failed.
+    # The library prints to stdout, which is reserved for the reason of a failure.
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which stops the arm gently
-    orders = Orders.from_json(sys.stdin.read())
-    if orders.realtime:
+    config = WorkerConfig.from_json(sys.stdin.read())
+    if config.realtime:
         ask_for_realtime(WORKER)  # before the library starts its threads
     try:
-        worker = Worker(orders)
+        worker = Worker(config)
         worker.connect()
     except (DeviceError, OSError) as failure:
         kind = type(failure).__name__ if isinstance(failure, DeviceError) else DeviceNotConnectedError.__name__

@@ -1,4 +1,4 @@
-"""The one place where poses, speeds and forces of a UR controller turn into those of the rig, and back.
+"""The one place that converts poses, speeds and forces of a UR controller to those of the rig, and back.
 
 A controller speaks of its tool centre point (TCP), in the axes of the base, poses as position and rotation vector; the
 rig speaks of the sensor, in the world. The controller's force is what the surroundings do to the tool, so its sign is
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robot.common.kinematics import inverse_frame, matrix, rotation_vector
 from tacsim.interface import FloatArray, Pose
@@ -22,10 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """One package, and where that puts the sensor."""
+    """One package of the controller, as pose, twist and wrench of the sensor."""
 
     joints: FloatArray  # (6,) [rad]
-    flange: FloatArray  # base_from_flange (4, 4) as the controller has it
+    flange: FloatArray  # base_from_flange (4, 4) by the controller
     sensor: FloatArray  # world_from_sensor (4, 4)
     twist: FloatArray  # (6,) of the sensor's origin, world axes [m/s, rad/s]
     wrench: FloatArray  # (6,) what the object does to the sensor, about its origin, its axes [N, N m]
@@ -44,7 +45,7 @@ class ArmFrames:
 
     @classmethod
     def of(cls, config: UrArmConfig) -> ArmFrames:
-        """Those of a rig file."""
+        """The frames of an arm in a rig file."""
         from tacsim.pose import to_matrix  # SciPy takes half a second to load; the worker of an arm needs none of it
 
         fixed = (config.world_from_base, config.flange_from_tool, config.tool_from_sensor)
@@ -55,14 +56,15 @@ class ArmFrames:
         frame: FloatArray = self._base_from_world @ world_from_sensor @ self._sensor_from_flange
         return frame
 
-    def measure(self, joints: FloatArray, pose: FloatArray, speed: FloatArray, force: FloatArray) -> Measured:
-        """What one package says, from joints (6,) and the controller's TCP pose, speed and force, each (6,)."""
-        base_from_tool = matrix(pose)
+    def measure(self, package: NDArray[np.void]) -> Measured:
+        """From one package of the controller: a record () with joints, tcp_pose, tcp_speed, tcp_force, each (6,)."""
+        speed, force = package["tcp_speed"], package["tcp_force"]
+        base_from_tool = matrix(package["tcp_pose"])
         base_from_sensor = base_from_tool @ self.tool_from_sensor
         lever = base_from_sensor[:3, 3] - base_from_tool[:3, 3]
         to_world, to_sensor = self.world_from_base[:3, :3], base_from_sensor[:3, :3].T
         return Measured(
-            joints=joints,
+            joints=package["joints"].copy(),
             flange=base_from_tool @ self._tool_from_flange,
             sensor=self.world_from_base @ base_from_sensor,
             twist=np.concatenate([to_world @ (speed[:3] + _cross(speed[3:], lever)), to_world @ speed[3:]]),
@@ -71,7 +73,7 @@ class ArmFrames:
 
 
 def pose_of(frame: FloatArray) -> Pose:
-    """A frame (4, 4) as a Pose; without SciPy, which is slow for one pose."""
+    """A frame (4, 4) as a Pose, without SciPy, which is slow for a single pose."""
     vector = rotation_vector(frame[:3, :3])
     half = 0.5 * math.sqrt(float(vector @ vector))
     factor = 0.5 * (math.sin(half) / half if half > 1e-9 else 1.0)
@@ -79,6 +81,6 @@ def pose_of(frame: FloatArray) -> Pose:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """np.cross of two vectors, at a tenth of its price."""
+    """np.cross of two vectors, ten times as fast."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -80,7 +80,7 @@ class RigArm:
 
     def unwatch(self) -> None:
         """For motions that are not decided by observations: they need not be fresh, until the next one is made."""
-        self._driven.arm.tell(None)
+        self._driven.arm.report_tactile(None)
 
     def stop(self) -> None:
         self._driven.target = None
@@ -217,7 +217,7 @@ def _watch(config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mappin
     """Tells the arms what their gels show, and guards those by it. Raises DeviceError for a limit that cannot be
     watched, because its sensor delivers no height or flow."""
     limits = {name: arm.limits for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
-    tell = {name: driven.arm.tell for name, driven in arms.items()}
+    tell = {name: driven.arm.report_tactile for name, driven in arms.items()}
     try:
         return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, tell, SafetyViolation)
     except ValueError as failure:

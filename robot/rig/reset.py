@@ -70,7 +70,7 @@ class GuidedStart:
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
         """Raises DeviceError when an arm is stopped, or does not get there."""
         for driven in self._arms.values():
-            driven.arm.tell(None)  # until the first observation nothing is decided by one
+            driven.arm.report_tactile(None)  # until the first observation nothing is decided by one
         aside = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
         shift = np.append(aside, 0.0)
         self._begun = {name: Pose(pose.position + shift, pose.quaternion) for name, pose in self._start.items()}

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, ArmStatus, Kind, Orders, Partner, command, touch
-from robot.arm.servo import HARD, STEEPEST, Servo, measured
+from robot.arm.channel import STATE, ArmStatus, CommandKind, Partner, WorkerConfig, command_record, tactile_record
+from robot.arm.servo import HARD, STEEPEST, Servo
 from robot.arm.shared_ring import Record
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, pose, rotation
@@ -21,7 +21,7 @@ KINEMATICS = Kinematics("ur5e")
 EYE = np.eye(4).tolist()
 
 
-def orders(**changes: object) -> Orders:
+def worker_config(**changes: object) -> WorkerConfig:
     sensor = np.eye(4)
     sensor[:3, :3], sensor[:3, 3] = rotation([0.0, 0.0, 0.4]), [0.0, 0.01, 0.05]
     plain: dict[str, object] = {
@@ -58,18 +58,18 @@ def orders(**changes: object) -> Orders:
         "gain": 600.0,
         "partners": [],
     }
-    return Orders(**{**plain, **changes})  # type: ignore[arg-type]
+    return WorkerConfig(**{**plain, **changes})  # type: ignore[arg-type]
 
 
 class Bench:
     """A servo and an arm whose joints make up a part of their error in each period."""
 
     def __init__(self, calibration: FloatArray | None = None, **changes: object) -> None:
-        self.servo = Servo(orders(**changes))
+        self.servo = Servo(worker_config(**changes))
         self.q, self.time, self.number = HOME.copy(), 0.0, 0
         self.calibration = np.eye(4) if calibration is None else calibration  # the true flange, seen from the nominal
         self.record: Record = np.zeros((), STATE)
-        self.partners: list[Record | None] = [None] * len(self.servo.orders.partners)
+        self.partners: list[Record | None] = [None] * len(self.servo.config.partners)
         self.sent: list[FloatArray] = []
         self.look()
 
@@ -80,21 +80,21 @@ class Bench:
         if before.any():
             self.record["tcp_speed"][:3] = (self.record["tcp_pose"][:3] - before[:3]) / PERIOD
         self.record["tcp_force"] = force
-        self.now = measured(self.record, self.servo.frames)
+        self.now = self.servo.frames.measure(self.record)
 
     @property
     def at(self) -> Pose:
         return pose_of(self.now.sensor)
 
-    def ask(self, target: Pose | np.ndarray, kind: Kind = Kind.TARGET) -> None:
+    def ask(self, target: Pose | np.ndarray, kind: CommandKind = CommandKind.TARGET) -> None:
         row = target if isinstance(target, np.ndarray) else np.array([*target.position, *target.quaternion])
         self.number += 1
-        self.servo.hear(self.number, command(self.time, kind, row))
+        self.servo.on_command(self.number, command_record(self.time, kind, row))
 
     def run(self, periods: int, force: tuple[float, ...] = (0.0,) * 6) -> None:
         for _ in range(periods):
             self.time += PERIOD
-            self.servo.watch(self.now, self.partners)
+            self.servo.check_faults(self.now, self.partners)
             joints = self.servo.step(self.time, self.now, self.partners)
             if joints is not None:
                 self.sent.append(joints)
@@ -164,9 +164,9 @@ def test_what_is_no_pose_makes_it_hold(row: np.ndarray) -> None:
 def test_each_command_is_taken_once() -> None:
     bench = Bench(action_timeout=60.0)
     bench.ask(np.full(7, np.nan))
-    record = command(0.0, Kind.TARGET, np.full(7, np.nan))
+    record = command_record(0.0, CommandKind.TARGET, np.full(7, np.nan))
     for _ in range(5):
-        bench.servo.hear(bench.number, record)
+        bench.servo.on_command(bench.number, record)
     assert bench.servo.rejected == 1
 
 
@@ -205,7 +205,9 @@ def test_an_old_command_is_not_followed_and_a_late_one_brakes() -> None:
     assert steps.max() <= 0.5 * PERIOD**2 * (1 + 1e-4)
     here = bench.path()[-1]
     bench.time += 10.0
-    bench.servo.hear(bench.number, command(0.0, Kind.TARGET, np.zeros(7)))  # the same command once more
+    bench.servo.on_command(
+        bench.number, command_record(0.0, CommandKind.TARGET, np.zeros(7))
+    )  # the same command once more
     bench.run(5)
     assert np.allclose(bench.path()[-1], here, atol=1e-9)
 
@@ -248,7 +250,7 @@ def test_too_much_force_stops_from_the_measured_pose() -> None:
 def test_a_force_that_is_no_number_is_too_much() -> None:
     bench = Bench()
     bench.look(force=(math.nan,) * 6)
-    bench.servo.watch(bench.now, [])
+    bench.servo.check_faults(bench.now, [])
     assert bench.servo.status == ArmStatus.FORCE_LIMIT
 
 
@@ -277,7 +279,7 @@ def test_joint_steps_and_singularities_slow_it_down() -> None:
 
 def other(position: list[float], stop: list[float] | None = None, status: ArmStatus = ArmStatus.OK) -> Record:
     record = np.zeros((), STATE)
-    record["position"], record["stop"] = position, stop or position
+    record["position"], record["stopping_point"] = position, stop or position
     record["status"], record["top_speed"] = status, 0.1
     return record
 
@@ -337,13 +339,13 @@ def test_a_worse_fault_replaces_a_lesser_one() -> None:
         (ArmStatus.EMERGENCY_STOP, ArmStatus.EMERGENCY_STOP),
         (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP),
     ):
-        bench.servo.fault(status, bench.now)
+        bench.servo.trip(status, bench.now)
         assert bench.servo.status == kept
 
 
-def test_orders_travel_as_json() -> None:
-    given = orders(partners=[Partner("a", 0.1)], planes=[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-    assert Orders.from_json(given.to_json()) == given
+def test_a_worker_config_travels_as_json() -> None:
+    given = worker_config(partners=[Partner("a", 0.1)], planes=[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    assert WorkerConfig.from_json(given.to_json()) == given
 
 
 def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
@@ -356,7 +358,7 @@ def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
         bench = Bench(action_timeout=60.0, depth=1e-3, shear=0.5e-3)
         bench.ask(shifted(bench.at, 0.0, 0.0, -0.05))
         bench.run(100)
-        bench.servo.look(1, touch(bench.time, *shown), bench.now)
+        bench.servo.on_tactile(1, tactile_record(bench.time, *shown), bench.now)
         here = bench.at.position[2]
         bench.run(100)
         assert (bench.servo.status == ArmStatus.GEL_LIMIT) == stops
@@ -368,20 +370,20 @@ def test_an_arm_is_not_called_well_before_it_was_looked_at() -> None:
     for changes, found in (({}, ArmStatus.HOLD), ({"lower": [2.0] * 3, "upper": [3.0] * 3}, ArmStatus.WORKSPACE_LIMIT)):
         bench = Bench(**changes)
         assert bench.servo.status == ArmStatus.CONNECTING
-        bench.servo.look(1, touch(0.0, 0.0, 0.0), bench.now)
+        bench.servo.on_tactile(1, tactile_record(0.0, 0.0, 0.0), bench.now)
         assert bench.servo.status == ArmStatus.CONNECTING
-        bench.servo.watch(bench.now, bench.partners)
+        bench.servo.check_faults(bench.now, bench.partners)
         assert bench.servo.status == found
 
 
 def test_what_was_shown_to_a_worker_before_is_not_held_against_this_one() -> None:
-    servo = Servo(orders(depth=1e-3), touches=7)
+    servo = Servo(worker_config(depth=1e-3), tactile_read=7)
     bench = Bench()
-    servo.look(7, touch(0.0, 2e-3, 0.0), bench.now)
+    servo.on_tactile(7, tactile_record(0.0, 2e-3, 0.0), bench.now)
     assert not servo.status.is_fault
-    servo.look(8, touch(math.nan, 2e-3, 0.0), bench.now)  # nobody looks by now
+    servo.on_tactile(8, tactile_record(math.nan, 2e-3, 0.0), bench.now)  # nobody looks by now
     assert not servo.status.is_fault
-    servo.look(9, touch(0.0, 2e-3, 0.0), bench.now)
+    servo.on_tactile(9, tactile_record(0.0, 2e-3, 0.0), bench.now)
     assert servo.status == ArmStatus.GEL_LIMIT
 
 
@@ -389,17 +391,19 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
     bench = Bench(action_timeout=60.0, observation_timeout=0.5)
     bench.ask(shifted(bench.at, 0.02))
     bench.run(20)
-    bench.servo.look(1, touch(bench.time, math.nan, math.nan), bench.now)
+    bench.servo.on_tactile(1, tactile_record(bench.time, math.nan, math.nan), bench.now)
     bench.run(200)
     assert bench.servo.status == ArmStatus.OK
     bench.run(100)  # 0.6 s without another picture
-    assert bench.servo.status == ArmStatus.BLIND
+    assert bench.servo.status == ArmStatus.OBSERVATION_STALE
     bench.run(200)
     held = bench.at.position.copy()
     bench.ask(shifted(bench.at, 0.02))
     bench.run(100)
     assert np.abs(bench.at.position - held).max() < 1e-5
-    bench.servo.look(2, touch(bench.time, math.nan, math.nan), bench.now)  # it sees again, and goes on by itself
+    bench.servo.on_tactile(
+        2, tactile_record(bench.time, math.nan, math.nan), bench.now
+    )  # it sees again, and goes on by itself
     bench.run(100)
     assert bench.servo.status == ArmStatus.OK
     assert bench.at.position[0] - held[0] > 5e-3

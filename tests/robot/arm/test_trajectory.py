@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from robot.arm.trajectory import (
     PERIOD,
-    Motion,
+    MotionState,
     braking,
     landing_speed,
     resting,
+    stopping_distance,
     stopping_point,
-    stopping_way,
     towards,
 )
 from robot.common.kinematics import rotation, rotation_vector
@@ -35,11 +35,11 @@ rates = st.builds(
 )
 
 
-def stays_inside(limits: SimpleNamespace) -> Callable[[Motion], bool]:
+def stays_inside(limits: SimpleNamespace) -> Callable[[MotionState], bool]:
     return lambda motion: bool(BOX.excess(stopping_point(motion, limits.acceleration)) <= 1e-9)
 
 
-def check_step(before: Motion, after: Motion, limits: SimpleNamespace) -> None:
+def check_step(before: MotionState, after: MotionState, limits: SimpleNamespace) -> None:
     """The poses themselves, not what the planner says of them."""
     moved, turned = after.position - before.position, rotation_vector(after.rotation @ before.rotation.T)
     assert np.abs(moved - after.velocity * PERIOD).max() <= 1e-12
@@ -50,7 +50,9 @@ def check_step(before: Motion, after: Motion, limits: SimpleNamespace) -> None:
     assert np.linalg.norm(after.spin - before.spin) <= limits.turn_acceleration * PERIOD * (1 + 1e-9)
 
 
-def drive(motion: Motion, position: np.ndarray, turn: np.ndarray, limits: SimpleNamespace, steps: int) -> list[Motion]:
+def drive(
+    motion: MotionState, position: np.ndarray, turn: np.ndarray, limits: SimpleNamespace, steps: int
+) -> list[MotionState]:
     """Up to `steps` periods towards a target, or until it is reached at rest."""
     path = [motion]
     for _ in range(steps):
@@ -130,9 +132,9 @@ def test_landing_speed_stops_exactly_there(distance: float, acceleration: float)
 @given(st.floats(0.0, 1.0), st.floats(0.05, 10.0), st.floats(0.0, 3.0))
 def test_braking_comes_to_rest_where_it_said(speed: float, deceleration: float, spin: float) -> None:
     limits = SimpleNamespace(speed=1.0, acceleration=deceleration, turn_rate=3.0, turn_acceleration=5.0)
-    motion = Motion(np.zeros(3), np.eye(3), np.array([0.0, 0.6, 0.8]) * speed, np.array([spin, 0.0, 0.0]))
+    motion = MotionState(np.zeros(3), np.eye(3), np.array([0.0, 0.6, 0.8]) * speed, np.array([spin, 0.0, 0.0]))
     promised = stopping_point(motion, deceleration)
-    assert stopping_way(speed, deceleration) <= speed**2 / (2 * deceleration) + 1e-12
+    assert stopping_distance(speed, deceleration) <= speed**2 / (2 * deceleration) + 1e-12
     for _ in range(20_000):
         before, motion = motion, braking(motion, deceleration, 5.0)
         check_step(before, motion, limits)

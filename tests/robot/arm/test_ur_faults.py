@@ -43,8 +43,8 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR) -> None:
         since = mock.faults.received().last
         arm.command(moved(start, z=-0.1))
         until(lambda: arm.status() == ArmStatus.FORCE_LIMIT, "force limit")
-        until(lambda: arm._link.states.latest()["resting"] == 1, "rest")  # type: ignore[index]
-        records = arm._link.states.recent(HISTORY)
+        until(lambda: arm._channel.states.latest()["resting"] == 1, "rest")  # type: ignore[index]
+        records = arm._channel.states.recent(HISTORY)
         over = np.linalg.norm(records["tcp_force"][:, :3], axis=1) > limit
         first = records[over][0]
         of_that_package = records[records["stamp"] == first["stamp"]]
@@ -69,13 +69,13 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR) -> None:
 def test_a_gel_pressed_too_far_stops_the_arm_that_presses_it(mock: MockUR) -> None:
     with URArm(config(limits={"depth": 1e-3, "speed": 0.05}), "left") as arm:
         start = arm.state().pose
-        arm.tell(GelReading(time.monotonic(), depth=0.9e-3))
+        arm.report_tactile(GelReading(time.monotonic(), depth=0.9e-3))
         in_motion(arm, moved(start, z=-0.1))
         since = mock.faults.received().last
-        arm.tell(GelReading(time.monotonic(), depth=1.1e-3))
+        arm.report_tactile(GelReading(time.monotonic(), depth=1.1e-3))
         until(lambda: arm.status() == ArmStatus.GEL_LIMIT, "gel limit")
-        until(lambda: arm._link.states.latest()["resting"] == 1, "rest")  # type: ignore[index]
-        records = arm._link.states.recent(HISTORY)
+        until(lambda: arm._channel.states.latest()["resting"] == 1, "rest")  # type: ignore[index]
+        records = arm._channel.states.recent(HISTORY)
         first = records[records["status"] == ArmStatus.GEL_LIMIT][0]
         path = sensor_path(arm, servo_targets(mock.faults.received(since).entries))[:, 2, 3]
         assert path[-1] >= float(first["position"][2]) - 0.05**2 / (2 * 5.0) - 1e-5
@@ -89,9 +89,9 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
     with URArm(config(observation_timeout=0.5), "left") as arm:
         start = arm.state().pose
         far = moved(start, x=0.12)
-        arm.tell(GelReading(time.monotonic()))
+        arm.report_tactile(GelReading(time.monotonic()))
         in_motion(arm, far)
-        until(lambda: arm.status() == ArmStatus.BLIND, "blind")
+        until(lambda: arm.status() == ArmStatus.OBSERVATION_STALE, "blind")
         until(arm.at_rest, "rest")
         held = arm.state().pose
         assert se3.distance(start, held)[0] < 0.1
@@ -99,7 +99,7 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
         since = mock.faults.received().last
         until(lambda: len(servo_targets(mock.faults.received(since).entries)) > 50, "held targets")
         assert np.ptp(servo_targets(mock.faults.received(since).entries), axis=0).max() < 1e-9
-        arm.tell(None)  # nobody looks by now: the rule ends
+        arm.report_tactile(None)  # nobody looks by now: the rule ends
         go(arm, far)
 
 

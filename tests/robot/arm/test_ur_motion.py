@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.channel import HISTORY, ArmStatus, Kind, command
+from robot.arm.channel import HISTORY, ArmStatus, CommandKind, command_record
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.common.kinematics import matrix
@@ -111,7 +111,7 @@ def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm) -> None:
     for look in range(100_000):
         if look % 5_000 == 0:
             arm.command(moved(start, x=0.03 * (-1) ** (look // 5_000)))
-        record = arm._link.states.latest()
+        record = arm._channel.states.latest()
         assert record is not None
         packages.add(float(record["stamp"]))
         expected = KINEMATICS.forward(record["joints"], flange_from_tool)
@@ -136,7 +136,7 @@ def send_hostile(arm: URArm, mock: MockUR, number: int) -> None:
     joints = []
     for k in range(number):
         # Past the guards of the driver: the worker must stand alone.
-        arm._link.commands.write(command(time.monotonic(), Kind.TARGET, hostile(rng, start)))
+        arm._channel.commands.write(command_record(time.monotonic(), CommandKind.TARGET, hostile(rng, start)))
         time.sleep(0.0005)
         if k % 2000 == 1999:
             page = mock.faults.received(since)
@@ -149,7 +149,7 @@ def send_hostile(arm: URArm, mock: MockUR, number: int) -> None:
     assert len(sent) > number / 100
     assert np.isfinite(sent).all()
     check_path(arm, sent)
-    record = arm._link.states.latest()
+    record = arm._channel.states.latest()
     assert record is not None and record["rejected"] > 0 and record["shortened"] > 0
     assert not arm.status().is_fault
     assert mock.faults.state().program
@@ -213,7 +213,9 @@ def test_a_target_out_of_reach_is_refused_and_the_program_lives(mock: MockUR) ->
         # Past the driver's look: the worker stops where the joints, their speed or a singularity say so.
         far = moved(arm.state().pose, z=2.0)
         since = mock.faults.received().last
-        arm._link.commands.write(command(time.monotonic(), Kind.TARGET, np.array([*far.position, *far.quaternion])))
+        arm._channel.commands.write(
+            command_record(time.monotonic(), CommandKind.TARGET, np.array([*far.position, *far.quaternion]))
+        )
         until(lambda: arm.status() == ArmStatus.OUT_OF_REACH, "out of reach")
         time.sleep(0.5)
         assert mock.faults.state().program

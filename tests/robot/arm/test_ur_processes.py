@@ -279,10 +279,10 @@ def test_both_arms_stop_when_one_does(pair: tuple[URArm, URArm, MockUR]) -> None
         left.command(a)
     until(left.at_rest, "rest")
     # Within two periods of the stop's publication, as the loop of the arm that hears of it counts them.
-    told = right._link.states.recent(HISTORY)
-    told = told[told["status"] == ArmStatus.PROTECTIVE_STOP][0]["beat"]
-    heard = left._link.states.recent(HISTORY)
-    before = heard[heard["beat"] < told][-1]["cycles"]
+    told = right._channel.states.recent(HISTORY)
+    told = told[told["status"] == ArmStatus.PROTECTIVE_STOP][0]["written"]
+    heard = left._channel.states.recent(HISTORY)
+    before = heard[heard["written"] < told][-1]["cycles"]
     assert heard[heard["status"] == ArmStatus.PARTNER_STOPPED][0]["cycles"] - before <= 2
     right.recover()
     left.recover()

@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from robot.arm import shared_ring, worker
-from robot.arm.channel import ArmStatus, Link, Orders
-from robot.arm.ur import _orders
+from robot.arm.channel import ArmStatus, Channel, WorkerConfig
+from robot.arm.ur import _worker_config
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
 
 ROOT = Path(worker.__file__).parents[2]
 NOBODY = f"127.223.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 
 
-def orders(segment: str, **changes: object) -> Orders:
+def worker_config(segment: str, **changes: object) -> WorkerConfig:
     box = Workspace(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
     config = UrArmConfig(
         driver="ur",
@@ -30,7 +30,7 @@ def orders(segment: str, **changes: object) -> Orders:
         limits=ArmLimits(workspace=box),
         mock=MockArmConfig(),
     )
-    return dataclasses.replace(_orders(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(_worker_config(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
 
 
 def start(text: str) -> subprocess.CompletedProcess[str]:
@@ -78,20 +78,20 @@ def test_nobody_else_imports_the_library() -> None:
 
 
 def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
-    segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "failing"), Link.SIZE)
+    segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "failing"), Channel.SIZE)
     try:
-        done = start(orders(segment.name).to_json())
+        done = start(worker_config(segment.name).to_json())
         assert done.returncode == worker.FAILED
         told = json.loads(done.stdout)
         assert told["error"] == "DeviceNotConnectedError"
         assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["text"]
-        latest = Link(segment).states.latest()
+        latest = Channel(segment).states.latest()
         assert latest is not None and latest["status"] == ArmStatus.CONNECTING
     finally:
         segment.close()
 
 
 def test_without_memory_to_write_to_it_says_so() -> None:
-    done = start(orders("tacsim-0-missing").to_json())
+    done = start(worker_config("tacsim-0-missing").to_json())
     assert done.returncode == worker.FAILED
     assert "No such file" in json.loads(done.stdout)["text"]

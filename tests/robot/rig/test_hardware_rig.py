@@ -235,14 +235,14 @@ def test_arms_never_come_nearer_than_the_keep_out(bare: Opened) -> None:
 
 
 def test_arms_are_told_what_is_seen_from_the_first_observation_on(bare: Opened) -> None:
-    links = [arm._driven.arm._link for arm in bare.rig.arms.values()]  # type: ignore[attr-defined]
+    links = [arm._driven.arm._channel for arm in bare.rig.arms.values()]  # type: ignore[attr-defined]
     observation, _ = bare.rig.step(Action())
     oldest = min(touch.time for touch in observation.tactile.values())
-    shown = [link.touches.latest() for link in links]
-    assert [float(touch["seen"]) for touch in shown] == [oldest, oldest]
+    shown = [link.tactile.latest() for link in links]
+    assert [float(touch["exposed"]) for touch in shown] == [oldest, oldest]
     assert all(np.isnan(touch["depth"]) for touch in shown)  # grey pictures tell of no height
     bare.rig._start.clear(0)
-    assert all(np.isnan(link.touches.latest()["seen"]) for link in links)
+    assert all(np.isnan(link.tactile.latest()["exposed"]) for link in links)
 
 
 def test_a_start_aside_is_drawn_from_the_seed(shared: Opened) -> None:

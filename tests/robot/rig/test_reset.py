@@ -27,7 +27,7 @@ class StubArm:
         self.stopped = False
         self.told: object = "what was seen last"
 
-    def tell(self, shown: object) -> None:
+    def report_tactile(self, shown: object) -> None:
         self.told = shown
 
     def state(self) -> ArmState:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,10 @@ ROOT = str(Path(shared_ring.__file__).parents[2])
 
 
 @pytest.fixture
-def segment() -> shared_ring.Segment:
-    return shared_ring.create(shared_ring.segment_name(os.getpid(), "test"), shared_ring.Ring.size(RECORD, 8))
+def segment() -> Iterator[shared_ring.Segment]:
+    made = shared_ring.create(shared_ring.segment_name(os.getpid(), "test"), shared_ring.Ring.size(RECORD, 8))
+    yield made
+    made.close()
 
 
 def record(value: float) -> shared_ring.Record:
@@ -30,7 +33,7 @@ def record(value: float) -> shared_ring.Record:
 
 
 def child(code: str, *arguments: str) -> subprocess.Popen[str]:
-    text = "import sys, time, os, numpy as np\nfrom robot import snapshot\n" + textwrap.dedent(code)
+    text = "import sys, time, os, numpy as np\nfrom robot.arm import shared_ring\n" + textwrap.dedent(code)
     return subprocess.Popen(
         [sys.executable, "-c", text, *arguments],
         env={**os.environ, "PYTHONPATH": ROOT},
@@ -59,7 +62,7 @@ def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> Non
     writer = child(
         """
         record = np.dtype([("a", np.float64, 40), ("b", np.uint64)])
-        ring = snapshot.Ring(snapshot.attach(sys.argv[1]).memory, record, 8)
+        ring = shared_ring.Ring(shared_ring.attach(sys.argv[1]).memory, record, 8)
         value, made = 0, np.zeros((), record)
         print("writing", flush=True)
         while os.getppid() == int(sys.argv[2]):
@@ -99,7 +102,7 @@ def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> Non
 
 
 def test_who_only_attached_leaves_the_segment_alone(segment: shared_ring.Segment) -> None:
-    code = "segment = snapshot.attach(sys.argv[1])\nprint(len(segment.memory), flush=True)\n"
+    code = "segment = shared_ring.attach(sys.argv[1])\nprint(len(segment.memory), flush=True)\n"
     assert child(code, segment.name).communicate(timeout=60)[0].strip() == str(len(segment.memory))
     killed = child(code + "time.sleep(60)\n", segment.name)
     assert killed.stdout is not None and killed.stdout.readline()
@@ -113,9 +116,7 @@ def test_who_only_attached_leaves_the_segment_alone(segment: shared_ring.Segment
 
 
 def test_what_a_killed_process_left_is_swept_and_nothing_else(segment: shared_ring.Segment) -> None:
-    code = (
-        "segment = snapshot.create(snapshot.segment_name(os.getpid(), 'gone'), 100)\nprint(segment.name, flush=True)\n"
-    )
+    code = "segment = shared_ring.create(shared_ring.segment_name(os.getpid(), 'gone'), 100)\nprint(segment.name, flush=True)\n"
     killed = child(code + "time.sleep(60)\n")
     assert killed.stdout is not None
     name = killed.stdout.readline().strip()

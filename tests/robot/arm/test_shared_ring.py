@@ -117,7 +117,7 @@ def test_who_only_attached_leaves_the_segment_alone(segment: shared_ring.Segment
 
 def test_what_a_killed_process_left_is_swept_and_nothing_else(segment: shared_ring.Segment) -> None:
     code = "segment = shared_ring.create(shared_ring.segment_name(os.getpid(), 'gone'), 100)\n"
-        "print(segment.name, flush=True)\n"
+    code += "print(segment.name, flush=True)\n"
     killed = child(code + "time.sleep(60)\n")
     assert killed.stdout is not None
     name = killed.stdout.readline().strip()

@@ -11,7 +11,6 @@ from robot.cli.errors import FAILED
 from robot.cli.output import busy, results, say_files
 
 if TYPE_CHECKING:
-    from robot.studies.dump_view import Replay
     from tacsim.physics.failure.dump import Dump
 
 
@@ -27,58 +26,57 @@ def debug(
     Example: tacsim debug runs/first/diverged/00
     """
     with busy("reading"):
-        from robot.studies import dump_view as dumps
+        from robot.studies import dump_view
         from tacsim.physics.failure.dump import read
 
         found = read(dump)
-        world = dumps.open_world(found)
-    _print_facts(found)
-    _print_table(dumps.table(found))
+        world = dump_view.open_world(found)
+    _print_error(found)
+    _print_table(dump_view.table(found), dump_view.TITLES)
     picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
     with busy("drawing"):
-        dumps.draw(found, picture)
+        dump_view.draw(found, picture)
+    diverged = False
     if again:
         with busy("running the motion again"):
-            outcome = dumps.replay(found, world)
-        results.print(_said(outcome), markup=False)
+            outcome = dump_view.replay(found, world)
+        diverged = outcome.failure is not None
+        if outcome.stats is not None:
+            retries, settled = outcome.stats.retries, "yes" if outcome.stats.settled else "no"
+            how = f"after {retries} retries" if retries else "at the first attempt"
+            said = f"does not diverge: reached its targets {how}, settled: {settled}"
+        elif outcome.identical:
+            said = "diverges again, exactly as recorded, to the last bit"
+        else:
+            said = f"diverges again, otherwise than recorded: {outcome.failure}"
+        results.print(f"replay    {said}", markup=False)
     say_files(picture)
-    if again and outcome.failure is not None:
+    if diverged:
         raise typer.Exit(FAILED)
 
 
-def _print_facts(dump: Dump) -> None:
+def _print_error(dump: Dump) -> None:
     info = dump.info
-    results.print(f"cause     {info.cause}", markup=False)
-    if info.place:
-        results.print(f"at        {info.place}", markup=False)
-    results.print(f"where     {info.where}", markup=False)
-    if info.refine > 1:
-        results.print(f"retried   down to 1/{info.refine} of the time step")
     made = ", ".join(f"{name} {version}" for name, version in info.versions.items())
-    results.print(f"written   {info.time}, {made}", markup=False)
-    results.print(f"advice    {info.advice}", markup=False)
+    lines = {
+        "cause": info.cause,
+        "at": info.place,
+        "where": info.where,
+        "retried": f"down to 1/{info.refine} of the time step" if info.refine > 1 else "",
+        "written": f"{info.time}, {made}",
+        "advice": info.advice,
+    }
+    for name, line in lines.items():
+        if line:
+            results.print(f"{name:10}{line}", markup=False)
 
 
-def _print_table(rows: list[tuple[str, dict[str, str]]]) -> None:
+def _print_table(rows: dict[str, dict[str, str]], titles: dict[str, str]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from robot.studies.dump_view import TITLES
-
-    shown = [moment for moment in TITLES if any(moment in values for _, values in rows)]
-    table = Table("", *(TITLES[moment] for moment in shown), box=None, padding=(0, 2, 0, 0))
-    for what, values in rows:
-        table.add_row(what, *(escape(values.get(moment, "")) for moment in shown))
+    shown = [moment for moment in titles if any(moment in values for values in rows.values())]
+    table = Table("", *(titles[moment] for moment in shown), box=None, padding=(0, 2, 0, 0))
+    for row, values in rows.items():
+        table.add_row(row, *(escape(values.get(moment, "")) for moment in shown))
     results.print(table)
-
-
-def _said(outcome: Replay) -> str:
-    """What the replay showed, in words."""
-    if outcome.stats is not None:
-        stats = outcome.stats
-        how = f"after {stats.retries} retries" if stats.retries else "at the first attempt"
-        return f"replay    does not diverge: reached its targets {how}, settled: {'yes' if stats.settled else 'no'}"
-    words = (
-        "exactly as recorded, to the last bit" if outcome.identical else f"otherwise than recorded: {outcome.failure}"
-    )
-    return f"replay    diverges again, {words}"

@@ -14,23 +14,28 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.geometry.shapes import distance
 from tacsim.interface import Pose
-from tacsim.models.scene import Indenter, Scene
+from tacsim.models.scene import Scene
 from tacsim.physics.exec import layout
-from tacsim.physics.failure import diagnosis
-from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, no_dumps
+from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, millimetres, particle_volumes
+from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dumps_in
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.snapshot import State
 from tacsim.physics.world import MoveStats, World, make_world
 from tacsim.report.figure import COLOURS, INK, canvas, plain, save
 
-State = Mapping[str, NDArray[Any]]
 TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"}
-BOOKKEEPING = ("poses", "rates", "speed", "true_inertia")  # no arrays of the kernels: kept of "before" alone
-PICKED = 6000  # particles drawn at most
+HEALTH = {
+    "overlap": "deepest overlap [mm]",
+    "capped": "overlaps capped",
+    "off_grid": "off the grid",
+    "courant": "time step / the wave's, most squeezed element or cell",
+}
+MOST_DRAWN = 6000  # particles
 
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What came of running the motion again."""
+    """What came of running the motion again: the failure, or how it went."""
 
     failure: SimulationDiverged | None
     stats: MoveStats | None
@@ -42,117 +47,80 @@ def open_world(dump: Dump) -> World:
 
     Raises DumpError for arrays that do not belong to the scene, and what making a world raises.
     """
-    _check_sizes(dump)
     world = make_world(dump.info.scene)
-    own = world.snapshot()
-    for moment in MOMENTS:
-        state = dump.states[moment]
-        if moment != "before" and not state:
-            continue
-        unknown = sorted(set(state) - set(own))
-        if unknown:
-            raise DumpError(f"array '{moment}.{unknown[0]}' is none of this scene's: {', '.join(own)}")
-        for name, a in own.items():
-            if moment != "before" and name in BOOKKEEPING and name not in state:
-                continue
-            found = state.get(name)
-            if found is None or found.shape != a.shape or found.dtype != a.dtype:
-                shown = "nothing" if found is None else f"{found.dtype} {found.shape}"
-                raise DumpError(f"array '{moment}.{name}' must be {a.dtype} {a.shape} for this scene, found {shown}")
     try:
         world.restore(dump.states["before"])
-    except ValueError as error:  # poses that are none
-        raise DumpError(f"the state before the motion is unsound: {error}") from None
+    except ValueError as error:
+        raise DumpError(f"the state before the motion does not fit the dump's scene: {error}") from None
     return world
-
-
-def _check_sizes(dump: Dump) -> None:
-    """Before anything is allocated for the scene: it must need as many gel nodes as the dump holds."""
-    scene, before = dump.info.scene, dump.states["before"]
-    if scene.physics == "seed":
-        from tacsim.physics.seed.world import gel_lattice
-
-        needed, name = int(np.prod([float(n) for n in gel_lattice(scene.gel, scene.spacing).count])), "position"
-    else:
-        from tacsim.physics.gel.gel import gel_params
-
-        nodes = (float(n + 1) for n in gel_params(scene.gel, scene.element).elements)
-        needed, name = int(np.prod([*nodes, len(scene.sensors)])), "gel_displacement"
-    held = before[name].size // 3 if name in before else 0
-    if held < needed:
-        raise DumpError(f"the scene has {needed:,} gel nodes, but 'before.{name}' holds {held:,}")
 
 
 def replay(dump: Dump, world: World) -> Replay:
     """Runs the motion again, with all its retries; leaves `world` in the state before it, or in the new one.
 
-    Raises LoadNotReached (tacsim.physics.motion.load) if it gets further this time, and a load it holds is out of
-    reach.
+    Raises DumpError for a command that makes no sense in this scene, and LoadNotReached (tacsim.physics.motion.load) if
+    it gets further this time, but a load is out of reach.
     """
-    order = dump.order
-    with no_dumps():
-        try:
-            return Replay(None, world.move(order.targets, order.loads, order.duration, flow=order.flow), False)
-        except SimulationDiverged as failure:
-            same = (failure.cause, failure.where) == (dump.info.cause, dump.info.where)
-            for moment, state in (("good", failure.good), ("failed", failure.failed)):
-                recorded = dump.states[moment]
-                same = same and recorded.keys() == state.keys()
-                same = same and all(recorded[name].tobytes() == a.tobytes() for name, a in state.items())
-            return Replay(failure, None, same)
+    try:
+        command = dump.command
+        with dumps_in(None):
+            stats = world.move(command.targets, command.loads, command.duration, flow=command.flow)
+    except SimulationDiverged as failure:
+        same = (failure.cause, failure.where) == (dump.info.cause, dump.info.where)
+        for moment, state in (("good", failure.good), ("failed", failure.failed)):
+            recorded = dump.states[moment]
+            same &= recorded.keys() == state.keys()
+            same = same and all(recorded[name].tobytes() == a.tobytes() for name, a in state.items())
+        return Replay(failure, None, same)
+    except (KeyError, ValueError) as error:
+        raise DumpError(f"the motion cannot be run again: {error.args[0]}") from None
+    return Replay(None, stats, False)
 
 
 # ------------------------------------------------------------------ table
 
 
-def table(dump: Dump) -> list[tuple[str, dict[str, str]]]:
-    """Rows (what, value by moment) of the moments that the dump holds."""
-    scene = dump.info.scene
+def table(dump: Dump) -> dict[str, dict[str, str]]:
+    """Values by row and moment, of the moments that the dump holds."""
     rows: dict[str, dict[str, str]] = {}
     for moment in MOMENTS:
-        if dump.states[moment]:
-            for what, value in _facts_of(dump.states[moment], scene):
-                rows.setdefault(what, {})[moment] = value
-    if dump.info.health:
-        seen = dump.info.health
-        said = {"overlap": "deepest overlap [mm]", "capped": "overlaps capped", "off_grid": "off the grid"}
-        said["courant"] = "time step / the wave's, most squeezed element or cell"
-        rows |= {words: {"failed": seen[key]} for key, words in said.items() if key in seen}
-    return list(rows.items())
+        for row, value in _figures(dump.states[moment], dump.info.scene).items():
+            rows.setdefault(row, {})[moment] = value
+    return rows | {row: {"failed": dump.info.health[key]} for key, row in HEALTH.items() if key in dump.info.health}
 
 
-def _facts_of(state: State, scene: Scene) -> list[tuple[str, str]]:
-    bad = sum(int((~np.isfinite(a)).sum()) for a in state.values())
-    info = [("numbers not finite", f"{bad:,} of {sum(a.size for a in state.values()):,}")]
-    elements = diagnosis.element_volumes(state, scene.gel.size[2] * 1e3)
-    particles = diagnosis.particle_volumes(state)
-    info += [("smallest volume ratio, gel elements", _least(elements))] if elements is not None else []
-    corners = diagnosis.corner_volumes(state, scene.gel.size[2] * 1e3)
-    info += [("smallest at a corner of one", _least(corners))] if corners is not None else []
-    info += [("smallest volume ratio, particles", _least(particles))] if particles is not None else []
+def _figures(state: State, scene: Scene) -> dict[str, str]:
+    if not state:
+        return {}
+    bad, thickness = sum(int((~np.isfinite(a)).sum()) for a in state.values()), scene.gel.size[2] * 1e3
+    figures = {"numbers not finite": f"{bad:,} of {sum(a.size for a in state.values()):,}"}
+    for row, volumes in (
+        ("smallest volume ratio, gel elements", element_volumes(state, thickness)),
+        ("smallest at a corner of one", corner_volumes(state, thickness)),
+        ("smallest volume ratio, particles", particle_volumes(state)),
+    ):
+        if volumes is not None:
+            figures[row] = _extreme(volumes)
     for name, words in (("gel_velocity", "gel nodes"), ("velocity", "particles")):
         if name in state:
-            info.append((f"fastest of {words} [wave speed]", _least(-np.abs(state[name]), -1.0)))
-    for words, vectors in _forces_of(state, len(scene.sensors)):
-        info.append((f"{words} [N]", "  ".join(diagnosis.millimetres(v) for v in vectors)))
-    return info
-
-
-def _forces_of(state: State, gels: int) -> list[tuple[str, NDArray[Any]]]:
-    """What pressed on each gel and on its backing, (gels, 3)."""
+            figures[f"fastest of {words} [wave speed]"] = _extreme(np.abs(state[name]), largest=True)
+    gels = len(scene.sensors)
     if "sums" in state:  # of the kernels' parts
-        contact = state["sums"][:, layout.FORCE : layout.FORCE + 6 * gels].sum(axis=0).reshape(gels, 6)[:, :3]
+        force = state["sums"][:, layout.FORCE : layout.FORCE + 6 * gels].sum(axis=0).reshape(gels, 6)
+        figures["contact force [N]"] = "  ".join(map(millimetres, force[:, :3]))
         backing = state["sums"][:, layout.BACKING : layout.BACKING + 3].reshape(gels, -1, 3).sum(axis=1)
-        return [("contact force", contact), ("force at backing", backing)]
-    found = (("contact force", "wrench"), ("force at backing", "backing"))
-    return [(words, state[name].reshape(gels, -1)[:, :3]) for words, name in found if name in state]
+        figures["force at backing [N]"] = "  ".join(map(millimetres, backing))
+    elif "backing" in state:
+        figures["force at backing [N]"] = "  ".join(map(millimetres, state["backing"].reshape(gels, -1)[:, :3]))
+    return figures
 
 
-def _least(values: NDArray[Any], sign: float = 1.0) -> str:
-    """The smallest of the finite values, and how many are not finite."""
+def _extreme(values: NDArray[Any], largest: bool = False) -> str:
+    """The smallest (or largest) of the finite values, and how many are not finite."""
     finite = values[np.isfinite(values)]
     bad = values.size - finite.size
-    return (f"{sign * float(finite.min()):.4g}" if finite.size else "none") + (f"  ({bad:,} not finite)" if bad else "")
+    found = f"{float(finite.max() if largest else finite.min()):.4g}" if finite.size else "none"
+    return f"{found}  ({bad:,} not finite)" if bad else found
 
 
 # ------------------------------------------------------------------ picture
@@ -161,9 +129,9 @@ def _least(values: NDArray[Any], sign: float = 1.0) -> str:
 def draw(dump: Dump, path: Path) -> None:
     """Writes a picture: a cut through body and gels in the world's x-z plane, at every moment that the dump holds."""
     moments = [moment for moment in MOMENTS if dump.states[moment]]
-    figure = canvas(5.2 * len(moments), 4.6)
-    figure.suptitle(_title(dump), fontsize=9, color=INK, x=0.01, ha="left")
-    scene = dump.info.scene
+    figure, scene = canvas(5.2 * len(moments), 4.6), dump.info.scene
+    title = f"{dump.info.cause} at {dump.info.place}"
+    figure.suptitle(title[:200].replace("$", r"\$"), fontsize=9, color=INK, x=0.01, ha="left")
     depth, width = scene.gel.size[2] * 1.1e3, scene.gel.size[0] * 0.6e3
     heights = [float(pose.position[2]) * 1e3 for pose in dump.poses("before").values()]
     for column, moment in enumerate(moments):
@@ -171,8 +139,7 @@ def draw(dump: Dump, path: Path) -> None:
         axes = plain(figure.add_subplot(1, len(moments), column + 1), TITLES[moment], "x [mm]", "z [mm]")
         _draw_gels(axes, dump.states[moment], scene, poses)
         _draw_particles(axes, dump.states[moment], scene)
-        if scene.indenter is not None:
-            _draw_indenter(axes, scene.indenter, poses["indenter"])
+        _draw_indenter(axes, scene, poses)
         middle = float(poses["lower"].position[0]) * 1e3
         axes.set(xlim=(middle - width, middle + width), ylim=(min(heights) - depth, max(heights) + depth))
         axes.set_aspect("equal")
@@ -180,56 +147,42 @@ def draw(dump: Dump, path: Path) -> None:
     save(figure, path)
 
 
-def _title(dump: Dump) -> str:
-    text = f"{dump.info.cause} at {dump.info.place}".replace("$", r"\$")
-    return text if len(text) < 200 else text[:197] + "..."
-
-
 def _draw_gels(axes: Axes, state: State, scene: Scene, poses: Mapping[str, Pose]) -> None:
     """Lattice lines of each gel's middle plane."""
-    if "gel_displacement" not in state:
-        return
-    size = np.array(scene.gel.size) * 1e3
-    for index, name in enumerate(scene.sensors):
+    for index, name in enumerate(scene.sensors if "gel_displacement" in state else ()):
         u = state["gel_displacement"][index].astype(np.float64)
-        nodes = (np.array(np.unravel_index(np.arange(u[..., 0].size), u.shape[:3])).T).reshape(*u.shape[:3], 3)
-        rest = (nodes / (np.array(u.shape[:3]) - 1) - [0.5, 0.5, 1.0]) * size
-        cut = (rest + u)[:, u.shape[1] // 2]
-        x, z = _to_world(cut, poses[name])
-        axes.plot(x, z, color=COLOURS[index], linewidth=0.5)
-        axes.plot(x.T, z.T, color=COLOURS[index], linewidth=0.5)
-
-
-def _to_world(points: NDArray[np.float64], pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x and z [mm] of points (..., 3) [mm] of a frame; those that are not finite or absurd are left out (NaN)."""
-    flat = points.reshape(-1, 3)
-    shown = np.where(np.abs(flat) < 1e6, flat, np.nan)  # NaN compares false
-    world = shown @ Rotation.from_quat(pose.quaternion).as_matrix().T + pose.position * 1e3
-    return world[:, 0].reshape(points.shape[:-1]), world[:, 2].reshape(points.shape[:-1])
+        shares = np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in u.shape[:3]), indexing="ij")
+        at = (np.stack(shares, axis=-1) - [0.5, 0.5, 1.0]) * np.array(scene.gel.size) * 1e3 + u
+        cut = at[:, u.shape[1] // 2]
+        cut = np.where(np.abs(cut) < 1e6, cut, np.nan)  # what is absurd is left out, and so is NaN
+        pose = poses[name]
+        world = cut @ Rotation.from_quat(pose.quaternion).as_matrix().T + pose.position * 1e3
+        for lines in (world, world.swapaxes(0, 1)):
+            axes.plot(lines[..., 0], lines[..., 2], color=COLOURS[index], linewidth=0.5)
 
 
 def _draw_particles(axes: Axes, state: State, scene: Scene) -> None:
     """Particles within one spacing of the middle plane, coloured by their volume ratio."""
     if "position" not in state:
         return
-    x = state["position"].astype(np.float64)
+    x, volumes = state["position"].astype(np.float64), particle_volumes(state)
     finite = np.abs(x).max(axis=1) < 1e6
     middle = float(np.median(x[finite, 1])) if finite.any() else 0.0
     near = np.flatnonzero(finite & (np.abs(x[:, 1] - middle) <= scene.spacing * 1e3))
-    near = near[:: -(-len(near) // PICKED)] if len(near) else near
-    volumes = diagnosis.particle_volumes(state)
+    near = near[:: max(1, -(-len(near) // MOST_DRAWN))]
     colour = np.ones(len(x)) if volumes is None else np.nan_to_num(volumes, nan=0.0, posinf=2.0, neginf=0.0)
     dots = axes.scatter(x[near, 0], x[near, 2], c=colour[near], s=6, cmap="coolwarm_r", vmin=0.8, vmax=1.2)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label="volume ratio")
 
 
-def _draw_indenter(axes: Axes, indenter: Indenter, pose: Pose) -> None:
-    """Outline of the indenter in the middle plane."""
-    reach = 10e-3
-    a = np.linspace(-reach, reach, 161)
+def _draw_indenter(axes: Axes, scene: Scene, poses: Mapping[str, Pose]) -> None:
+    """Outline of the indenter in the middle plane, within 10 mm of its centre."""
+    if scene.indenter is None:
+        return
+    pose, a = poses["indenter"], np.linspace(-10e-3, 10e-3, 161)
     x, z = np.meshgrid(a, a, indexing="ij")
     points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     local = Rotation.from_quat(pose.quaternion).inv().apply(points)
-    value = distance(indenter.geometry, local).reshape(x.shape)
+    value = distance(scene.indenter.geometry, local).reshape(x.shape)
     at = pose.position * 1e3
     axes.contour(x * 1e3 + at[0], z * 1e3 + at[2], value, levels=[0.0], colors=INK, linewidths=1.2)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,51 +27,15 @@ NO_ROOM = "restore a snapshot in which its particles are together; worlds of a s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
-    """Where in a motion a launch is, in words, and the poses of the driven frames at its end."""
+class LaunchSpan:
+    """Which part of a motion a launch is, in words, and the poses of the driven frames at its end."""
 
     words: str
-    poses: Mapping[str, Pose]
+    poses: Mapping[str, Pose] = field(default_factory=dict)
 
     def __str__(self) -> str:
         at = (f"{name} at {diagnosis.millimetres(1e3 * pose.position)} mm" for name, pose in self.poses.items())
         return ", ".join([self.words, *at])
-
-
-class SimulationDiverged(RuntimeError):
-    """No step size gave a finite, physical state. The world is as it was before the motion.
-
-    good, failed: arrays at the start and at the end of the launch that went wrong, where they are known; health: what
-    its kernels saw. `dump`: the folder that `tacsim debug` reads, if one was written.
-    """
-
-    def __init__(self, cause: str, where: str, advice: str = ADVICE, *, retry: bool = True) -> None:
-        """retry: a smaller time step might do better."""
-        super().__init__(cause, where, advice)
-        self.retry = retry
-        self.cause, self.where, self.advice = cause, where, advice
-        self.place = ""  # of the worst entry: which particle or node, where [mm]
-        self.quantity: diagnosis.Quantity = "not finite"  # by which the worst entry is found
-        self.good: State = {}
-        self.failed: State = {}
-        self.poses: Mapping[str, Pose] = {}  # of the driven frames at the end of that launch
-        self.health: Health | None = None
-        self.refine = 1  # the step was cut into so many at the last attempt
-        self.dump: Path | None = None
-        self.no_dump = ""  # why there is none
-
-    def of_launch(self, good: State, failed: State, where: Place) -> Self:
-        """Keeps what a dump wants of the launch that went wrong: the arrays before and after it, and the poses then."""
-        self.good, self.failed, self.poses = good, copies(failed), where.poses
-        return self
-
-    def __str__(self) -> str:
-        steps = f"even with 1/{self.refine} of the time step; " if self.refine > 1 else ""
-        place = f" at {self.place}" if self.place else ""
-        text = f"simulation diverged: {self.cause}{place}; {self.where}; {steps}{self.advice}"
-        if self.dump is not None:
-            return f"{text}; to look into it: tacsim debug {self.dump}"
-        return f"{text}; {self.no_dump}" if self.no_dump else text
 
 
 @dataclass(frozen=True)
@@ -102,59 +66,84 @@ class Health:
             float(most[layout.FASTEST]), counts[1], float(most[layout.OVERLAP]), courant,
         )  # fmt: skip
 
-    def complaint(self) -> tuple[str, diagnosis.Quantity] | None:
-        """What is unphysical, and the quantity that shows where; None when all is well."""
-        if not self.smallest_volume_ratio > SMALLEST_VOLUME_RATIO:
-            return f"a gel element is inverted or crushed (volume ratio {self.smallest_volume_ratio:.3g})", "node speed"
-        if not self.smallest_step_volume > SMALLEST_STEP_VOLUME:
-            return f"a particle lost its volume in one substep (ratio {self.smallest_step_volume:.3g})", "speed"
-        if not self.fastest < FASTEST:
-            return f"a particle moves at {self.fastest:.3g} of the wave speed (limit {FASTEST})", "speed"
-        if self.off_grid:
-            return f"particles left the grid ({self.off_grid} particle substeps)", "speed"
-        if self.courant > LARGEST_COURANT:
-            words = f"the time step is {self.courant:.3g} of what the pressure wave takes through the most squeezed"
-            return f"{words} element or grid cell (limit {LARGEST_COURANT:g})", "element length"
-        return None
+
+class SimulationDiverged(RuntimeError):
+    """No step size gave a finite, physical state. The world is as it was before the motion."""
+
+    def __init__(
+        self, cause: str, where: LaunchSpan, advice: str = ADVICE, *, retry: bool = True,
+        quantity: diagnosis.Quantity = "not finite", good: State | None = None, failed: State | None = None,
+        health: Health | None = None,
+    ) -> None:  # fmt: skip
+        """retry: a smaller time step might do better; quantity: that by which the worst particle or node is found.
+
+        good, failed: the world's arrays before and after the launch that went wrong, and what its kernels saw, where
+        there was a launch.
+        """
+        super().__init__(cause, where, advice)
+        self.cause, self.where, self.advice, self.retry, self.quantity = cause, str(where), advice, retry, quantity
+        self.poses = where.poses if failed else {}
+        self.good, self.failed, self.health = good or {}, copies(failed or {}), health
+        self.place = ""  # of the worst entry: which particle or node, where [mm]
+        self.refine = 1  # the step was cut into so many at the last attempt
+        self.dump: Path | None = None  # the folder that `tacsim debug` reads, if one was written
+        self.no_dump = ""  # why there is none
+
+    def __str__(self) -> str:
+        at = f" at {self.place}" if self.place else ""
+        steps = [f"even with 1/{self.refine} of the time step"] if self.refine > 1 else []
+        dump = [self.no_dump] if self.no_dump else []
+        if self.dump is not None:
+            dump = [f"to look into it: tacsim debug {self.dump}"]
+        return "; ".join([f"simulation diverged: {self.cause}{at}", self.where, *steps, self.advice, *dump])
 
 
-def judged(arrays: State, good: State, health: Health, where: Place) -> Health:
+def check_launch(arrays: State, good: State, health: Health, where: LaunchSpan) -> Health:
     """`health` of a launch that changed `arrays` from `good` to what they are.
 
     Raises SimulationDiverged if that is unphysical; tacsim.physics.motion.retry rolls back and tries again.
     """
-    complaint = health.complaint() or _complaint(arrays)
-    if complaint is None:
-        return health
-    words, quantity = complaint
-    failure = SimulationDiverged(words, str(where)).of_launch(good, arrays, where)
-    failure.quantity, failure.health = quantity, health
-    raise failure
+    fault = _fault(arrays, health)
+    if fault is not None:
+        words, quantity = fault
+        raise SimulationDiverged(words, where, quantity=quantity, good=good, failed=arrays, health=health)
+    return health
 
 
-def _complaint(arrays: State) -> tuple[str, diagnosis.Quantity] | None:
-    """What the kernels don't watch: numbers that are not finite, gel nodes too fast, crushed particles."""
-    found = diagnosis.not_finite(arrays)
-    if found is not None:
-        return found, "not finite"
-    speed = diagnosis.fastest_node(arrays)
-    if speed > FASTEST:
-        return f"a gel node moves at {speed:.3g} of the wave speed (limit {FASTEST})", "node speed"
+def _fault(arrays: State, health: Health) -> tuple[str, diagnosis.Quantity] | None:
+    """What is unphysical, and the quantity that shows where; None when all is well."""
+    if not health.smallest_volume_ratio > SMALLEST_VOLUME_RATIO:
+        return f"a gel element is inverted or crushed (volume ratio {health.smallest_volume_ratio:.3g})", "node speed"
+    if not health.smallest_step_volume > SMALLEST_STEP_VOLUME:
+        ratio = health.smallest_step_volume
+        return f"a particle lost its volume in one substep (ratio {ratio:.3g})", "particle speed"
+    if not health.fastest < FASTEST:
+        return f"a particle moves at {health.fastest:.3g} of the wave speed (limit {FASTEST})", "particle speed"
+    if health.off_grid:
+        return f"particles left the grid ({health.off_grid} particle substeps)", "particle speed"
+    if health.courant > LARGEST_COURANT:
+        words = f"the time step is {health.courant:.3g} of what the pressure wave takes through the most squeezed"
+        return f"{words} element or grid cell (limit {LARGEST_COURANT:g})", "element length"
+    entry = diagnosis.not_finite(arrays)
+    if entry is not None:
+        return entry, "not finite"
+    node = float(np.abs(arrays["gel_velocity"]).max()) if "gel_velocity" in arrays else 0.0
+    if node > FASTEST:
+        return f"a gel node moves at {node:.3g} of the wave speed (limit {FASTEST})", "node speed"
     volumes = diagnosis.particle_volumes(arrays)
     if volumes is not None and not volumes.min() > SMALLEST_VOLUME_RATIO:
         return f"a particle is crushed (elastic volume ratio {volumes.min():.3g})", "particle volume"
     return None
 
 
-def require_room(low: NDArray[Any], high: NDArray[Any], cell: float, where: Place, most: int = LARGEST_GRID) -> None:
+def require_room(
+    low: NDArray[Any], high: NDArray[Any], cell: float, where: LaunchSpan, most: int = LARGEST_GRID
+) -> None:
     """Raises SimulationDiverged for a grid from `low` to `high` (3,) [mm] with more nodes than `most`, what there is
     memory for, or LARGEST_GRID."""
     most = min(most, LARGEST_GRID)
     counts = (np.asarray(high, np.float64) - np.asarray(low, np.float64)) / cell + 1
     if not float(np.prod(counts)) <= most:
         size = " x ".join(f"{length:.4g}" for length in (counts - 1) * cell)
-        raise SimulationDiverged(
-            f"particles spread over {size} mm, which needs a grid of {np.prod(counts):.3g} nodes (limit {most:.3g})",
-            str(where),
-            NO_ROOM,
-        )
+        needed = f"a grid of {np.prod(counts):.3g} nodes (limit {most:.3g})"
+        raise SimulationDiverged(f"particles spread over {size} mm, which needs {needed}", where, NO_ROOM)

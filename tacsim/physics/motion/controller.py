@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.models.scene import Settling
-from tacsim.physics.failure.health import Place, SimulationDiverged
+from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tacsim.physics.motion.path import MM, Path
 from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
@@ -103,7 +103,7 @@ class Prepared:
 
     launch: Launch
     drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel
-    where: Place
+    where: LaunchSpan
     good: State  # the environment's arrays before it
 
 

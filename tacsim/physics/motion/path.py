@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.failure.health import Place
+from tacsim.physics.failure.health import LaunchSpan
 
 MM = 1e3
 PEAK = 1.875  # peak slope of the ramp over its mean
@@ -98,7 +98,7 @@ class Path:
         cubic: NDArray[np.float64] = t * t * (3 - 2 * t) * whole + t * (1 - t) * ((1 - t) * before - t * after)
         return cubic
 
-    def place(self, names: Iterable[str], first: int, last: int) -> Place:
+    def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
         """Where the frames called `names` are on substeps first..last."""
         part = (
             f"substeps {first} to {last} of {self.substeps} of the motion"
@@ -111,7 +111,7 @@ class Path:
             if way[3:].any():
                 quaternion = (Rotation.from_rotvec(way[3:]) * Rotation.from_quat(quaternion)).as_quat()
             poses[name] = Pose(a.position + way[:3] / MM, quaternion)
-        return Place(f"in {part}", poses)
+        return LaunchSpan(f"in {part}", poses)
 
 
 def way_between(a: Pose, b: Pose) -> NDArray[np.float64]:

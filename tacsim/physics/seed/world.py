@@ -20,7 +20,7 @@ from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 from tacsim.physics.exec.layout import NUMBERS
-from tacsim.physics.failure.health import Health, Place, SimulationDiverged, judged, require_room
+from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
 from tacsim.physics.motion.controller import Motion, Reading, Scheme, move_and_settle, run
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import MM, Path, plan, resolve_targets
@@ -242,7 +242,7 @@ class SeedWorld(BaseWorld):
     def _advance(self, path: Path, first: int, last: int) -> Reading:
         """Substeps first to last of a path, in one launch."""
         aside = int(self._aside.sum())
-        where = path.place(self.sensors, first, last)
+        where = path.span(self.sensors, first, last)
         x0, y0 = self._fit_grid(path, first, last, where)
 
         def launch() -> Health:
@@ -253,12 +253,12 @@ class SeedWorld(BaseWorld):
             return Health.read(health, path.step / self._smallest_cell(drive))
 
         good = copies(self.arrays())
-        health = judged(self.arrays(), good, launch(), where)
+        health = check_launch(self.arrays(), good, launch(), where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
-            failure = SimulationDiverged("every particle of the body left the grid", str(where))
-            raise failure.of_launch(good, self.arrays(), where)
+            cause = "every particle of the body left the grid"
+            raise SimulationDiverged(cause, where, quantity="particle speed", good=good, failed=self.arrays())
         scheme = Scheme(path.step, GEL_DAMPING, health.courant)
         overlap = self._overlap(path, last)
         return Reading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
@@ -278,7 +278,7 @@ class SeedWorld(BaseWorld):
             self._momentum, self._gain, self._backing, health, self._gel, self._body, step,
         )  # fmt: skip
 
-    def _fit_grid(self, path: Path, first: int, last: int, where: Place) -> tuple[float, float]:
+    def _fit_grid(self, path: Path, first: int, last: int, where: LaunchSpan) -> tuple[float, float]:
         """Makes the grid cover what the particles can reach; returns x, y of node (0, 0), whole multiples of dx."""
         from tacsim.physics.seed.kernels import PAD
 

@@ -45,7 +45,7 @@ from tacsim.physics.exec.layout import (
     TURNING,
 )  # fmt: skip
 from tacsim.physics.exec.team import run_team
-from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, judged, require_room
+from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
 from tacsim.physics.gel.gel import MM, MPA, GelState, gel_params, one_lattice
 from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
@@ -231,7 +231,7 @@ class HybridWorld(FemWorld):
         drive = path.drive(launch.first, launch.last)
         driven = max(self._mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
         margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
-        where = path.place(self._poses, launch.first, launch.last)
+        where = path.span(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
         low, high = bounds(x)
         reach = margin + BORDER / 2 * self._body.cell
@@ -239,9 +239,7 @@ class HybridWorld(FemWorld):
         try:
             state.particles.fit(index, self._body.cell, margin, state.params, state.counts)
         except MemoryError as error:
-            raise SimulationDiverged(
-                f"no memory for the grid round the particles ({error})", str(where), NO_ROOM
-            ) from None
+            raise SimulationDiverged(f"no memory for the grid round the particles ({error})", where, NO_ROOM) from None
         good = copies(self.arrays())
         state.params[index, STEP] = path.step
         self._note_inertia(x)
@@ -263,7 +261,7 @@ class HybridWorld(FemWorld):
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
-        health = judged(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
+        health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
         self._speed = health.fastest
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
@@ -290,6 +288,7 @@ class HybridWorld(FemWorld):
         if found > most:
             raise SimulationDiverged(
                 f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",
-                str(prepared.where), "keep the sensors further apart, or use physics 'seed'", retry=False,
-            ).of_launch(prepared.good, self.arrays(), prepared.where)  # fmt: skip
+                prepared.where, "keep the sensors further apart, or use physics 'seed'", retry=False,
+                good=prepared.good, failed=self.arrays(),
+            )  # fmt: skip
         return found

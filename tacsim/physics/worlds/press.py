@@ -51,7 +51,7 @@ from tacsim.physics.exec.team import (
     piece_done,
     run_team,
 )
-from tacsim.physics.failure.health import Health, SimulationDiverged, judged
+from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
 from tacsim.physics.gel.gel import (
     MM,
     MPA,
@@ -255,16 +255,16 @@ class PressWorld(FemWorld):
     def prepare(self, launch: Launch) -> Prepared:
         """Sets this environment's numbers for a launch. Raises SimulationDiverged: too much of a mesh to lay."""
         path = launch.path
-        where = path.place(self._poses, launch.first, launch.last)
+        where = path.span(self._poses, launch.first, launch.last)
         both = path.drive(launch.first, launch.last)
         drive = relative_drive(both[:, 0], both[:, 1])
         try:
             self._cover(drive)
         except ValueError as error:
-            raise SimulationDiverged(str(error), str(where), TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(str(error), where, TOO_MUCH, retry=False) from None
         except MemoryError as error:
             cause = f"no memory for the distances from the indenter's mesh ({error})"
-            raise SimulationDiverged(cause, str(where), TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(cause, where, TOO_MUCH, retry=False) from None
         good = copies(self.arrays())
         self._state.params[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
@@ -292,7 +292,7 @@ class PressWorld(FemWorld):
     def outcome(self, prepared: Prepared) -> Reading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
-        health = judged(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
+        health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
@@ -327,8 +327,8 @@ class PressWorld(FemWorld):
                 f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
                 f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
             )
-            failure = SimulationDiverged(cause, str(prepared.where), advice, retry=False)
-            raise failure.of_launch(prepared.good, self.arrays(), prepared.where)
+            good = prepared.good
+            raise SimulationDiverged(cause, prepared.where, advice, retry=False, good=good, failed=self.arrays())
 
 
 def _require_resolved(geometry: Shape, gel: GelParams) -> None:

@@ -72,7 +72,7 @@ def test_a_motion_at_constant_load_is_replayed_with_its_load(
     with dumps_in(tmp_path), pytest.raises(SimulationDiverged):
         world.move({}, loads)
     dump = read(tmp_path / "00")
-    assert dump.info.loads == loads and dump.order.targets == {}
+    assert dump.info.loads == loads and dump.command.targets == {}
     assert dump_view.replay(dump, dump_view.open_world(dump)).identical
 
 
@@ -80,7 +80,7 @@ def test_the_table_tells_what_is_wrong(tmp_path: Path, monkeypatch: pytest.Monke
     dump = read(diverge(SCENES["hybrid"], tmp_path, monkeypatch))
     dump.states["failed"]["velocity"][:3] = np.nan
     dump.states["failed"]["gel_displacement"][0, 2, 2, 4, 2] = -1.5  # the element is 1 mm high
-    rows = dict(dump_view.table(dump))
+    rows = dump_view.table(dump)
     assert rows["numbers not finite"]["failed"].startswith("9 of ")
     assert rows["numbers not finite"]["before"].startswith("0 of ")
     assert float(rows["smallest at a corner of one"]["failed"]) == pytest.approx(-0.5, abs=0.02)
@@ -97,16 +97,17 @@ def test_arrays_of_another_scene_are_refused(tmp_path: Path, monkeypatch: pytest
         (place / "dump.json").write_text(json.dumps({**info, "scene": {**info["scene"], **scene}}))
         return tacsim("debug", place)
 
-    fewer = changed(element_size=2e-3)
-    assert fewer.exit_code == 2 and "'before.gel_displacement' must be float32" in fewer.output
-    huge = changed(element_size=0.05e-3)  # a thousand times as much memory
-    assert huge.exit_code == 2 and "gel nodes, but 'before.gel_displacement' holds" in huge.output
-    other = changed(particle_spacing=1e-3)
-    assert other.exit_code == 2 and "for this scene, found" in other.output
+    for scene in ({"element_size": 2e-3}, {"particle_spacing": 1e-3}):
+        result = changed(**scene)
+        assert result.exit_code == 2 and "is it of this scene?" in result.output
     (place / "dump.json").write_text(json.dumps(info))
     dump = read(place)
     dump.states["before"]["poses"][0, 3:] = 0.0
-    with pytest.raises(DumpError, match=r"unsound: .*'lower': Pose\.quaternion"):
+    with pytest.raises(DumpError, match=r"does not fit .*'lower': Pose\.quaternion"):
+        dump_view.open_world(dump)
+    dump = read(place)
+    dump.states["before"]["rates"][:] = np.inf
+    with pytest.raises(DumpError, match="'rates' is not finite"):
         dump_view.open_world(dump)
 
 
@@ -123,36 +124,16 @@ def test_a_run_that_diverges_leaves_a_dump_and_says_where(tmp_path: Path, monkey
     assert nowhere.exit_code == 2 and "is no dump: it has no dump.json" in nowhere.output
 
 
-def test_an_altered_dump_is_refused_with_file_and_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_that_makes_no_sense_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = diverge(SCENES["press"], tmp_path, monkeypatch)
-    text, arrays = (place / "dump.json").read_text(), (place / "state.npz").read_bytes()
-    here, none = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], [0.0] * 7
-
-    def refused(said: str) -> None:
+    info = json.loads((place / "dump.json").read_text())
+    for change, said in (
+        ({"targets": {"other": [0.0] * 6 + [1.0]}}, "cannot be run again: no driven frame other"),
+        ({"loads": {"other": 1.0}}, "cannot be run again: no sensor 'other'"),
+        ({"loads": {"lower": -1.0}}, "load of 'lower' is -1 N"),
+        ({"duration": 1e308}, "duration is 1e+308 s"),
+        ({"duration": 1e-3, "flow": True}, "give one of the two"),
+    ):
+        (place / "dump.json").write_text(json.dumps({**info, **change}))
         result = tacsim("debug", place)
         assert result.exit_code == 2 and said in " ".join(result.output.split()), result.output
-
-    for change, said in (
-        ({"poses": {"other": here}}, "dump.json: poses.indenter: this scene drives lower, indenter"),
-        ({"poses": {"lower": none, "indenter": here}}, "dump.json: poses.lower: Pose.quaternion must have unit length"),
-        ({"failed_poses": {"lower": here}}, "dump.json: failed_poses.indenter"),
-        ({"targets": {"other": here}}, "dump.json: targets.other: this scene drives"),
-        ({"loads": {"other": 1.0}}, "dump.json: loads.other: must be 0 N or more on one of lower, found 1"),
-        ({"loads": {"lower": -1.0}}, "dump.json: loads.lower"),
-        ({"duration": 1e308}, "dump.json: duration: Input should be less than or equal to 1000"),
-    ):
-        (place / "dump.json").write_text(json.dumps({**json.loads(text), **change}))
-        refused(said)
-    (place / "dump.json").write_text(text)
-
-    for name, array, said in (
-        ("before.rates", np.full((2, 6), np.inf), "state.npz: before.rates: not all of its numbers are finite"),
-        ("good.position", np.zeros(3, np.float32), "array 'good.position' is none of this scene's"),
-        ("before.strain", np.zeros((3, 2), np.float32), "array 'before.strain' is none of this scene's"),
-        ("good.gel_displacement", None, "array 'good.gel_displacement' must be float32"),
-    ):
-        (place / "state.npz").write_bytes(arrays)
-        with np.load(place / "state.npz", allow_pickle=False) as archive:
-            altered = {**archive, name: array}
-        np.savez(place / "state.npz", **{key: a for key, a in altered.items() if a is not None})
-        refused(said)

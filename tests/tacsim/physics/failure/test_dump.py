@@ -16,7 +16,7 @@ import pytest
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.physics.failure import dump
-from tacsim.physics.failure.dump import MOST_DUMPS, DumpError, dumps_in, no_dumps, read
+from tacsim.physics.failure.dump import MOST_DUMPS, DumpError, dumps_in, read
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.press import PressWorld
 
@@ -80,7 +80,7 @@ def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, mon
     monkeypatch.setenv(dump.FOLDER, str(tmp_path / "mine"))
     with dumps_in(tmp_path / "theirs"):
         assert os.environ[dump.FOLDER] == str(tmp_path / "mine")
-        with no_dumps():
+        with dumps_in(None):
             assert os.environ[dump.FOLDER] == ""
     assert os.environ[dump.FOLDER] == str(tmp_path / "mine")
     monkeypatch.delenv(dump.FOLDER)
@@ -92,7 +92,7 @@ def test_the_environment_goes_before_the_folder_of_a_command(tmp_path: Path, mon
 def test_it_holds_all_that_a_replay_needs(made: Path) -> None:
     found = read(made)
     assert found.info.scene == SCENE
-    assert found.order.targets["indenter"].position == pytest.approx([0, 0, 3.1e-3 - TOO_DEEP])
+    assert found.command.targets["indenter"].position == pytest.approx([0, 0, 3.1e-3 - TOO_DEEP])
     assert found.poses("before")["indenter"].position == pytest.approx([0, 0, 3.1e-3])
     assert found.poses("failed")["indenter"].position[2] < 3.1e-3
     assert found.info.versions["numpy"] == np.__version__ and found.info.refine == 4
@@ -127,8 +127,7 @@ def test_an_stl_file_comes_along(tmp_path: Path) -> None:
     assert isinstance(geometry, Mesh) and Path(geometry.path) == tmp_path / "out" / "00" / "shape.stl"
     assert press_through(PressWorld(found.info.scene)).cause == found.info.cause
     edit(tmp_path / "out" / "00", lambda d: d["scene"]["indenter"]["geometry"].update(path="/etc/hosts"))
-    with pytest.raises(DumpError, match=r"no STL file but its own shape\.stl, not /etc/hosts"):
-        read(tmp_path / "out" / "00")
+    assert read(tmp_path / "out" / "00").info.scene == found.info.scene  # a dump names no file but its own
 
 
 def test_dumps_are_numbered_and_few(tmp_path: Path) -> None:
@@ -182,7 +181,7 @@ def npy(array: np.ndarray, **options: Any) -> bytes:
     return file.getvalue()
 
 
-def test_arrays_are_read_with_suspicion(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrays_that_cannot_be_read_are_refused(copied: Path) -> None:
     sound = (copied / "state.npz").read_bytes()
 
     def refused(words: str) -> None:
@@ -191,18 +190,13 @@ def test_arrays_are_read_with_suspicion(copied: Path, monkeypatch: pytest.Monkey
         (copied / "state.npz").write_bytes(sound)
 
     rewrite(copied, "before.objects.npy", npy(np.array([{"a": 1}], dtype=object), allow_pickle=True))
-    refused("object of shape")
-    lying = npy(np.zeros(8, np.float32)).replace(b"(8,)", b"(9,)")
-    rewrite(copied, "before.lying.npy", lying)
-    refused(r"32 bytes where shape \(9,\)")
+    refused("Object arrays cannot be loaded")  # nothing in a dump is executed
+    rewrite(copied, "before.lying.npy", npy(np.zeros(8, np.float32)).replace(b"(8,)", b"(9,)"))
+    refused("damaged")
     rewrite(copied, "../escape.npy", npy(np.zeros(1)))
-    refused("no array of a dump")
-    rewrite(copied, "before.words.npy", b"not an array")
-    refused("magic string")
+    refused("no moment of a dump")
     (copied / "state.npz").write_bytes(sound[: len(sound) // 2])
     refused("damaged")
-    monkeypatch.setattr(dump, "MOST_BYTES", 1000)
-    refused("the limits are 100 and 1,000")
     (copied / "state.npz").unlink()
     with pytest.raises(DumpError, match="incomplete"):
         read(copied)

@@ -185,15 +185,15 @@ def test_a_step_that_diverges_is_taken_back_with_its_speed_and_dumped(
     assert {name: a.tobytes() for name, a in world.snapshot().items()} == before
     assert failure.value.dump is not None
     found = dump.read(failure.value.dump)
-    assert found.order.flow
+    assert found.command.flow
     assert replay(found, open_world(found)).identical
 
 
 def test_what_excludes_each_other_is_refused() -> None:
     world = PressWorld(BALL)
-    with pytest.raises(ValueError, match="a motion that flows"):
+    with pytest.raises(ValueError, match="flowing motion"):
         world.move({}, loads={"lower": 1.0}, flow=True)
-    with pytest.raises(ValueError, match="a motion that flows"):
+    with pytest.raises(ValueError, match="flowing motion"):
         world.move({}, duration=0.1, flow=True)
     with pytest.raises(ValueError, match="'seed' settles every motion"):
         SeedWorld(CUBE.model_copy(update={"physics": "seed"})).move({}, flow=True)

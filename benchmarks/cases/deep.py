@@ -14,7 +14,8 @@ from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import Gel, Scene
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
 
 SIDE = 10e-3  # of the cube [m]
 SHARES = (0.5, 0.8)  # of its height, by which sensors close

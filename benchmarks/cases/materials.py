@@ -14,8 +14,8 @@ from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import FloatArray
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Scene
+from tacsim.physics.move import MoveStats
 from tacsim.physics.oracle import laws
-from tacsim.physics.world import MoveStats
 
 CLAY = BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=30e3)
 RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um

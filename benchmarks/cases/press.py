@@ -15,8 +15,8 @@ from benchmarks.truth.limit import GRID_PITCH, load_limit, rms, surface_profile
 from tacsim.geometry.shapes import extent
 from tacsim.interface import Pose
 from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
+from tacsim.physics.move import MoveStats
 from tacsim.physics.oracle.layer import LayerContact, layer_contact
-from tacsim.physics.world import MoveStats
 
 if TYPE_CHECKING:
     from tacsim.physics.worlds.press import PressWorld

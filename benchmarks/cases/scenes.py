@@ -15,7 +15,8 @@ from benchmarks.cases.squeeze import PRESETS, STEP, close, closer, normal_forces
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
 from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
 
 DEPTH = 0.3e-3  # of an indenter [m]
 CLOSE = 0.3e-3  # both sensors together [m]

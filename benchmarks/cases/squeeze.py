@@ -15,7 +15,8 @@ from benchmarks.truth.roughness import print_roughness
 from tacsim.compute.threads import map_parallel
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
 
 if TYPE_CHECKING:
     from tacsim.interface import FloatArray

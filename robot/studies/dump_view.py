@@ -19,8 +19,9 @@ from tacsim.physics.exec import layout
 from tacsim.physics.failure.diagnosis import corner_volumes, element_volumes, millimetres, particle_volumes
 from tacsim.physics.failure.dump import MOMENTS, Dump, DumpError, dumps_in
 from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.world import World, make_world
 from tacsim.report.figure import COLOURS, INK, canvas, plain, save
 
 TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"}

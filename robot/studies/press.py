@@ -21,7 +21,8 @@ from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, sample_surface
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
 
 # A surface point nearer to the indenter than this share of a gel element is in contact: the gel surface is a spline on
 # its elements, which follows the indenter no closer. Enlarges the radius of a ball's contact by about 4 %.

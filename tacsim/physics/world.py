@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,6 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import GelSurface, Scene
 from tacsim.physics.move import MoveStats
-
-if TYPE_CHECKING:
-    from tacsim.physics.worlds.batch import Batch
-
-__all__ = ["MoveStats", "World", "make_batch", "make_world"]
 
 
 class World(Protocol):
@@ -90,10 +85,3 @@ def make_world(scene: Scene) -> World:
     from tacsim.physics.worlds.hybrid import HybridWorld
 
     return HybridWorld(scene)
-
-
-def make_batch(scenes: Sequence[Scene]) -> Batch:
-    """Worlds of several scenes that advance in one launch. Raises ValueError for scenes that cannot share one."""
-    from tacsim.physics.worlds.batch import Batch
-
-    return Batch(scenes)

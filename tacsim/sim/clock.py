@@ -8,7 +8,8 @@ from dataclasses import asdict, replace
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.rig import SimMotion
-from tacsim.physics.world import MoveStats, World
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World
 
 
 class SimClock:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.control.approach import NoTouch
 from tacsim.interface import FloatArray, Pose, TactileFrame, Truth
-from tacsim.physics.world import MoveStats, World
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World
 from tacsim.sim.clock import SimClock
 from tacsim.sim.sensor import SimSensor
 

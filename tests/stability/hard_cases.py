@@ -38,8 +38,9 @@ from tacsim.models.scene import (
 from tacsim.physics.failure import diagnosis, health
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.retry import RETRIES
+from tacsim.physics.move import MoveStats
 from tacsim.physics.seed import world as seed_world
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds import hybrid, press
 
 Targets = Mapping[str, Pose]

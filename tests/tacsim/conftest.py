@@ -12,7 +12,7 @@ from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import GelSurface, Scene
-from tacsim.physics.world import MoveStats
+from tacsim.physics.move import MoveStats
 from tacsim.rig import Rig
 
 HEIGHT, RADIUS, GAP = 10e-3, 0.25e-3, 0.5e-3  # of the body; of a particle; between gel and body at first [m]

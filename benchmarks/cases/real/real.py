@@ -20,7 +20,8 @@ from benchmarks.harness.runner import Case
 from calibration.light.circle import NoCircle, contact_circle
 from tacsim.interface import Pose
 from tacsim.models.scene import Gel, GelMaterial, Indenter, Scene, Settling, Sphere
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
 
 Float64 = NDArray[np.float64]
 

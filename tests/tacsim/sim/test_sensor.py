@@ -11,7 +11,7 @@ from tacsim.control.approach import NoTouch
 from tacsim.interface import Action, Pose, SensorSpec
 from tacsim.limits import LimitExceeded
 from tacsim.models.hardware import ArmLimits, Workspace
-from tacsim.physics.world import MoveStats
+from tacsim.physics.move import MoveStats
 from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import TOUCH_TOLERANCE, SimReset, approach_force

@@ -29,7 +29,8 @@ from tacsim.physics.exec.lanes import COPIES, MOST
 from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.motion.retry import RETRIES
-from tacsim.physics.world import MoveStats, World, make_world
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds import press
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld

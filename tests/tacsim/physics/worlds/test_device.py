@@ -22,7 +22,8 @@ from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Mesh, Sc
 from tacsim.physics.exec.layout import SHAPE_FIRST
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.controller import Launch
-from tacsim.physics.world import MoveStats, World
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld

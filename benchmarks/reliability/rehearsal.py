@@ -24,9 +24,9 @@ from robot.arm.channel import HISTORY, Channel
 from robot.arm.shared_ring import Record
 from robot.arm.ur import URArm
 from robot.common.kinematics import Kinematics
+from robot.common.loopback import loopback_host
 from robot.mock import Input, MockState, MockUR
 from robot.mock.ur.machine.arm import HOME
-from robot.mock.wire_client import loopback_host
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, Plane, UrArmConfig, Workspace

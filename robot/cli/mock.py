@@ -45,18 +45,21 @@ def mock(
     hosts = host or [f"127.0.0.{2 + index}" for index in range(arms)]
     if not hosts and not cameras:
         raise typer.BadParameter("nothing to run: give at least one arm or camera", param_hint="--arms, --cameras")
-    seen_from = [hosts[index] if index < len(hosts) else f"127.0.0.{2 + index}" for index in range(cameras)]
+    camera_hosts = [hosts[index] if index < len(hosts) else f"127.0.0.{2 + index}" for index in range(cameras)]
     with Interrupt() as interrupt, ExitStack() as stack:
-        controllers = stack.enter_context(MockArms(hosts, model=model, allow_network=allow_network)) if hosts else None
-        eyes = [stack.enter_context(MockCamera(each, camera_port, allow_network=allow_network)) for each in seen_from]
+        devices: list[MockArms | MockCamera] = []
+        if hosts:
+            devices.append(stack.enter_context(MockArms(hosts, model=model, allow_network=allow_network)))
         ports = ", ".join(map(str, sorted(PORTS)))
         for each in hosts:
             results.print(f"{model} at {each}: ports {ports}; faults {FAULT_PORT}")
-        for eye in eyes:
-            results.print(f"camera at {eye.url}", markup=False)
+        for each in camera_hosts:
+            camera = stack.enter_context(MockCamera(each, camera_port, allow_network=allow_network))
+            devices.append(camera)
+            results.print(f"camera at {camera.url}", markup=False)
         results.print("Ctrl-C ends them.")
-        while not interrupt() and (controllers is None or controllers.running) and all(eye.running for eye in eyes):
+        while not interrupt():
+            for device in devices:
+                device.check()
             time.sleep(0.1)
-        if interrupt():
-            raise typer.Exit(interrupt.exit_code)
-        raise RuntimeError("a process of the mocks has ended by itself; its reason stands above")
+        raise typer.Exit(interrupt.exit_code)

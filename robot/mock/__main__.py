@@ -7,7 +7,6 @@ input ends or its parent is gone, so that no mock outlives who started it.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import selectors
 import signal
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, cast
 
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import MODELS
+from robot.common.process import write_message
 from robot.common.realtime import CONTROLLER, ask_for_realtime
 from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
@@ -45,8 +45,7 @@ def serve(all_facts: Sequence[ControllerConfig], fault_port: int, *, with_parent
                 fault_servers.append(FaultServer(controllers[-1], selector, fault_port))
             if with_parent:
                 _watch_input(selector, lambda: ended.append("input"))
-            sys.stdout.write(json.dumps({"ready": [config.host for config in all_facts]}) + "\n")
-            sys.stdout.flush()
+            write_message(sys.stdout.buffer, {"ready": [config.host for config in all_facts]})
             _loop(selector, controllers, fault_servers, ended, os.getppid() if with_parent else None)
         finally:
             for server in fault_servers:
@@ -137,8 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         serve(config, given.fault_port, with_parent=given.with_parent)
     except (OSError, ValueError) as error:
         message = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        sys.stdout.write(json.dumps({"error": message}) + "\n")
-        sys.stdout.flush()
+        write_message(sys.stdout.buffer, {"error": message})
         return 1
     return 0
 

@@ -6,12 +6,12 @@ so tests may run side by side.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
 
+from robot.common.loopback import loopback_host
 from robot.mock.camera.camera import MockCamera
 from robot.mock.ur.handle import MockUR
 from tacsim.rig import Rig
@@ -21,7 +21,7 @@ ROOM = 31  # second number of the addresses
 
 def mock_host(number: int) -> str:
     """A loopback address of this process's own, number 1 to 254."""
-    return f"127.{ROOM}.{os.getpid() % 250 + 1}.{number}"
+    return loopback_host(number, ROOM)
 
 
 def rig_addresses() -> list[str]:

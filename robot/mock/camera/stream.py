@@ -68,7 +68,9 @@ class FrameSource:
             return self.counts["images"]
 
     def set_fault(self, name: str, value: Any) -> None:
-        """Sets one of `Faults`."""
+        """Sets one of `Faults`. Raises ValueError for another name."""
+        if name not in Faults.__dataclass_fields__:
+            raise ValueError(f"no command '{name}'")
         with self._changed:
             setattr(self._faults, name, value)
             self._changed.notify_all()

@@ -55,7 +55,7 @@ class HertzCell:
         self._balls = {name: se3.compose(pose, ahead).position for name, pose in self._poses.items()}
         self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
         self._noise = {name: noise_source(model, name) for name, model in models.items()}
-        self._looks = count()
+        self._pictures = count()
         self._drawn: OrderedDict[tuple[str | int, ...], tuple[NDArray[np.uint8], SurfaceMap]] = OrderedDict()
 
     @property
@@ -91,11 +91,11 @@ class HertzCell:
         depth, x, y = _contact(self._poses[name], self._balls[name])
         return self._wrench(depth, x, y)
 
-    def look(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
+    def render(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
         """Picture (H, W, 3) and surface of a sensor."""
-        image, surface = self._look(name, *_contact(self._poses[name], self._balls[name]))
+        image, surface = self._draw(name, *_contact(self._poses[name], self._balls[name]))
         noise = self._noise[name]
-        return image if noise is None else noise(image, next(self._looks)), surface
+        return image if noise is None else noise(image, next(self._pictures)), surface
 
     def _wrench(self, depth: float, x: float, y: float) -> FloatArray:
         """(6,) on the sensor, about its origin: the ball pushes along its -z."""
@@ -104,7 +104,7 @@ class HertzCell:
         force = 4.0 / 3.0 * modulus * np.sqrt(RADIUS) * max(0.0, depth) ** 1.5
         return np.array([0.0, 0.0, -force, -y * force, x * force, 0.0])
 
-    def _look(self, name: str, depth: float, x: float, y: float) -> tuple[NDArray[np.uint8], SurfaceMap]:
+    def _draw(self, name: str, depth: float, x: float, y: float) -> tuple[NDArray[np.uint8], SurfaceMap]:
         from tacsim.optics.surface import surface_map
 
         # All places without touch look the same.

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import ipaddress
-import json
-import os
-import selectors
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from robot.common import MOCK_SERIAL
+from robot.common.loopback import require_loopback
+from robot.common.process import Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
 from robot.mock.ur.machine.machine import Version
@@ -61,18 +55,11 @@ class MockArms:
         if realtime:
             arguments.append("--realtime")
         check_hosts(self.hosts, allow_network)
-        root = str(Path(__file__).resolve().parents[3])
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "robot.mock", *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for the parent; the mock ends with it
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))},
-        )
-        self.pid = self._process.pid
+        self._child = Child("robot.mock", arguments, name=f"mock controller on {', '.join(hosts)}", error=MockError)
+        self.pid = self._child.pid
         self.fault_clients = tuple(FaultClient(host, fault_port) for host in self.hosts)
         try:
-            self._wait(ready_timeout)
+            self._child.receive(ready_timeout)
         except BaseException:
             self.close()
             raise
@@ -80,49 +67,23 @@ class MockArms:
     @property
     def running(self) -> bool:
         """False once the process has ended."""
-        return self._process.poll() is None
+        return self._child.running
+
+    def check(self) -> None:
+        """Raises MockError, with its reason, if the process has ended."""
+        self._child.check()
 
     def close(self) -> None:
-        """Ends the process; again does nothing."""
+        """Ends the process; a second call does nothing."""
         for faults in self.fault_clients:
             faults.close()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
-        if self._process.poll() is not None:
-            return
-        # A stopped process hears neither the end of its input nor SIGTERM.
-        for patience, end in ((2.0, self._process.terminate), (1.0, self._process.kill)):
-            try:
-                self._process.wait(patience)
-                return
-            except subprocess.TimeoutExpired:
-                end()
-        self._process.wait()
+        self._child.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-    def _wait(self, limit: float) -> None:
-        pipe = self._process.stdout
-        assert pipe is not None
-        deadline, said = time.monotonic() + limit, b""
-        with selectors.DefaultSelector() as selector:
-            selector.register(pipe, selectors.EVENT_READ)
-            while not said.endswith(b"\n"):
-                if not selector.select(max(0.0, deadline - time.monotonic())):
-                    raise MockError(f"mock controller on {', '.join(self.hosts)}: not ready after {limit:g} s")
-                data = os.read(pipe.fileno(), 4096)
-                if not data:
-                    code = self._process.wait()
-                    raise MockError(f"mock controller on {', '.join(self.hosts)} ended at once, exit code {code}")
-                said += data
-        message = json.loads(said)
-        if "error" in message:
-            raise MockError(message["error"])
 
 
 class MockUR(MockArms):
@@ -162,16 +123,8 @@ class MockUR(MockArms):
 
 
 def check_hosts(hosts: Sequence[str], allow_network: bool) -> None:
-    """Raises ValueError unless every host is a numeric loopback address, or the network is allowed."""
+    """Raises ValueError unless the hosts are different loopback addresses, or the network is allowed."""
     if not hosts or len(set(hosts)) < len(hosts):
         raise ValueError(f"mock controllers need different hosts, at least one, got {list(hosts)}")
     for host in hosts:
-        try:
-            loopback = ipaddress.ip_address(host).is_loopback
-        except ValueError:
-            raise ValueError(f"'{host}' is no address; a mock controller listens on one like 127.0.0.2") from None
-        if not (loopback or allow_network):
-            raise ValueError(
-                f"{host} is not a loopback address: a mock controller there could be taken for a robot by the whole "
-                "network. Use 127.x.y.z, or ask for it with --allow-network"
-            )
+        require_loopback(host, "mock controller", allow_network=allow_network)

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import pytest
 
 from robot.mock import FaultClient, MockUR
-from robot.mock.wire_client import loopback_host
+from tests.robot.mock.wire_client import wire_host
 
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[MockUR]:
-    with MockUR(loopback_host(2), ready_timeout=60) as mock:
+    with MockUR(wire_host(2), ready_timeout=60) as mock:
         yield mock
 
 

@@ -10,14 +10,14 @@ import pytest
 
 from robot.camera.camera import Camera
 from robot.mock import FaultClient
-from robot.mock.wire_client import TIMEOUT, loopback_host
 from tacsim.models.hardware import CameraSensorConfig
+from tests.robot.mock.wire_client import TIMEOUT, wire_host
 
 START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 
 
 def test_it_serves_until_ctrl_c() -> None:
-    hosts = [loopback_host(40), loopback_host(41)]
+    hosts = [wire_host(40), wire_host(41)]
     options = [word for host in hosts for word in ("--host", host)]
     process = subprocess.Popen([*START, *options, "--model", "ur3e"], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -33,7 +33,7 @@ def test_it_serves_until_ctrl_c() -> None:
 
 
 def test_cameras_stand_at_the_arms_addresses() -> None:
-    host = loopback_host(42)
+    host = wire_host(42)
     options = ["--host", host, "--cameras", "1", "--camera-port", "8090"]
     process = subprocess.Popen([*START, *options], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

@@ -12,7 +12,7 @@ import pytest
 
 from robot.mock import FaultClient, FaultError, MockUR
 from robot.mock.ur.wire.controller import PORTS
-from robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, loopback_host
+from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, wire_host
 
 
 def until(done: Callable[[], bool], what: str) -> None:
@@ -179,9 +179,9 @@ def test_black_hole(mock: MockUR, faults: FaultClient) -> None:
 
 
 def test_a_black_hole_ends_as_quietly_as_any_mock() -> None:
-    with MockUR(loopback_host(8), ready_timeout=60) as mock:
+    with MockUR(wire_host(8), ready_timeout=60) as mock:
         mock.faults.black_hole(True)
-    assert mock._process.returncode == 0
+    assert mock._child._process.returncode == 0
 
 
 def test_delay_is_at_least_what_was_asked(mock: MockUR, faults: FaultClient) -> None:
@@ -332,8 +332,6 @@ def test_reset_makes_it_as_new(mock: MockUR, faults: FaultClient) -> None:
         other.receive()
 
 
-def test_calls_to_a_door_that_is_not_there() -> None:
-    from robot.mock.wire_client import loopback_host
-
+def test_calls_to_a_mock_that_is_not_there() -> None:
     with pytest.raises(FaultError, match=r"127\.21\..*:30020, state: .*refused"):
-        FaultClient(loopback_host(200)).state()
+        FaultClient(wire_host(200)).state()

@@ -60,7 +60,7 @@ def test_pictures_change_where_the_ball_touches_and_only_there(cell: HertzCell) 
 
     def picture(depth: float, x: float) -> np.ndarray:
         cell.move(pressed(depth, x))
-        return cell.look("lower")[0].astype(int)
+        return cell.render("lower")[0].astype(int)
 
     calm = picture(-0.2e-3, 0.0)
     assert np.array_equal(calm, picture(-0.3e-3, 1e-3))
@@ -95,9 +95,9 @@ def test_a_camera_with_noise_shows_another_picture_each_time_and_the_same_surfac
     noisy = SensorModel(noise=CameraNoise(deviation=(2, 2, 2)))
     made = HertzCell(scene, {"lower": SensorModel(), "upper": noisy}, CanonicalGrid())
     cell.place(made.poses())
-    plain = cell.look("upper")[0].astype(float)
-    first, second = made.look("upper"), made.look("upper")
+    plain = cell.render("upper")[0].astype(float)
+    first, second = made.render("upper"), made.render("upper")
     assert (first[0] - plain).std() == pytest.approx(2.0, rel=0.05)
     assert np.corrcoef((first[0] - plain).ravel(), (second[0] - plain).ravel())[0, 1] < 0.1
     np.testing.assert_array_equal(first[1].height, second[1].height)
-    np.testing.assert_array_equal(made.look("lower")[0], made.look("lower")[0])
+    np.testing.assert_array_equal(made.render("lower")[0], made.render("lower")[0])

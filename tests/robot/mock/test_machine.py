@@ -13,8 +13,8 @@ from robot.mock.ur.machine.arm import PERIOD, Arm
 from robot.mock.ur.machine.commands import REALTIME
 from robot.mock.ur.machine.load import GRAVITY, Wall
 from robot.mock.ur.machine.machine import Machine, Mode, Runtime, Safety
-from robot.mock.wire_client import control_script
 from tacsim.interface import FloatArray
+from tests.robot.mock.wire_client import control_script
 
 DOWN = (-0.4, -0.2, 0.3, 0.0, math.pi, 0.0)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import pytest
 
 from robot.mock import FaultError, MockArms, MockError, MockUR
-from robot.mock.wire_client import TIMEOUT, ControlClient, loopback_host
+from tests.robot.mock.wire_client import TIMEOUT, ControlClient, wire_host
 
 
 def until(done: Callable[[], bool], what: str) -> None:
@@ -32,26 +32,26 @@ def alive(pid: int) -> bool:
 
 
 def test_close_leaves_nothing_and_may_be_repeated() -> None:
-    mock = MockUR(loopback_host(10), ready_timeout=60)
+    mock = MockUR(wire_host(10), ready_timeout=60)
     assert mock.running and mock.faults.state().tick >= 0
     mock.close()
     mock.close()
     assert not alive(mock.pid) and not mock.running
     with pytest.raises(FaultError):
         mock.faults.state()
-    with MockUR(loopback_host(10), ready_timeout=60):
+    with MockUR(wire_host(10), ready_timeout=60):
         pass  # the ports are free again at once
 
 
 def test_options_arrive() -> None:
     joints = [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
-    with MockUR(loopback_host(11), model="ur3e", joints=joints, fault_port=30555, ready_timeout=60) as mock:
+    with MockUR(wire_host(11), model="ur3e", joints=joints, fault_port=30555, ready_timeout=60) as mock:
         assert mock.faults.port == 30555
         assert mock.faults.state().joints == pytest.approx(joints)
 
 
 def test_two_arms_in_one_process_do_not_touch() -> None:
-    hosts = [loopback_host(12), loopback_host(13)]
+    hosts = [wire_host(12), wire_host(13)]
     with MockArms(hosts, ready_timeout=60) as arms, ControlClient(hosts[0]) as client:
         client.call(9, [0, 0, 0, 0, 0, 0.5, 2.0, 0])
         until(lambda: arms.fault_clients[0].state().joint_speeds[5] > 0.4, "the first moves")
@@ -61,7 +61,7 @@ def test_two_arms_in_one_process_do_not_touch() -> None:
 
 
 def test_a_port_in_use_is_named() -> None:
-    host = loopback_host(14)
+    host = wire_host(14)
     with MockUR(host, ready_timeout=60) as first:
         with pytest.raises(MockError, match=rf"cannot listen on {host}:\d+: .*in use"):
             MockUR(host, ready_timeout=60)
@@ -73,7 +73,7 @@ def test_a_port_in_use_is_named() -> None:
     [
         (["10.0.0.1"], "not a loopback address"),
         (["0.0.0.0"], "not a loopback address"),
-        (["localhost"], "is no address"),
+        (["robot.example"], "not a loopback address"),
         ([], "at least one"),
         (["127.0.0.9", "127.0.0.9"], "different hosts"),
     ],
@@ -85,16 +85,16 @@ def test_addresses_that_are_refused(hosts: list[str], words: str) -> None:
 
 def test_joints_that_are_refused() -> None:
     with pytest.raises(MockError, match=r"within \+-2 pi"):
-        MockUR(loopback_host(15), joints=[7, 0, 0, 0, 0, 0], ready_timeout=60)
+        MockUR(wire_host(15), joints=[7, 0, 0, 0, 0, 0], ready_timeout=60)
     with pytest.raises(MockError, match="6 finite"):
-        MockUR(loopback_host(15), joints=[0, 0], ready_timeout=60)
+        MockUR(wire_host(15), joints=[0, 0], ready_timeout=60)
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
 def test_it_dies_with_its_parent(end: signal.Signals) -> None:
     code = (
         "import sys, time; from robot.mock import MockUR\n"
-        f"mock = MockUR({loopback_host(16)!r}, ready_timeout=60); print(mock.pid, flush=True); time.sleep(600)"
+        f"mock = MockUR({wire_host(16)!r}, ready_timeout=60); print(mock.pid, flush=True); time.sleep(600)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
@@ -107,7 +107,7 @@ def test_it_dies_with_its_parent(end: signal.Signals) -> None:
 
 
 def test_a_stopped_process_is_ended_too() -> None:
-    with MockUR(loopback_host(17), ready_timeout=60) as mock:
+    with MockUR(wire_host(17), ready_timeout=60) as mock:
         mock.faults.timeout = 0.2
         os.kill(mock.pid, signal.SIGSTOP)
         with pytest.raises(FaultError, match="no answer in time"):
@@ -116,7 +116,7 @@ def test_a_stopped_process_is_ended_too() -> None:
 
 
 def test_it_goes_on_after_a_pause_of_its_process() -> None:
-    with MockUR(loopback_host(18), ready_timeout=60) as mock:
+    with MockUR(wire_host(18), ready_timeout=60) as mock:
         before = mock.faults.state()
         os.kill(mock.pid, signal.SIGSTOP)
         time.sleep(0.3)
@@ -127,21 +127,21 @@ def test_it_goes_on_after_a_pause_of_its_process() -> None:
 
 
 def test_without_a_parent_it_runs_until_it_is_told() -> None:
-    command = [sys.executable, "-m", "robot.mock", loopback_host(19)]
+    command = [sys.executable, "-m", "robot.mock", wire_host(19)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
     assert process.stdout is not None
     with process, process.stdout:
-        assert json.loads(process.stdout.readline()) == {"ready": [loopback_host(19)]}
+        assert json.loads(process.stdout.readline()) == {"ready": [wire_host(19)]}
         process.send_signal(signal.SIGINT)
         assert process.wait(TIMEOUT) == 0
 
 
 def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
     """Without the watchdog the arm goes on for ever, as a real one does; with it, the program ends."""
-    with MockUR(loopback_host(20), ready_timeout=60) as mock:
+    with MockUR(wire_host(20), ready_timeout=60) as mock:
         for watchdog in (False, True):
             code = (
-                "import sys, time; from robot.mock.wire_client import ControlClient\n"
+                "import sys, time; from tests.robot.mock.wire_client import ControlClient\n"
                 f"client = ControlClient({mock.host!r})\n"
                 f"if {watchdog}: client.call(35, [10.0])\n"
                 "client.write(10, [0, 0, -0.01, 0, 0, 0, 0.5, 0]); print('moves', flush=True); \n"

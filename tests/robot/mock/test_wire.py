@@ -19,7 +19,7 @@ from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
 from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
 from robot.mock.ur.wire.rtde import BadPackage, package, packages
-from robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
+from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
 
 
 def until(done: Callable[[], bool], what: str) -> None:

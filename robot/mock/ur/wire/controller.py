@@ -313,7 +313,7 @@ def open_port(host: str, port: int) -> socket.socket:
         listener.close()
         reason = (error.strerror or str(error)).lower()
         raise OSError(
-            error.errno, f"mock controller: cannot listen on {host}:{port}: {reason}; is another mock running there?"
+            error.errno, f"cannot listen on {host}:{port}: {reason}; is another mock running there?"
         ) from None
     listener.setblocking(False)
     return listener

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
 from typing import Self
 
+from robot.common.loopback import loopback_host
 from robot.mock.ur.machine.commands import NEEDS, REALTIME
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS
@@ -17,9 +17,9 @@ from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PR
 TIMEOUT = 20.0  # of whatever a test waits for [s]
 
 
-def loopback_host(number: int, room: int = 21) -> str:
-    """A loopback address of this process's own: test processes that run side by side do not meet."""
-    return f"127.{room}.{os.getpid() % 250 + 1}.{number}"
+def wire_host(number: int) -> str:
+    """A loopback address of this process's own."""
+    return loopback_host(number, 21)
 
 
 def control_script(offset: int = 0, path: Sequence[str] = ()) -> str:

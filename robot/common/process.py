@@ -1,0 +1,221 @@
+"""Child processes of this program (`python -m MODULE`), and the messages between them and their parent.
+
+A message is one line of JSON. Arrays go behind it as bytes: the key "arrays" of the line gives name, type and shape of
+each. A message with the key "error" says that the child could not do what it was asked.
+
+A child ends when its standard input does, so that it never outlives its parent. Ctrl-C reaches the parent alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.errors import DeviceError, DeviceNotConnectedError
+
+Arrays = Mapping[str, NDArray[Any]]
+Message = tuple[dict[str, Any], Arrays]  # what is said, and the arrays with it
+
+LARGEST = 256 * 2**20  # of an array [bytes]
+LONGEST = 2**20  # of a line [bytes]
+PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
+LAST_LINES = 5  # of a dead child's standard error, in the error that tells of it
+
+
+class Child:
+    """A process `python -m module`. A context manager; several threads may use it.
+
+    Args:
+        name: what it is, in errors.
+        error: the class of every error.
+        advice: what to do when it has ended, in errors.
+        environment: added to the parent's.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        arguments: Sequence[str] = (),
+        *,
+        name: str,
+        error: type[DeviceError] = DeviceNotConnectedError,
+        advice: str = "start another",
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self._name, self._error, self._advice = name, error, advice
+        self._lock = threading.RLock()
+        self._closed = False
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,  # Ctrl-C is for the parent, which ends its children in order
+            env={**os.environ, **(environment or {}), "PYTHONPATH": path},
+        )
+        self.pid = self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """False once the process has ended."""
+        return self._process.poll() is None
+
+    def check(self) -> None:
+        """Raises `error` if the process has ended."""
+        if not self.running:
+            raise self._failure(f"has ended, exit status {self._process.returncode}")
+
+    def receive(self, timeout: float) -> Message:
+        """The child's next message; its first one says that it is ready. Raises `error`: it says that it cannot, it has
+        ended, or it says nothing within `timeout` [s] (then it is killed)."""
+        return self._exchange(None, {}, timeout)
+
+    def ask(self, request: dict[str, Any], arrays: Arrays | None = None, *, timeout: float) -> Message:
+        """Sends a request and returns the answer. Raises `error` as `receive` does."""
+        return self._exchange(request, arrays or {}, timeout)
+
+    def close(self, patience: float = PATIENCE) -> None:
+        """Ends the process, by force after `patience` [s]; a second call does nothing."""
+        if not self._lock.acquire(timeout=patience):  # another thread waits for an answer
+            self._process.kill()
+            self._lock.acquire()
+        try:
+            for pipe in (self._process.stdin, self._process.stdout):
+                assert pipe is not None
+                with contextlib.suppress(OSError):  # the process has gone first
+                    pipe.close()
+            try:
+                self._process.wait(patience)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._closed = True
+            self._errors.close()
+        finally:
+            self._lock.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _exchange(self, request: dict[str, Any] | None, arrays: Arrays, timeout: float) -> Message:
+        with self._lock:
+            if self._closed:
+                raise self._error(f"{self._name} is closed; {self._advice}")
+            stdin, stdout = self._process.stdin, self._process.stdout
+            assert stdin is not None and stdout is not None
+            deadline = time.monotonic() + timeout
+            watchdog = threading.Timer(timeout, self._process.kill)  # also ends a write that a stopped child blocks
+            watchdog.daemon = True
+            watchdog.start()
+            try:
+                if request is not None:
+                    write_message(stdin, request, arrays)
+                answer = read_message(stdout)
+                if answer is None:
+                    raise EOFError
+            except (OSError, EOFError) as failure:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(PATIENCE)
+                late = time.monotonic() >= deadline
+                told = (
+                    f"gave no answer within {timeout:g} s" if late else f"has ended, exit status {self._process.poll()}"
+                )
+                raise self._ended(told) from failure
+            except ValueError as failure:
+                raise self._ended(f"sent what is no message: {failure}") from failure
+            except BaseException:  # Ctrl-C: its answer must not be taken for that of the next request
+                self.close(0.0)
+                raise
+            finally:
+                watchdog.cancel()
+        if "error" in answer[0]:
+            raise self._error(f"{self._name}: {answer[0]['error']}")
+        return answer
+
+    def _ended(self, what: str) -> DeviceError:
+        """Ends the process; returns the error that tells of it."""
+        failure = self._failure(what)
+        self.close(0.0)
+        return failure
+
+    def _failure(self, what: str) -> DeviceError:
+        text = f"{self._name} (process {self.pid}) {what}; {self._advice}"
+        if not self._closed:
+            self._errors.seek(0)
+            lines = self._errors.read().decode(errors="replace").strip().splitlines()[-LAST_LINES:]
+            text += "".join(f"\n  {line}" for line in lines)
+        return self._error(text)
+
+
+class Parent:
+    """The other end, inside a child: messages go to standard output, and whatever else is printed to standard error."""
+
+    def __init__(self) -> None:
+        self._answers = os.fdopen(os.dup(1), "wb")
+        os.dup2(2, 1)
+
+    def send(self, message: dict[str, Any], arrays: Arrays | None = None) -> None:
+        write_message(self._answers, message, arrays)
+
+    def serve(self, answer: Callable[[dict[str, Any], Arrays], Message]) -> None:
+        """Answers requests until standard input ends. Whatever `answer` raises goes to the parent as an error."""
+        while True:
+            try:
+                request = read_message(sys.stdin.buffer)
+                if request is None:
+                    return
+                self.send(*answer(*request))
+            except Exception as failure:
+                self.send({"error": f"{type(failure).__name__}: {failure}"})
+
+
+def write_message(pipe: IO[bytes], message: dict[str, Any], arrays: Arrays | None = None) -> None:
+    if arrays:
+        message = {**message, "arrays": [[name, array.dtype.str, array.shape] for name, array in arrays.items()]}
+    pipe.write(json.dumps(message).encode() + b"\n")
+    for array in (arrays or {}).values():
+        pipe.write(array.tobytes())
+    pipe.flush()
+
+
+def read_message(pipe: IO[bytes]) -> Message | None:
+    """The next message; None at the end of the pipe, also in the middle of a message. Raises ValueError for what is no
+    message."""
+    line = pipe.readline(LONGEST)
+    if not line.endswith(b"\n") and len(line) < LONGEST:
+        return None
+    message = json.loads(line)
+    if not isinstance(message, dict):
+        raise ValueError(f"{line[:80]!r}")
+    arrays = {}
+    for name, kind, shape in message.pop("arrays", ()):
+        try:
+            dtype = np.dtype(kind)
+        except TypeError as failure:
+            raise ValueError(str(failure)) from failure
+        size = int(np.prod(shape)) * dtype.itemsize
+        if not 0 <= size <= LARGEST:
+            raise ValueError(f"array '{name}' of {size} bytes; the limit is {LARGEST}")
+        data = pipe.read(size)
+        if len(data) < size:
+            return None
+        arrays[name] = np.frombuffer(data, dtype).reshape(shape)
+    return message, arrays

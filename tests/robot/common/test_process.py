@@ -1,0 +1,222 @@
+"""Child processes and the messages between them and their parent: what goes over, how it fails, what is left."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.common import process
+from robot.common.process import LARGEST, Child, read_message, write_message
+from robot.errors import DeviceError
+
+PATIENCE = 60.0  # for anything that has to happen [s]
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def until(done: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE} s"
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    """False for a zombie, too: who reaps an orphan is not this project's matter."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+# -- messages --------------------------------------------------------------------------------------------------------
+
+
+def message(said: dict[str, object], arrays: dict[str, np.ndarray] | None = None) -> bytes:
+    pipe = io.BytesIO()
+    write_message(pipe, said, arrays)
+    return pipe.getvalue()
+
+
+def test_a_message_comes_back_as_it_was() -> None:
+    arrays = {
+        "image": np.arange(24, dtype=np.uint8).reshape(2, 4, 3),
+        "turned": np.arange(6.0).reshape(2, 3).T,  # not contiguous
+        "none": np.zeros((0, 3), np.float32),
+    }
+    pipe = io.BytesIO(message({"do": "move", "x": [1, 2.5]}, arrays) + message({"second": True}))
+    found = read_message(pipe)
+    assert found is not None
+    said, back = found
+    assert said == {"do": "move", "x": [1, 2.5]}
+    for name, array in arrays.items():
+        assert back[name].dtype == array.dtype
+        np.testing.assert_array_equal(back[name], array)
+    assert read_message(pipe) == ({"second": True}, {})
+    assert read_message(pipe) is None
+
+
+def test_a_message_that_is_cut_off_is_the_end_wherever_it_is_cut() -> None:
+    whole = message({"do": "move"}, {"a": np.ones(5)})
+    assert all(read_message(io.BytesIO(whole[:length])) is None for length in range(len(whole)))
+    assert read_message(io.BytesIO(whole)) is not None
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"arrays": [["a", "|u1", [%d]]]}' % (LARGEST + 1),  # nothing of that size is read
+        b'{"arrays": [["a", "|u1", [-1]]]}',
+        b'{"arrays": [["a", "no such type", [2]]]}',
+        b'{"arrays": [["a", "|O", [1]]]}',
+        b'{"arrays": [["a"]]}',
+        b"\xff\xfe",
+        b"[1, 2",
+        b"[1, 2]",
+        b" " * process.LONGEST,
+    ],
+)
+def test_what_is_no_message_is_a_value_error(line: bytes) -> None:
+    with pytest.raises(ValueError):
+        read_message(io.BytesIO(line + b"\n" + bytes(16)))
+
+
+# -- children --------------------------------------------------------------------------------------------------------
+
+STAND_IN = """
+import os, signal, sys, time
+from robot.common.process import Parent
+parent = Parent()
+parent.send({"ready": True})
+def answer(request, arrays):
+    act()
+    return {"echo": request}, arrays
+parent.serve(answer)
+"""
+
+
+@pytest.fixture
+def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Child]:
+    """Starts a child that does `act` at each request, and then sends it back."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+
+    def start(act: str = "pass", stand_in: str = STAND_IN) -> Child:
+        (tmp_path / "stand_in.py").write_text(stand_in.replace("act()", act))
+        return Child("stand_in", name="stand-in", error=DeviceError, advice="start another")
+
+    return start
+
+
+def test_a_child_answers_until_it_is_closed_and_leaves_nothing(child: Callable[[str], Child]) -> None:
+    with child("print('words that are no message')") as running:
+        assert running.receive(PATIENCE) == ({"ready": True}, {})
+        answer, arrays = running.ask({"x": 1}, {"a": np.arange(3)}, timeout=PATIENCE)
+        assert answer == {"echo": {"x": 1}} and arrays["a"].tolist() == [0, 1, 2]
+        assert os.getsid(running.pid) != os.getsid(0)  # Ctrl-C in a terminal does not reach it
+        running.check()
+    assert not running.running and not alive(running.pid)
+    running.close()
+    with pytest.raises(DeviceError, match="stand-in is closed; start another"):
+        running.ask({}, timeout=PATIENCE)
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        ("raise ValueError('so and so')", "^stand-in: ValueError: so and so$"),
+        ("print('last words'); os._exit(7)", "(?s)has ended, exit status 7; start another.*last words"),
+        ("parent._answers.write(b'x' * 8 + b'\\n'); parent._answers.flush()", "sent what is no message"),
+        ("parent._answers.close(); time.sleep(600)", "has ended, exit status None"),  # closed its end, but lives on
+    ],
+)
+def test_what_goes_wrong_there_is_an_error_here(child: Callable[[str], Child], act: str, words: str) -> None:
+    with child(act) as running:
+        running.receive(PATIENCE)
+        with pytest.raises(DeviceError, match=words):
+            running.ask({}, timeout=PATIENCE)
+    assert not alive(running.pid)
+
+
+def test_a_child_that_does_not_start_is_an_error_with_its_reason(child: Callable[..., Child]) -> None:
+    why = r"(?s)exit status 1.*No module named 'no_such_module'"
+    with child(stand_in="import no_such_module") as running, pytest.raises(DeviceError, match=why):
+        running.receive(PATIENCE)
+
+
+@pytest.mark.parametrize("size", [0, 2**20])  # more than a pipe holds: the request itself is stuck
+def test_a_child_that_is_silent_is_ended(child: Callable[[str], Child], size: int) -> None:
+    with child("pass") as running:
+        running.receive(PATIENCE)
+        os.kill(running.pid, signal.SIGSTOP)
+        with pytest.raises(DeviceError, match=r"gave no answer within 0\.2 s"):
+            running.ask({}, {"a": np.zeros(size)}, timeout=0.2)
+        assert not alive(running.pid)
+
+
+def test_a_stopped_child_is_closed_by_force(child: Callable[[str], Child]) -> None:
+    running = child("pass")
+    running.receive(PATIENCE)
+    os.kill(running.pid, signal.SIGSTOP)
+    running.close(0.1)
+    assert not alive(running.pid)
+
+
+def test_after_ctrl_c_no_old_answer_is_taken_for_a_new_one(child: Callable[[str], Child]) -> None:
+    with child("os.kill(os.getppid(), signal.SIGINT); time.sleep(1)") as running:
+        running.receive(PATIENCE)
+        with pytest.raises(KeyboardInterrupt):
+            running.ask({"old": True}, timeout=PATIENCE)
+        with pytest.raises(DeviceError, match="is closed"):
+            running.ask({"new": True}, timeout=PATIENCE)
+
+
+def test_it_may_be_closed_while_another_thread_waits_for_an_answer(child: Callable[[str], Child]) -> None:
+    running = child("time.sleep(600)")
+    running.receive(PATIENCE)
+    failures: list[str] = []
+
+    def ask() -> None:
+        try:
+            running.ask({}, timeout=PATIENCE)
+        except DeviceError as failure:
+            failures.append(str(failure))
+
+    waiting = threading.Thread(target=ask)
+    waiting.start()
+
+    def asks() -> bool:
+        free = running._lock.acquire(blocking=False)
+        if free:
+            running._lock.release()
+        return not free
+
+    until(asks, "it asks")
+    running.close(0.1)
+    waiting.join(PATIENCE)
+    assert len(failures) == 1 and not alive(running.pid)
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals) -> None:
+    (tmp_path / "stand_in.py").write_text(STAND_IN.replace("act()", "pass"))
+    code = (
+        "import time; from robot.common.process import Child\n"
+        "child = Child('stand_in', name='stand-in'); child.receive(60.0); print(child.pid, flush=True); time.sleep(600)"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment) as parent:
+        assert parent.stdout is not None
+        pid = int(json.loads(parent.stdout.readline()))
+        assert alive(pid)
+        parent.send_signal(end)
+    until(lambda: not alive(pid), "the end of the child")

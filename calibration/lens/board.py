@@ -236,4 +236,9 @@ def _find_charuco(image: NDArray[np.uint8], board: Board) -> Points:
     apart = np.linalg.norm(on_board[:, None] - on_board[None], axis=-1)
     i, j = np.nonzero(np.triu(apart < 1.1 * board.pitch, 1))
     steps = np.linalg.norm(seen_at[i] - seen_at[j], axis=1)
-    return Points(on_board, seen_at, float(np.median(steps)) if len(steps) else float(np.ptp(seen_at)))
+    spacing = float(np.median(steps)) if len(steps) else float(np.ptp(seen_at))
+    # OpenCV 4.13 finds the corners half a pixel off, 4.14 where they are; refined, both agree
+    half = int(np.clip(round(spacing / 10), 2, 5))
+    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    refined = cv2.cornerSubPix(grey, np.ascontiguousarray(seen_at, np.float32), (half, half), (-1, -1), until)
+    return Points(on_board, refined.astype(np.float64), spacing)

@@ -1,8 +1,9 @@
-"""Where a command writes, and how it shows that it is at work."""
+"""Where a command writes, how it shows that it is at work, and how it asks a person."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -99,6 +100,29 @@ def say_files(*paths: Path) -> None:
     """Prints paths, one a line."""
     for path in paths:
         results.print(str(path), markup=False)
+
+
+def ask(question: str) -> bool:
+    """A person's word; without a terminal there is nobody to give it."""
+    return sys.stdin.isatty() and typer.confirm(question, default=False, err=True)
+
+
+def show_table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    left: Collection[int] = (),
+    width: int | None = None,
+) -> None:
+    """Prints a table on stdout; columns are flush right, except those with a number in `left`."""
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 1), title=title, title_justify="left")
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number in left else "right")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=width, highlight=False).print(table)
 
 
 def quantity(kind: str) -> Callable[[str], float]:

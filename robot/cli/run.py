@@ -12,7 +12,7 @@ import typer
 
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results, writing
+from robot.cli.output import Out, Overrides, ask, busy, make, new_directory, notes, progress, results, writing
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
@@ -96,11 +96,6 @@ def _run(
     episode.dropped = recording.dropped
     _report(episode, folder, [folder / "episode.mcap"])
     return bool(failure or recording.problem(len(episode.steps)))
-
-
-def ask(question: str) -> bool:
-    """A person's word; without a terminal there is nobody to give it."""
-    return sys.stdin.isatty() and typer.confirm(question, default=False, err=True)
 
 
 def _drive(

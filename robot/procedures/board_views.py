@@ -6,25 +6,20 @@ otherwise than in all views before. What is not taken is said with the reason, a
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.errors import CalibrationError
 from calibration.lens.board import BadBoard, Board, Points, find_board
-from robot.procedures.presses import LOOK, PICTURE, Seeing
-from tacsim.interface import EndOfEpisode, FloatArray
-
-Image = NDArray[np.uint8]
+from robot.procedures.session import CannotCalibrate, FrameSource, Image, Session
+from tacsim.interface import FloatArray, TactileFrame
 
 STILL = 0.003  # of the picture's longer side: a board whose points move less stands still
 HOLD = 0.4  # for so long [s]
-APART = 0.04  # of the same: two views are the same if their points differ by less, root mean square
+DISTINCT = 0.04  # of the same: two views are the same if their points differ by less, root mean square
 REMIND = 4.0  # between two words on why nothing is taken [s]
-WAYS = (
+PROMPTS = (
     "facing the camera, so that it fills the picture",
     "its left side nearer to the camera, by 30 degrees",
     "its right side nearer to the camera, by 30 degrees",
@@ -38,12 +33,8 @@ WAYS = (
 ON_GEL = "lay the board on the gel, print side down, and leave it there"
 
 
-class CannotView(CalibrationError):
-    """Nobody held a board before the camera."""
-
-
 @dataclass(frozen=True, slots=True)
-class ViewPlan:
+class BoardViewPlan:
     """What to take."""
 
     board: Board
@@ -53,113 +44,60 @@ class ViewPlan:
     patience: float = 180.0  # for each view [s]
 
 
-@dataclass(slots=True)
-class ViewRecord:
-    """What came of a plan."""
+def record_board_views(camera: FrameSource, plan: BoardViewPlan, session: Session[tuple[str, Image]]) -> None:
+    """Leads a person through the views of `plan`, and takes name and native picture of each.
 
-    views: list[tuple[str, Image]] = field(default_factory=list)  # names and native pictures
-    skipped: list[str] = field(default_factory=list)  # why, in order
-
-
-def record_views(
-    camera: Seeing,
-    plan: ViewPlan,
-    keep: Callable[[str, Image], None],
-    say: Callable[[str], None],
-    tell: Callable[[int], None] = lambda done: None,
-    stop: Callable[[], bool] = lambda: False,
-) -> ViewRecord:
-    """Leads a person through the views of `plan`.
-
-    keep: is given name and native picture of each as soon as it is taken.
-    say: is told what to do next, and what became of it, a sentence at a time.
-    tell: how many views are done.
-
-    A stop, and the end of a recorded source, leave what was taken. Raises CannotView when no view comes for long, and
-    what the camera raises.
+    Raises CannotCalibrate when no view comes for long, and what the camera raises.
     """
-    record, taken = ViewRecord(), list[Points]()
-    look = _Look(camera, plan, stop)
-    try:
-        while len(taken) < plan.views:
-            number = len(taken) + 1
-            tell(len(taken))
-            way = ON_GEL if plan.on_gel else f"hold the board still, {WAYS[len(taken) % len(WAYS)]}"
-            say(f"View {number} of {plan.views}: {way}.")
-
-            def skipped(why: str) -> None:
-                record.skipped.append(why)
-                say(f"Skipped: {why}.")
-
-            image, points = look.view(taken, skipped)
-            name = f"view_{number:02d}.png"
-            taken.append(points)
-            record.views.append((name, image))
-            keep(name, image)
-            say(f"Taken: {len(points.image)} points, {points.spacing:.0f} px apart.")
-        tell(len(taken))
-    except (_Stopped, EndOfEpisode):
-        pass
-    return record
+    earlier: list[Points] = []
+    frames = session.frames(camera)
+    with session.until_stopped():
+        while len(earlier) < plan.views:
+            number = len(earlier) + 1
+            session.progress(len(earlier))
+            prompt = ON_GEL if plan.on_gel else f"hold the board still, {PROMPTS[len(earlier) % len(PROMPTS)]}"
+            session.say(f"View {number} of {plan.views}: {prompt}.")
+            image, points = _next_view(frames, plan, earlier, session)
+            earlier.append(points)
+            session.take((f"view_{number:02d}.png", image))
+            session.say(f"Taken: {len(points.image)} points, {points.spacing:.0f} px apart.")
+        session.progress(len(earlier))
 
 
-class _Stopped(Exception):
-    """Somebody asked for the end."""
+def _next_view(
+    frames: Iterator[TactileFrame], plan: BoardViewPlan, earlier: list[Points], session: Session[tuple[str, Image]]
+) -> tuple[Image, Points]:
+    """A picture of a board that stands still, seen otherwise than in the earlier views; the person is told now and then
+    why there is none. Raises Stopped, CannotCalibrate."""
+    frame = next(frames)
+    begun = reminded = since = frame.time
+    anchor: Points | None = None  # where the board has stood since
+    while True:
+        try:
+            points = find_board(frame.image, plan.board, plan.reference)
+        except BadBoard as missing:
+            why, anchor = str(missing), None
+        else:
+            side = max(frame.image.shape[:2])
+            if anchor is None or _point_distance(anchor, points) > STILL * side:
+                anchor, since = points, frame.time
+            alike = (k for k, other in enumerate(earlier, 1) if _point_distance(other, points) < DISTINCT * side)
+            same = next(alike, None)
+            if same is None and frame.time - since >= HOLD:
+                return frame.image, points
+            why = "the board moves; hold it still"
+            if same is not None:
+                why = f"the board is seen as in view {same}; tilt it, or hold it elsewhere"
+        if frame.time - reminded >= REMIND:
+            session.left_out.append(why)
+            session.say(f"Skipped: {why}.")
+            reminded = frame.time
+        if frame.time - begun > plan.patience:
+            raise CannotCalibrate(f"given up after {plan.patience:g} s without a view; the last: {why}")
+        frame = next(frames)
 
 
-class _Look:
-    """Looks for the board in picture after picture."""
-
-    def __init__(self, camera: Seeing, plan: ViewPlan, stop: Callable[[], bool]) -> None:
-        self._camera, self._plan, self._stop = camera, plan, stop
-        self._index = -1
-
-    def view(self, taken: list[Points], skipped: Callable[[str], None]) -> tuple[Image, Points]:
-        """A picture of a board that stands still, seen otherwise than those taken; `skipped` is told now and then why
-        there is none. Raises _Stopped, CannotView."""
-        begun: float | None = None
-        anchor: Points | None = None  # the board has not moved since
-        since = reminded = 0.0
-        why = "nothing was looked at"
-        while True:
-            image, now = self._next()
-            if begun is None:
-                begun = reminded = now
-            try:
-                points = find_board(image, self._plan.board, self._plan.reference)
-            except BadBoard as missing:
-                why, anchor = str(missing), None
-            else:
-                side = max(image.shape[:2])
-                if anchor is None or _moved(anchor, points) > STILL * side:
-                    anchor, since = points, now
-                like = next((k for k, other in enumerate(taken, 1) if _moved(other, points) < APART * side), None)
-                why = (
-                    f"the board is seen as in view {like}; tilt it, or hold it elsewhere"
-                    if like
-                    else "the board moves; hold it still"
-                )
-                if like is None and now - since >= HOLD:
-                    return image, points
-            if now - reminded >= REMIND:
-                skipped(why)
-                reminded = now
-            if now - begun > self._plan.patience:
-                raise CannotView(f"given up after {self._plan.patience:g} s without a view; the last: {why}")
-
-    def _next(self) -> tuple[Image, float]:
-        """The next new picture, and when it was taken [s]."""
-        while True:
-            if self._stop():
-                raise _Stopped
-            frame = self._camera.read(PICTURE)
-            if frame.index != self._index:
-                self._index = frame.index
-                return frame.image, frame.time
-            time.sleep(LOOK)
-
-
-def _moved(one: Points, other: Points) -> float:
+def _point_distance(one: Points, other: Points) -> float:
     """How far the points that both have lie apart in the picture, root mean square [px]; infinite without any."""
     places = {tuple(place): at for place, at in zip(np.round(one.board, 9).tolist(), one.image, strict=True)}
     pairs = [

@@ -6,33 +6,27 @@ next one is asked for once the gel looks untouched again.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import BadFrames, CalibrationError
+from calibration.errors import BadFrames
 from calibration.light.press_collection import PressCollection
 from calibration.markers.dots import DotEraser
 from calibration.markers.flow import find_markers
 from calibration.markers.lattice import NoLattice
-from tacsim.interface import EndOfEpisode, TactileFrame
-from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import RigConfig
+from robot.procedures.session import CannotCalibrate, FrameSource, Image, Session
+from tacsim.interface import TactileFrame
 
-Image = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
-LOOK = 5e-3  # between two looks at the camera [s]
-PICTURE = 10.0  # longest wait for one [s]
 CELL = 8  # colour is averaged over so many pixels each way: noise and JPEG go, contacts stay
 MOTION = 4.0  # a cell that changes by more is in motion [grey levels]
-TOUCH = 8.0  # a cell that differs from the reference by more than the usual is touched [grey levels]
+CONTACT = 8.0  # a cell that differs from the reference by more than the usual is touched [grey levels]
 HOLD = 0.5  # a picture that has not moved for so long stands still [s]
 REST = 1.5  # the same for the one without contact, which everything is measured against [s]
 RESTLESS = 5.0  # a press that does not come to rest for so long is worth a word [s]
@@ -40,18 +34,8 @@ REFERENCE = "background.png"
 NOISE_FRAMES = 8  # pictures without contact that tell the camera's noise
 
 
-class CannotPress(CalibrationError):
-    """This sensor is not such that a person could press a ball before it, or nobody did."""
-
-
-class Seeing(Protocol):
-    """What is needed of a camera."""
-
-    def read(self, timeout: float) -> TactileFrame: ...
-
-
 @dataclass(frozen=True, slots=True)
-class PressPlan:
+class BallPressPlan:
     """What to take."""
 
     ball: float  # radius [px of the metric picture]
@@ -61,88 +45,47 @@ class PressPlan:
     markers: bool = False  # dots are printed on the gel
 
 
-@dataclass(slots=True)
-class PressRecord:
-    """What came of a plan."""
+def record_presses(camera: FrameSource, plan: BallPressPlan, session: Session[tuple[str, Image]]) -> tuple[Image, ...]:
+    """Leads a person through the pictures without contact and the presses of `plan`; takes name and native picture of
+    each press. The pictures without contact are kept first, and returned; the last is the reference.
 
-    reference: Image | None = None
-    untouched: tuple[Image, ...] = ()  # pictures without contact, native; the reference is the last
-    presses: list[tuple[str, Image]] = field(default_factory=list)  # names and native pictures
-    refused: list[str] = field(default_factory=list)  # why, in order
-
-
-def camera_facts(config: RigConfig, sensor: str) -> CameraSensorConfig:
-    """Of a sensor before whose camera a person can press. Raises CannotPress."""
-    eye = config.sensors.get(sensor)
-    if not isinstance(eye, CameraSensorConfig):
-        known = (
-            ", ".join(name for name, each in config.sensors.items() if isinstance(each, CameraSensorConfig)) or "none"
-        )
-        raise CannotPress(f"rig '{config.name}': '{sensor}' is no sensor with a camera; cameras: {known}")
-    if eye.mock is not None:
-        raise CannotPress(
-            f"rig '{config.name}': sensors.{sensor} has a mock camera that a simulation feeds; nobody can press its "
-            "gel, and its model is known"
-        )
-    return eye
-
-
-def record_presses(
-    camera: Seeing,
-    plan: PressPlan,
-    keep: Callable[[str, Image], None],
-    say: Callable[[str], None],
-    tell: Callable[[int], None] = lambda done: None,
-    stop: Callable[[], bool] = lambda: False,
-) -> PressRecord:
-    """Leads a person through the pictures without contact and the presses of `plan`.
-
-    keep: is given name and native picture of each as soon as it is taken, those without contact first.
-    say: is told what to do next, and what became of it, a sentence at a time.
-    tell: how many presses are done.
-
-    A stop, and the end of a recorded source, leave what was taken. Raises CannotPress when nothing happens for long
-    or the gel does not become again what it was; BadFrames for a picture without contact that is dark or saturated;
-    what the camera raises.
+    Raises CannotCalibrate when nothing happens for long or the gel does not become again what it was; BadFrames for a
+    picture without contact that is dark or saturated; what the camera raises.
     """
-    record = PressRecord()
-    watch = _Watch(camera, plan.patience, stop)
-    try:
-        say("Take everything off the gel.")
-        record.untouched = watch.rest()
-        record.reference = record.untouched[-1]
-        collection = PressCollection(record.reference, plan.ball, _to_judge(plan, record.reference))
-        keep(REFERENCE, record.reference)
-        for number, image in enumerate(record.untouched[:-1], start=1):
-            keep(f"{Path(REFERENCE).stem}_{number}.png", image)
-        watch.untouched(record.reference)
-        while len(record.presses) < plan.presses:
-            tell(len(record.presses))
-            number = len(record.presses) + 1
-            say(
+    untouched: tuple[Image, ...] = ()
+    monitor = _ContactMonitor(camera, plan.patience, session)
+    with session.until_stopped():
+        session.say("Take everything off the gel.")
+        untouched = monitor.wait_for_rest()
+        reference = untouched[-1]
+        collection = PressCollection(reference, plan.ball, _marker_eraser(plan, reference))
+        session.keep((REFERENCE, reference))
+        for number, image in enumerate(untouched[:-1], start=1):
+            session.keep((f"{Path(REFERENCE).stem}_{number}.png", image))
+        monitor.set_reference(reference)
+        while len(session.taken) < plan.presses:
+            session.progress(len(session.taken))
+            number = len(session.taken) + 1
+            session.say(
                 f"Press {number} of {plan.presses}: press the ball into the gel, at the {collection.next_place()} of "
                 "the picture, and hold it still."
             )
-            image = watch.press(lambda: say("Still moving: hold the ball still."))
+            image = monitor.wait_for_press()
             try:
                 circle = collection.offer(image)
             except BadFrames as why:
-                record.refused.append(str(why))
-                say(f"Not taken: {why}.")
+                session.left_out.append(str(why))
+                session.say(f"Not taken: {why}.")
             else:
-                name = f"press_{number:02d}.png"
-                record.presses.append((name, image))
-                keep(name, image)
-                say(f"Taken: contact at {circle.x:.0f}, {circle.y:.0f} px, radius {circle.radius:.0f} px.")
-            say("Lift the ball off the gel.")
-            watch.lift()
-        tell(len(record.presses))
-    except (_Stopped, EndOfEpisode):
-        pass
-    return record
+                session.take((f"press_{number:02d}.png", image))
+                session.say(f"Taken: contact at {circle.x:.0f}, {circle.y:.0f} px, radius {circle.radius:.0f} px.")
+            session.say("Lift the ball off the gel.")
+            monitor.wait_for_lift()
+        session.progress(len(session.taken))
+    return untouched
 
 
-def _to_judge(plan: PressPlan, reference: Image) -> Callable[[Image], Image] | None:
+def _marker_eraser(plan: BallPressPlan, reference: Image) -> Callable[[Image], Image] | None:
     """Native picture -> the metric one that presses are judged by, without dots. Raises BadFrames."""
     if not plan.markers:
         return plan.rectify
@@ -155,25 +98,20 @@ def _to_judge(plan: PressPlan, reference: Image) -> Callable[[Image], Image] | N
     return lambda image: erase(rectify(image))
 
 
-class _Stopped(Exception):
-    """Somebody asked for the end."""
+class _ContactMonitor:
+    """Waits for what a person does, by the pictures alone. Whatever waits raises Stopped, CannotCalibrate."""
 
-
-class _Watch:
-    """Waits for what a person does, by the pictures alone. Whatever waits raises _Stopped, CannotPress."""
-
-    def __init__(self, camera: Seeing, patience: float, stop: Callable[[], bool]) -> None:
-        self._camera, self._patience, self._stop = camera, patience, stop
-        self._index = -1
+    def __init__(self, camera: FrameSource, patience: float, session: Session[tuple[str, Image]]) -> None:
+        self._frames, self._patience, self._say = session.frames(camera), patience, session.say
         self._anchor: Float32 | None = None  # the picture that nothing has moved since
         self._since = 0.0
-        self._cells: Float32 | None = None  # of the reference
+        self._reference: Float32 | None = None
 
-    def untouched(self, image: Image) -> None:
-        """What is touched is told by the difference from `image`."""
-        self._cells = _cells(image)
+    def set_reference(self, image: Image) -> None:
+        """Contact is told by the difference from `image`."""
+        self._reference = _cell_means(image)
 
-    def rest(self) -> tuple[Image, ...]:
+    def wait_for_rest(self) -> tuple[Image, ...]:
         """The last pictures, NOISE_FRAMES at most, of a time of REST in which none has moved."""
         begun = None
         shown: deque[Image] = deque(maxlen=NOISE_FRAMES)
@@ -187,8 +125,8 @@ class _Watch:
                 return tuple(shown)
             self._give_up(frame.time - begun, "the picture does not come to rest; is something moving before the gel?")
 
-    def press(self, restless: Callable[[], None]) -> Image:
-        """A picture of a touch that has not moved for HOLD; `restless` is called now and then while it moves."""
+    def wait_for_press(self) -> Image:
+        """A picture of a contact that has not moved for HOLD; the person is told now and then while it moves."""
         begun = moving = None
         while True:
             frame, still, touched = self._next()
@@ -201,11 +139,11 @@ class _Watch:
                 continue
             moving = frame.time if moving is None else moving
             if frame.time - moving > RESTLESS:
-                restless()
+                self._say("Still moving: hold the ball still.")
                 moving = frame.time
             self._give_up(frame.time - begun, "the press did not come to rest")
 
-    def lift(self) -> None:
+    def wait_for_lift(self) -> None:
         """Until the gel is as it was without contact."""
         begun = None
         while True:
@@ -221,31 +159,24 @@ class _Watch:
 
     def _next(self) -> tuple[TactileFrame, float, bool]:
         """The next new frame, how long nothing has moved in it [s], and whether the gel is touched."""
-        while True:
-            if self._stop():
-                raise _Stopped
-            frame = self._camera.read(PICTURE)
-            if frame.index != self._index:
-                break
-            time.sleep(LOOK)
-        self._index = frame.index
-        cells = _cells(frame.image)
+        frame = next(self._frames)
+        cells = _cell_means(frame.image)
         # against the first of the still ones, not the last: a slow creep is motion too
         if self._anchor is None or float(np.abs(cells - self._anchor).max()) > MOTION:
             self._anchor, self._since = cells, frame.time
         touched = False
-        if self._cells is not None:
-            change = cells - self._cells
+        if self._reference is not None:
+            change = cells - self._reference
             change -= np.median(change, axis=(0, 1))  # a lamp that warms up touches nothing
-            touched = float(np.abs(change).max()) > TOUCH
+            touched = float(np.abs(change).max()) > CONTACT
         return frame, frame.time - self._since, touched
 
     def _give_up(self, waited: float, why: str) -> None:
         if waited > self._patience:
-            raise CannotPress(f"given up after {self._patience:g} s: {why}")
+            raise CannotCalibrate(f"given up after {self._patience:g} s: {why}")
 
 
-def _cells(image: Image) -> Float32:
+def _cell_means(image: Image) -> Float32:
     """Means over CELL x CELL pixels, (h, w, 3)."""
     import cv2
 

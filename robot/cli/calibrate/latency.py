@@ -8,8 +8,7 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import Overrides, busy, notes, quantity, results
-from robot.cli.run import ask
+from robot.cli.output import Overrides, ask, busy, notes, quantity, results
 
 
 def latency(
@@ -33,36 +32,31 @@ def latency(
     Example: tacsim calibrate latency ur5e --arm upper --sensor upper
     """
     from calibration.poses.latency import estimate_latency
-    from robot.open import CannotOpen, open_rig
-    from robot.procedures.taps import CannotTap, TapPlan, entries, record_taps, untimed
+    from robot.open import open_rig
+    from robot.procedures.session import hardware_arm
+    from robot.procedures.taps import TapPlan, latency_entries, record_taps, without_latency
     from tacsim.config import load_rig
-    from tacsim.models.hardware import UrArmConfig
 
-    for what, length in (("--depth", depth), ("--lift", lift)):
+    for option, length in (("--depth", depth), ("--lift", lift)):
         if not 0.0 < length <= 5e-3:
-            raise typer.BadParameter(f"{1e3 * length:g} mm; allowed: above 0, at most 5 mm", param_hint=what)
+            raise typer.BadParameter(f"{1e3 * length:g} mm; allowed: above 0, at most 5 mm", param_hint=option)
     config = load_rig(rig, overrides=set_ or []).config
-    try:
-        opened = untimed(config, arm, sensor)
-    except CannotTap as wrong:
-        raise CannotOpen(str(wrong)) from wrong
+    opened = without_latency(config, arm, sensor)
     with Interrupt() as interrupt:
         with busy("tapping"), open_rig(opened, confirm=ask) as running:
-            taken = record_taps(running, opened, arm, sensor, TapPlan(taps, depth, lift), interrupt)
+            record = record_taps(running, opened, arm, sensor, TapPlan(taps, depth, lift), interrupt)
         if interrupt():
             complain("stopped by a signal; nothing is measured")
             raise typer.Exit(interrupt.exit_code)
-    found = estimate_latency(taken.arm_times, taken.depth, taken.frame_times, taken.touch)
+    measured = estimate_latency(record.arm_times, record.depth, record.frame_times, record.change)
     results.print(
-        f"sensors.{sensor} is {1e3 * found.seconds:.1f} ms later than arms.{arm}, ± {1e3 * found.uncertainty:.1f} ms "
-        f"(correlation {found.correlation:.3f}, {found.samples} pictures)"
+        f"sensors.{sensor} is {1e3 * measured.seconds:.1f} ms later than arms.{arm}, "
+        f"± {1e3 * measured.uncertainty:.1f} ms (correlation {measured.correlation:.3f}, {measured.samples} pictures)"
     )
-    there = config.arms[arm]
-    assert isinstance(there, UrArmConfig)
-    if taken.clock != "arrival":
+    if record.clock != "arrival":
         notes.print("The pictures bring their time of exposure along: what is left is the arm's.")
-        if found.seconds > 3.0 * found.uncertainty:
+        if measured.seconds > 3.0 * measured.uncertainty:
             notes.print("warning: yet they seem later than the arm; is the arm's own latency in the file too large?")
     results.print("Write into the rig file:")
-    for key, seconds in entries(found, taken.clock, arm, there, sensor).items():
+    for key, seconds in latency_entries(measured, record.clock, arm, hardware_arm(config, arm), sensor).items():
         results.print(f"  {key}: {1e3 * seconds:.1f} ms")

@@ -7,20 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.calibrate.presses import keeping, named_camera
-from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
+from robot.cli.calibrate.session import led, named_camera, picture_keeper
 from robot.cli.output import (
     Out,
     Overrides,
     busy,
     made,
     new_directory,
-    notes,
     progress,
     quantities,
     results,
     say_files,
+    show_table,
     writing,
 )
 
@@ -91,26 +89,29 @@ def lens(
     if corners is not None:
         if frames is None:
             raise typer.BadParameter("corners are read off a picture: give it, or a --board", param_hint="--corners")
-        _view_by_corners(frames, _numbers(corners, 8, "--corners"), size, folder)
+        _view_from_corners(frames, _numbers(corners, 8, "--corners"), size, folder)
         return
     assert board is not None
     described = parse_board(board)
     if camera is not None:
-        frames = _viewed(camera, set_ or [], folder, described, views, reference)
+        frames = _take_views(camera, set_ or [], folder, described, views, reference)
     assert frames is not None
     if frames.is_dir():
-        _lens(frames, described, folder)
+        _fit_lens(frames, described, folder)
         return
     axis = None if centre is None else _numbers(centre, 2, "--centre")
-    _view(frames, described, reference, known, None if axis is None else (axis[0], axis[1]), size, folder)
+    _fit_view(frames, described, reference, known, None if axis is None else (axis[0], axis[1]), size, folder)
 
 
-def _viewed(camera: str, overrides: list[str], folder: Path, board: Board, views: int, reference: Path | None) -> Path:
+def _take_views(
+    camera: str, overrides: list[str], folder: Path, board: Board, views: int, reference: Path | None
+) -> Path:
     """Pictures taken now: the folder that keeps them, or the only one. A signal ends the command; what was taken is
-    kept then, too. Raises CannotPress, CannotView, DeviceError."""
+    kept then, too. Raises CannotCalibrate, DeviceError."""
     from calibration.lens.view import FEWEST_PICTURES
     from robot.camera.camera import Camera
-    from robot.procedures.board_views import CannotView, ViewPlan, record_views
+    from robot.procedures.board_views import BoardViewPlan, record_board_views
+    from robot.procedures.session import CannotCalibrate
 
     if 1 < views < FEWEST_PICTURES:
         raise typer.BadParameter(
@@ -118,37 +119,23 @@ def _viewed(camera: str, overrides: list[str], folder: Path, board: Board, views
             param_hint="--views",
         )
     config, sensor = named_camera(camera, overrides)
-    empty = None if reference is None else _picture(reference)
+    empty = None if reference is None else _read_picture(reference)
     if empty is not None and empty.shape[:2] != (config.height, config.width):
         raise typer.BadParameter(
             f"it is {empty.shape[1]} x {empty.shape[0]} px, the camera's pictures are {config.width} x {config.height}",
             param_hint="--reference",
         )
-    plan = ViewPlan(board, views, on_gel=views == 1, reference=empty)
+    plan = BoardViewPlan(board, views, on_gel=views == 1, reference=empty)
     frames = folder / "frames"
-    with Camera(config, sensor) as eye, Interrupt() as interrupt, progress() as bar:
-        row = bar.add_task("views", total=views)
-        try:
-            taken = record_views(
-                eye,
-                plan,
-                keeping(frames),
-                say=lambda words: notes.print(words, markup=False),
-                tell=lambda done: bar.update(row, completed=done),
-                stop=interrupt,
-            )
-        finally:
-            if frames.exists():
-                notes.print(f"pictures kept in {frames}", markup=False)
-    if interrupt():
-        complain(f"stopped by a signal; {len(taken.views)} views are kept, nothing is calibrated")
-        raise typer.Exit(interrupt.exit_code)
-    if len(taken.views) < views:
-        raise CannotView(f"the source was over after {len(taken.views)} of {views} views")
-    return frames / taken.views[0][0] if plan.on_gel else frames
+    with Camera(config, sensor) as source, led("views", views, frames, f"pictures kept in {frames}") as session:
+        session.keep = picture_keeper(frames)
+        record_board_views(source, plan, session)
+    if len(session.taken) < views:
+        raise CannotCalibrate(f"the source was over after {len(session.taken)} of {views} views")
+    return frames / session.taken[0][0] if plan.on_gel else frames
 
 
-def _lens(pictures: Path, board: Board, folder: Path) -> None:
+def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
     from calibration.lens.board import BadBoard, find_board
     from calibration.lens.view import BadView, fit_lens
     from tacsim.record.sources import PICTURES as ENDINGS
@@ -161,7 +148,7 @@ def _lens(pictures: Path, board: Board, folder: Path) -> None:
     sizes: dict[tuple[int, ...], str] = {}
     with progress() as bar:
         for path in bar.track(paths, description="looking for the board"):
-            image = _picture(path)
+            image = _read_picture(path)
             sizes.setdefault(image.shape[:2], path.name)
             try:
                 found[path.name] = find_board(image, board)
@@ -175,7 +162,7 @@ def _lens(pictures: Path, board: Board, folder: Path) -> None:
     rows, columns = next(iter(sizes))
     with busy(f"fitting {len(found)} pictures"):
         lens_, each = fit_lens(found, (rows, columns))
-    _table("Each picture", ("picture", "residual [px]"), [(name, f"{value:.2f}") for name, value in each.items()])
+    show_table("Each picture", ("picture", "residual [px]"), [(name, f"{value:.2f}") for name, value in each.items()])
     for line in missing:
         results.print(f"left out: {line}", markup=False)
     results.print(
@@ -186,7 +173,7 @@ def _lens(pictures: Path, board: Board, folder: Path) -> None:
         say_files(_write(folder / "lens.yaml", lens_))
 
 
-def _view(
+def _fit_view(
     picture: Path,
     board: Board,
     reference: Path | None,
@@ -198,25 +185,25 @@ def _view(
     from calibration.lens.board import find_board
     from calibration.lens.view import fit_view
 
-    image = _picture(picture)
+    image = _read_picture(picture)
     with busy("looking for the board"):
-        points = find_board(image, board, None if reference is None else _picture(reference))
+        points = find_board(image, board, None if reference is None else _read_picture(reference))
         view = fit_view(points, image.shape[:2], known, centre, size, str(board))
-    _tell_view(view, image, folder)
+    _report_view(view, image, folder)
 
 
-def _view_by_corners(picture: Path, numbers: list[float], size: tuple[float, float] | None, folder: Path) -> None:
+def _view_from_corners(picture: Path, numbers: list[float], size: tuple[float, float] | None, folder: Path) -> None:
     from calibration.lens.view import view_of_corners
 
     if size is None:
         raise typer.BadParameter("with --corners, give the gel's --size between them, such as '18.6 mm, 14.3 mm'")
-    image = _picture(picture)
+    image = _read_picture(picture)
     pairs = [(numbers[i], numbers[i + 1]) for i in range(0, 8, 2)]
     view = view_of_corners((pairs[0], pairs[1], pairs[2], pairs[3]), size, image.shape[:2])
-    _tell_view(view, image, folder)
+    _report_view(view, image, folder)
 
 
-def _tell_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
+def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
     import numpy as np
 
     from calibration.lens.rectification import to_metric
@@ -233,7 +220,7 @@ def _tell_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
         say_files(_write(folder / "view.yaml", view), folder / "rectified.png")
 
 
-def _picture(path: Path) -> NDArray[np.uint8]:
+def _read_picture(path: Path) -> NDArray[np.uint8]:
     """Raises CalibrationError."""
     from calibration.errors import CalibrationError
     from tacsim.record.episode import EpisodeError
@@ -261,15 +248,3 @@ def _numbers(text: str, count: int, option: str) -> list[float]:
     if len(values) != count:
         raise typer.BadParameter(f"'{text}'; {count} numbers are needed, with commas between", param_hint=option)
     return values
-
-
-def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, padding=(0, 1), title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, justify="right")
-    for row in rows:
-        table.add_row(*row)
-    Console(highlight=False).print(table)

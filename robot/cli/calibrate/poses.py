@@ -11,19 +11,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.errors import complain
-from robot.cli.interrupt import Interrupt
-from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, progress, quantity, results, say_files
-from robot.cli.output import writing as writing_into
-from robot.cli.run import ask
+from robot.cli.calibrate.session import confirm_motion, led, tell_left_out
+from robot.cli.output import (
+    Out,
+    Overrides,
+    busy,
+    made,
+    new_directory,
+    quantity,
+    results,
+    say_files,
+    show_table,
+    writing,
+)
 
 if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise
     from calibration.poses.records import BoardPoseFile, TouchFile
-    from robot.procedures.ball_touches import TouchPlan
-    from robot.procedures.board_poses import SightPlan
+    from robot.procedures.ball_touches import BallTouchPlan
+    from robot.procedures.board_poses import BoardPosePlan
+    from robot.procedures.session import Session
     from tacsim.interface import Pose
-    from tacsim.models.rig import RigConfig
 
 Rig = Annotated[
     str | None, typer.Option("--rig", help="A rig of hardware, or the path of its file: measure now, with its arm.")
@@ -72,14 +80,14 @@ def touch(
     _one_source(touches, rig)
     folder = new_directory(out, "touch")
     if touches is not None:
-        _tell_touch(read_touches(touches), noise, folder, arm or "ARM")
+        _report_touch(read_touches(touches), noise, folder, arm or "ARM")
         return
-    from robot.procedures.ball_touches import TouchPlan
+    from robot.procedures.ball_touches import BallTouchPlan
 
     assert rig is not None
     if not (arm and sensor and ball_radius):
         raise typer.BadParameter("with --rig, give --arm, --sensor and --ball-radius")
-    plan = TouchPlan(
+    plan = BallTouchPlan(
         ball_radius=_within(ball_radius, 0.5e-3, 50e-3, "--ball-radius"),
         touches=number,
         tilt=_within(tilt, 0.15, 0.8, "--tilt"),
@@ -87,75 +95,55 @@ def touch(
         depth=_within(depth, 0.05e-3, 2e-3, "--depth"),
         lift=_within(lift, 2e-3, 50e-3, "--lift"),
     )
-    _tell_touch(_touched(rig, arm, sensor, plan, set_ or [], folder), noise, folder, arm)
+    _report_touch(_take_touches(rig, arm, sensor, plan, set_ or [], folder), noise, folder, arm)
 
 
-def _touched(rig: str, arm: str, sensor: str, plan: TouchPlan, overrides: list[str], folder: Path) -> TouchFile:
+def _take_touches(
+    rig: str, arm: str, sensor: str, plan: BallTouchPlan, overrides: list[str], folder: Path
+) -> TouchFile:
     """Touches now; what was recorded is kept in `folder`, whatever ends it."""
     from calibration.poses.records import touch_file
-    from robot.open import CannotOpen, open_rig
-    from robot.procedures.ball_touches import CannotTouch, alone, record_touches
+    from robot.open import open_rig
+    from robot.procedures.ball_touches import record_ball_touches, without_task
     from tacsim.config import load_rig
 
     config = load_rig(rig, overrides=overrides).config
-    try:
-        opened = alone(config, arm, sensor)
-    except CannotTouch as wrong:
-        raise CannotOpen(str(wrong)) from wrong
-    _confirm(config, f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?")
+    opened = without_task(config, arm, sensor)
+    question = f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?"
+    confirm_motion(config, question)
     with (
-        Interrupt() as interrupt,
-        _kept(folder / "touches.yaml", "touch") as keep,
-        progress() as bar,
+        _recording(folder / "touches.yaml", "touch", "touches", plan.touches) as (session, write),
         open_rig(opened, confirm=lambda question: True) as running,
     ):
-        row = bar.add_task("touching", total=plan.touches)
-        taken = record_touches(
-            running,
-            opened,
-            arm,
-            sensor,
-            plan,
-            interrupt,
-            lambda done: bar.update(row, completed=done),
-            lambda touches: keep(touch_file(touches, plan.ball_radius)),
-        )
-    _end_if_stopped(interrupt, f"{len(taken.touches)} touches")
-    for missed in taken.missed:
-        notes.print(f"left out: {missed}", markup=False)
-    return touch_file(taken.touches, plan.ball_radius)
+        session.keep = lambda _: write(touch_file(session.taken, plan.ball_radius))
+        record_ball_touches(running, opened, arm, sensor, plan, session)
+    tell_left_out(session)
+    return touch_file(session.taken, plan.ball_radius)
 
 
 @contextmanager
-def _kept(path: Path, command: str) -> Iterator[Callable[[TouchFile | BoardPoseFile], None]]:
-    """Gives what writes each state of a record to `path`, and says at the end where it is, also of a failure."""
+def _recording(
+    path: Path, command: str, what: str, total: int
+) -> Iterator[tuple[Session[Any], Callable[[TouchFile | BoardPoseFile], None]]]:
+    """A session, and what writes each state of its record to `path`."""
     from calibration.poses.records import write_record
 
-    def keep(record: TouchFile | BoardPoseFile) -> None:
-        with writing_into(made(path.parent)):
+    def write(record: TouchFile | BoardPoseFile) -> None:
+        with writing(made(path.parent)):
             write_record(path, record)
 
-    try:
-        yield keep
-    finally:
-        if path.exists():
-            again = f"tacsim calibrate {command} {shlex.quote(str(path))}"
-            notes.print(f"recorded: {path}; to calibrate from it again, without the arm: {again}", markup=False)
+    again = f"tacsim calibrate {command} {shlex.quote(str(path))}"
+    with led(what, total, path, f"recorded: {path}; to calibrate from it again, without the arm: {again}") as session:
+        yield session, write
 
 
-def _end_if_stopped(interrupt: Interrupt, what: str) -> None:
-    if interrupt():
-        complain(f"stopped by a signal; {what} are kept, nothing is calibrated")
-        raise typer.Exit(interrupt.exit_code)
-
-
-def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
+def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
     from calibration.poses.ball_touch import fit_touches
     from calibration.poses.records import pose_as_json
 
     with busy(f"fitting {len(record.touches)} touches"):
         fit = fit_touches(record.measurements(), record.ball_radius, noise)
-    _table(
+    _show_fit(
         "Where each touch puts the ball, off where it is, along the sensor's axes",
         ("touch", "x [mm]", "y [mm]", "z [mm]"),
         [(str(i + 1), *(f"{1e3 * v:.3f}" for v in miss)) for i, miss in enumerate(fit.misses)],
@@ -166,7 +154,7 @@ def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) ->
         f"tool_from_sensor: ± {1e3 * place:.3f} mm, ± {_degrees(turn):.3f} deg (at best, by Cramer and Rao, "
         f"{1e3 * best:.3f} mm, {_degrees(best_turn):.3f} deg); scatter {fit.scatter:.2f} of what the noise allows"
     )
-    _snippet(arm, fit.tool_from_sensor)
+    _print_entry(arm, fit.tool_from_sensor)
     report = {
         "tool_from_sensor": pose_as_json(fit.tool_from_sensor, fit.covariance),
         "bound": fit.bound.tolist(),
@@ -177,7 +165,7 @@ def _tell_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) ->
         "scatter": fit.scatter,
         "units": "m, rad",
     }
-    _keep(folder, "touch.json", report)
+    _write_report(folder, "touch.json", report)
 
 
 def hand_eye(
@@ -225,11 +213,11 @@ def hand_eye(
     _one_source(poses, rig)
     folder = new_directory(out, "hand-eye")
     if poses is not None:
-        _tell_hand_eye(read_board_poses(poses), noise, folder)
+        _report_hand_eye(read_board_poses(poses), noise, folder)
         return
     from calibration.lens.board import parse_board
     from calibration.lens.view import Lens
-    from robot.procedures.board_poses import SightPlan
+    from robot.procedures.board_poses import BoardPosePlan
     from tacsim.config import load
 
     if not (rig and arm and camera and lens and board):
@@ -237,56 +225,46 @@ def hand_eye(
     described = parse_board(board)
     if described.kind == "dots":
         raise CalibrationError("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
-    plan = SightPlan(
+    plan = BoardPosePlan(
         board=described,
         lens=load(Lens, lens),
         poses=number,
         tilt=_within(tilt, 0.1, 1.0, "--tilt"),
         pivot=_within(pivot, 0.0, 2.0, "--pivot"),
     )
-    _tell_hand_eye(_sighted(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
+    _report_hand_eye(_take_board_poses(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
 
 
-def _sighted(
-    rig: str, arm: str, camera: str, plan: SightPlan, overrides: list[str], folder: Path, *, fixed: bool
+def _take_board_poses(
+    rig: str, arm: str, camera: str, plan: BoardPosePlan, overrides: list[str], folder: Path, *, fixed: bool
 ) -> BoardPoseFile:
     """Looks now; what was recorded is kept in `folder`, whatever ends it."""
     from calibration.poses.records import board_pose_file
-    from robot.procedures.board_poses import open_camera, opened, record_sights
+    from robot.procedures.board_poses import open_arm, open_camera, record_board_poses
     from tacsim.config import load_rig
 
     config = load_rig(rig, overrides=overrides).config
-    _confirm(config, f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?")
+    question = f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?"
+    confirm_motion(config, question)
     with (
-        Interrupt() as interrupt,
-        _kept(folder / "poses.yaml", "hand-eye") as keep,
-        progress() as bar,
-        opened(config, arm) as mover,
-        open_camera(camera, plan.lens) as eye,
+        _recording(folder / "poses.yaml", "hand-eye", "poses", plan.poses) as (session, write),
+        open_arm(config, arm) as mover,
+        open_camera(camera, plan.lens) as source,
     ):
-        row = bar.add_task("looking", total=plan.poses)
-        taken = record_sights(
-            mover,
-            eye,
-            plan,
-            interrupt,
-            lambda done: bar.update(row, completed=done),
-            lambda board_poses: keep(board_pose_file(board_poses, fixed=fixed)),
-        )
-    _end_if_stopped(interrupt, f"{len(taken.board_poses)} poses")
-    for missed in taken.missed:
-        notes.print(f"left out: {missed}", markup=False)
-    return board_pose_file(taken.board_poses, fixed=fixed)
+        session.keep = lambda _: write(board_pose_file(session.taken, fixed=fixed))
+        record_board_poses(mover, source, plan, session)
+    tell_left_out(session)
+    return board_pose_file(session.taken, fixed=fixed)
 
 
-def _tell_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
+def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
     from calibration.poses.hand_eye import fit_hand_eye
     from calibration.poses.records import pose_as_json
 
     fixed = record.camera == "fixed"
     with busy(f"fitting {len(record.poses)} poses"):
         fit = fit_hand_eye(record.measurements(), fixed=fixed, noise=noise)
-    _table(
+    _show_fit(
         "How far each board was seen from where it should be",
         ("pose", "place [mm]", "direction [deg]"),
         [(str(i + 1), f"{1e3 * m[0]:.3f}", f"{_degrees(m[1]):.3f}") for i, m in enumerate(fit.misses)],
@@ -298,7 +276,7 @@ def _tell_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
         f"{name}: ± {1e3 * place:.3f} mm, ± {_degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
         f"allows; the flange's directions swing by {_degrees(fit.spread):.0f} deg"
     )
-    results.print(f"  {name}: {_placed(fit.camera)}", markup=False)
+    results.print(f"  {name}: {_placement(fit.camera)}", markup=False)
     report = {
         name: pose_as_json(fit.camera, fit.covariance),
         board: pose_as_json(fit.board),
@@ -307,7 +285,7 @@ def _tell_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
         "scatter": fit.scatter,
         "units": "m, rad",
     }
-    _keep(folder, "hand-eye.json", report)
+    _write_report(folder, "hand-eye.json", report)
 
 
 def _one_source(file: Path | None, rig: str | None) -> None:
@@ -321,34 +299,17 @@ def _within(value: float, low: float, high: float, option: str) -> float:
     return value
 
 
-def _confirm(config: RigConfig, question: str) -> None:
-    """Asks a person, where an arm is no mock."""
-    from robot.open import CannotOpen
-    from tacsim.models.hardware import UrArmConfig
-
-    real = any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values())
-    if real and not ask(f"Rig '{config.name}': {question}"):
-        raise CannotOpen("nobody confirmed (at a terminal); nothing was moved")
+def _show_fit(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]], used: tuple[bool, ...]) -> None:
+    marked = ((*row, "" if good else "disagrees, left out") for row, good in zip(rows, used, strict=True))
+    show_table(title, (*columns, ""), marked)
 
 
-def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]], used: tuple[bool, ...]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, padding=(0, 1), title=title, title_justify="left")
-    for column in (*columns, ""):
-        table.add_column(column, justify="right")
-    for row, good in zip(rows, used, strict=True):
-        table.add_row(*row, "" if good else "disagrees, left out")
-    Console(highlight=False).print(table)
-
-
-def _snippet(arm: str, pose: Pose) -> None:
+def _print_entry(arm: str, pose: Pose) -> None:
     results.print("Write into the rig file:")
-    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placed(pose)}", markup=False)
+    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(pose)}", markup=False)
 
 
-def _placed(pose: Pose) -> str:
+def _placement(pose: Pose) -> str:
     """A pose as a rig file writes it, to the tenth of a micrometre."""
     from calibration.poses.records import placement
 
@@ -364,8 +325,8 @@ def _degrees(radians: float) -> float:
     return math.degrees(radians)
 
 
-def _keep(folder: Path, name: str, report: dict[str, Any]) -> None:
+def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:
     path = folder / name
-    with writing_into(made(folder)):
+    with writing(made(folder)):
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     say_files(path)

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.calibrate.presses import pressed
-from robot.cli.output import Out, Overrides, busy, made, new_directory, notes, quantity, say_files, writing
+from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
+from robot.cli.output import (
+    Out,
+    Overrides,
+    busy,
+    made,
+    new_directory,
+    notes,
+    quantity,
+    results,
+    say_files,
+    show_table,
+    writing,
+)
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -93,7 +106,7 @@ def sensor(
         from calibration.markers.dots import DotEraser
     try:
         if camera is not None:
-            read = pressed(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
+            read = _take_presses(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
         else:
             assert frames is not None
             read = read_folder(frames, reference, MAX_PRESSES)
@@ -104,13 +117,51 @@ def sensor(
         found = _markers(read, pitch) if markers else None
         erase = None if found is None else DotEraser(found.radius / pitch)
         with busy(f"calibrating from {len(read.frames)} presses"):
-            fit = calibrate_light(
-                read.reference, [(frame.name, frame.image) for frame in read.frames], ball / pitch, erase
-            )
+            named = [(frame.name, frame.image) for frame in read.frames]
+            fit = calibrate_light(read.reference, named, ball / pitch, erase)
     except BadFrames as error:
         hint = "FRAMES" if camera is None else "--camera"
         raise typer.BadParameter(str(error), param_hint=hint) from None
     _write(folder, fit, read, serial, ball, pitch, found, view=seen)
+
+
+def _take_presses(
+    camera: str,
+    overrides: list[str],
+    folder: Path,
+    ball: float,
+    presses: int,
+    view: GelView | None,
+    serial: str,
+    *,
+    markers: bool,
+) -> FrameSet:
+    """Frames taken now, native, and kept in `folder`/frames. camera: RIG/SENSOR; ball: its radius [px].
+
+    A signal ends the command; what was taken is kept then, too. Raises CannotCalibrate, BadFrames, DeviceError.
+    """
+    from calibration.errors import BadFrames
+    from calibration.frame_set import Frame, FrameSet, metric_picture, require_view_size
+    from robot.camera.camera import Camera
+    from robot.procedures.presses import BallPressPlan, record_presses
+
+    config, sensor = named_camera(camera, overrides)
+    if view is not None:
+        require_view_size((config.height, config.width), view)
+    plan = BallPressPlan(ball, presses, rectify=None if view is None else metric_picture(view), markers=markers)
+    frames = folder / "frames"
+    again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(serial)} ..."
+    with Camera(config, sensor) as source:
+        confirm_free_gel()
+        note = f"frames kept in {frames}; to calibrate from them again: {again}"
+        with led("presses", presses, frames, note) as session:
+            session.keep = picture_keeper(frames)
+            untouched = record_presses(source, plan, session)
+    if not untouched or not session.taken:
+        raise BadFrames("the source was over before a press was taken")
+    taken = tuple(Frame(name, image) for name, image in session.taken)
+    more = tuple(Frame(f"background_{k}.png", image) for k, image in enumerate(untouched[:-1], start=1))
+    return FrameSet(camera, untouched[-1], "background.png", taken, more)
 
 
 def _write(
@@ -173,15 +224,14 @@ def _noise(read: FrameSet) -> CameraNoise | None:
     """The camera's noise, and a word on it."""
     from calibration.light.noise import NoiseUnknown, measure_noise
 
-    untouched = read.untouched_images
     try:
-        noise = measure_noise(untouched)
+        noise = measure_noise(read.untouched_images)
     except NoiseUnknown as why:
         notes.print(f"camera's noise not measured: {why}", markup=False)
         return None
     spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
     notes.print(
-        f"camera's noise, from {len(untouched)} pictures without contact: R, G, B {spread} grey levels; "
+        f"camera's noise, from {len(read.untouched_images)} pictures without contact: R, G, B {spread} grey levels; "
         f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
     )
     return noise
@@ -251,23 +301,18 @@ def _bundle(
 
 
 def _show(fit: LightFit, pitch: float) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, padding=(0, 1), title="Each press predicted by all the others", title_justify="left")
-    table.add_column("frame")
-    for column in ("contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]"):
-        table.add_column(column, justify="right")
-    for score in fit.scores:
-        table.add_row(
-            score.name, f"{score.circle.radius * pitch * 1e3:.3f}", f"{score.error:.1f}", f"{score.nothing:.1f}",
-            f"{score.correlation:.3f}", f"{score.angle:.1f}",
-        )  # fmt: skip
-    console = Console(highlight=False)
     if fit.scores:
-        console.print(table)
+        rows = (
+            (
+                score.name, f"{score.circle.radius * pitch * 1e3:.3f}", f"{score.error:.1f}", f"{score.nothing:.1f}",
+                f"{score.correlation:.3f}", f"{score.angle:.1f}",
+            )
+            for score in fit.scores
+        )  # fmt: skip
+        columns = ("frame", "contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]")
+        show_table("Each press predicted by all the others", columns, rows, left={0})
     order = fit.order
-    console.print(
+    results.print(
         f"model: degree {order.degree} in the normal, {order.position} in the place; calibrated up to a slope of "
         f"{fit.steepest:.2f}; skirt {fit.skirt.length * pitch * 1e3:.2f} mm x {fit.skirt.fraction:.2f}"
     )

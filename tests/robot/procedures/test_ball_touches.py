@@ -23,7 +23,8 @@ from robot.cli import app
 from robot.errors import DeviceError
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
-from robot.procedures.ball_touches import CannotTouch, TouchPlan, TouchRecord, alone, schedule
+from robot.procedures.ball_touches import BallTouchPlan, schedule, without_task
+from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
 from tacsim.interface import Pose
@@ -58,7 +59,7 @@ start: {{ approach_speed: 10 mm/s, approach_step: 20 um }}
 
 
 def test_tilts_and_places_lie_round_about() -> None:
-    plan = TouchPlan(ball_radius=4e-3, touches=24, tilt=0.4, spread=3e-3)
+    plan = BallTouchPlan(ball_radius=4e-3, touches=24, tilt=0.4, spread=3e-3)
     moves = schedule(plan)
     assert len(moves) == 24
     assert moves[0][0].magnitude() == 0.0 and not moves[0][1].any()
@@ -187,8 +188,8 @@ def test_a_gel_without_depth_is_refused() -> None:
     bare = {
         name: sensor.model_copy(update={"model": None, "calibration": None}) for name, sensor in config.sensors.items()
     }
-    with pytest.raises(CannotTouch, match="cannot tell how deep it is pressed"):
-        alone(config.model_copy(update={"sensors": bare}), "upper", "upper")
+    with pytest.raises(CannotCalibrate, match="cannot tell how deep it is pressed"):
+        without_task(config.model_copy(update={"sensors": bare}), "upper", "upper")
 
 
 def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
@@ -199,6 +200,7 @@ def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
     assert "nobody confirmed (at a terminal); nothing was moved" in done.stderr
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
 def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
     """And again without the arm, from what was kept."""
@@ -240,19 +242,18 @@ def test_what_was_touched_is_kept_whatever_ends_it(ends: str, tmp_path: Path, mo
     """The arm and its touches are made up; keeping and the end are the command's own."""
     touches, _, _ = made_touches(np.random.default_rng(0), 5)
 
-    def some(*given: Any) -> TouchRecord:
-        stop, _, keep = given[5:]
+    def some(*given: Any) -> None:
+        session: Session[Any] = given[-1]
         for count in range(1, 6):
-            assert not stop()
-            keep(touches[:count])
+            session.check()
+            session.take(touches[count - 1])
             assert len(read_touches(tmp_path / "out" / "touches.yaml").touches) == count  # each at once
         if ends == "fails":
             raise DeviceError("most touches failed")
         os.kill(os.getpid(), signal.SIGINT)
-        assert stop()
-        return TouchRecord(touches, [])
+        assert session.stop()
 
-    monkeypatch.setattr("robot.procedures.ball_touches.record_touches", some)
+    monkeypatch.setattr("robot.procedures.ball_touches.record_ball_touches", some)
     monkeypatch.setattr("robot.open.open_rig", lambda *_, **__: nullcontext())
     words = ["calibrate", "touch", "--rig", "mock", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"]
     done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")], env=NARROW)

@@ -17,7 +17,8 @@ from calibration.poses.records import board_pose_file, write_record
 from robot.cli import app
 from robot.mock import FaultClient, MockCamera
 from robot.mock.fixtures import mock_host
-from robot.procedures.board_poses import CannotSee, SightPlan, record_sights, schedule
+from robot.procedures.board_poses import BoardPosePlan, record_board_poses, schedule
+from robot.procedures.session import CannotCalibrate, Session
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tests.calibration.boards import CHARUCO, LENS, facing, photograph
@@ -128,6 +129,7 @@ class Eye:
         self._thread.join()
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")
 def test_a_mock_arm_finds_where_its_camera_sits(tmp_path: Path) -> None:
     host = mock_host(51)
@@ -152,10 +154,10 @@ def test_a_mock_arm_finds_where_its_camera_sits(tmp_path: Path) -> None:
 
 
 def test_a_plan_that_would_tell_too_little_is_refused_before_anything_moves() -> None:
-    plan = SightPlan(CHARUCO, LENS, poses=12, tilt=np.radians(15.0))
-    with pytest.raises(CannotSee, match=r"with a tilt of 15 degrees and 12 poses .* give a larger --tilt"):
-        record_sights(None, None, plan)  # type: ignore[arg-type]
-    turns = schedule(SightPlan(CHARUCO, LENS, poses=20, tilt=np.radians(30.0)))
+    plan = BoardPosePlan(CHARUCO, LENS, poses=12, tilt=np.radians(15.0))
+    with pytest.raises(CannotCalibrate, match=r"with a tilt of 15 degrees and 12 poses .* give a larger --tilt"):
+        record_board_poses(None, None, plan, Session())  # type: ignore[arg-type]
+    turns = schedule(BoardPosePlan(CHARUCO, LENS, poses=20, tilt=np.radians(30.0)))
     assert turns[0].magnitude() == 0.0 and len(turns) == 20
     vectors = np.degrees([turn.as_rotvec() for turn in turns])
     assert np.abs(vectors).max() <= 30.0 + 1e-9

@@ -19,10 +19,11 @@ from calibration.lens.view import GelView, Lens
 from robot.cli import app
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
-from robot.procedures.board_views import ON_GEL, WAYS, CannotView, ViewPlan, ViewRecord, record_views
+from robot.procedures.board_views import ON_GEL, PROMPTS, BoardViewPlan, record_board_views
+from robot.procedures.session import CannotCalibrate, Session
 from tacsim.config import load
 from tacsim.interface import EndOfEpisode, TactileFrame
-from tacsim.record.images import read_image
+from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
 
 Move = np.ndarray | Callable[[int], np.ndarray]
@@ -56,21 +57,22 @@ class Person:
                 raise EndOfEpisode("nobody is there any more")
             self._shown = move
 
-    def led(self, number: int, **options: object) -> tuple[ViewRecord, dict[str, np.ndarray]]:
+    def led(self, number: int, **options: object) -> tuple[Session[tuple[str, np.ndarray]], dict[str, np.ndarray]]:
         kept: dict[str, np.ndarray] = {}
-        plan = ViewPlan(DOTS, number, **options)  # type: ignore[arg-type]
-        return record_views(self, plan, kept.__setitem__, self.hear), kept
+        session: Session[tuple[str, np.ndarray]] = Session(say=self.hear, keep=lambda item: kept.update([item]))
+        record_board_views(self, BoardViewPlan(DOTS, number, **options), session)  # type: ignore[arg-type]
+        return session, kept
 
 
 def test_a_person_is_led_from_view_to_view() -> None:
     person = Person(list(views(3)))
     record, kept = person.led(3)
-    assert list(kept) == ["view_01.png", "view_02.png", "view_03.png"] and record.skipped == []
-    for (name, image), shown in zip(record.views, views(3), strict=True):
+    assert list(kept) == ["view_01.png", "view_02.png", "view_03.png"] and record.left_out == []
+    for (name, image), shown in zip(record.taken, views(3), strict=True):
         assert kept[name] is image
         np.testing.assert_array_equal(image, shown)
     asked = [words for words in person.said if words.startswith("View")]
-    assert asked == [f"View {k} of 3: hold the board still, {WAYS[k - 1]}." for k in (1, 2, 3)]
+    assert asked == [f"View {k} of 3: hold the board still, {PROMPTS[k - 1]}." for k in (1, 2, 3)]
     assert sum(words.startswith("Taken: 63 points") for words in person.said) == 3
 
 
@@ -91,26 +93,27 @@ def moving(index: int) -> np.ndarray:
 def test_a_view_that_tells_nothing_is_skipped_with_the_reason(move: Move, why: str) -> None:
     person = Person([views(3)[0], move, views(3)[2]])
     record, kept = person.led(2)
-    (skipped,) = record.skipped
+    (skipped,) = record.left_out
     assert re.search(why, skipped) and f"Skipped: {skipped}." in person.said
     assert len(kept) == 2
-    np.testing.assert_array_equal(record.views[1][1], views(3)[2])
+    np.testing.assert_array_equal(record.taken[1][1], views(3)[2])
 
 
 def test_the_gel_is_viewed_once_and_against_its_own_picture() -> None:
     faint = np.clip(128 + 0.1 * (views(1)[0].astype(float) - 128), 0, 255).astype(np.uint8)
     person = Person([faint])
     record, _ = person.led(1, on_gel=True, reference=EMPTY)
-    assert len(record.views) == 1 and person.said[0] == f"View 1 of 1: {ON_GEL}."
+    assert len(record.taken) == 1 and person.said[0] == f"View 1 of 1: {ON_GEL}."
 
 
 def test_it_ends_when_asked_when_the_source_ends_and_when_nobody_comes() -> None:
     record, kept = Person(list(views(3)[:2])).led(6)
-    assert len(record.views) == len(kept) == 2
-    with pytest.raises(CannotView, match=r"given up after 6 s without a view; the last: the board .* is not found"):
+    assert len(record.taken) == len(kept) == 2
+    with pytest.raises(CannotCalibrate, match=r"after 6 s without a view; the last: the board .* is not found"):
         Person([EMPTY] * 9).led(1, patience=6.0)
-    never = record_views(Person([EMPTY]), ViewPlan(DOTS, 2), lambda *_: None, lambda _: None, stop=lambda: True)
-    assert never.views == []
+    never: Session[tuple[str, np.ndarray]] = Session(stop=lambda: True)
+    record_board_views(Person([EMPTY]), BoardViewPlan(DOTS, 2), never)
+    assert never.taken == []
 
 
 RIG = """
@@ -141,6 +144,7 @@ def lead(camera: MockCamera, words: list[str], moves: list[np.ndarray], stop_aft
     return process.returncode, lines
 
 
+@pytest.mark.deep
 @pytest.mark.timeout(300)
 def test_the_command_calibrates_the_lens_and_then_the_gel(tmp_path: Path) -> None:
     """One view without a board is skipped; the pictures give the same lens again; then the board lies on the gel."""
@@ -173,6 +177,7 @@ def test_the_command_calibrates_the_lens_and_then_the_gel(tmp_path: Path) -> Non
     assert read_image(tmp_path / "view" / "rectified.png").shape == (view.geometry.height, view.geometry.width, 3)
 
 
+@pytest.mark.deep
 @pytest.mark.timeout(300)
 def test_ctrl_c_keeps_what_was_taken(tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -191,23 +196,20 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
     rig = tmp_path / "bench.yaml"
     rig.write_text(RIG.format(source="http://127.0.0.1:9/"))
     live = ["--camera", f"{rig}/eye"]
-    from tacsim.record.images import encode_png
-
     (tmp_path / "small.png").write_bytes(encode_png(EMPTY[:100]))
-    for words, code, said in (
-        (BOARD, 2, "either pictures, or --camera"),
-        ([str(tmp_path), *live, *BOARD], 2, "either pictures, or --camera"),
-        (live, 2, "either --board or --corners"),
-        ([*live, "--corners", "0,0,9,0,9,9,0,9"], 2, "corners are read off a picture"),
-        ([*live, *BOARD, "--views", "4"], 2, "a lens needs 6 views"),
-        ([*live, *BOARD, "--reference", str(tmp_path / "small.png")], 2, "it is 640 x 100 px"),
-        (["--camera", "eye", *BOARD], 2, "give rig and sensor"),
-        (["--camera", "mock/lower", *BOARD], 2, "has a mock camera that a simulation feeds"),
-        ([*live, *BOARD], 1, "no picture from http://127.0.0.1:9/"),
+    for words, said in (
+        (BOARD, "either pictures, or --camera"),
+        ([str(tmp_path), *live, *BOARD], "either pictures, or --camera"),
+        (live, "either --board or --corners"),
+        ([*live, "--corners", "0,0,9,0,9,9,0,9"], "corners are read off a picture"),
+        ([*live, *BOARD, "--views", "4"], "a lens needs 6 views"),
+        ([*live, *BOARD, "--reference", str(tmp_path / "small.png")], "it is 640 x 100 px"),
+        (["--camera", "eye", *BOARD], "give rig and sensor"),
+        (["--camera", "mock/lower", *BOARD], "has a mock camera that a simulation feeds"),
     ):
         done = CliRunner().invoke(
             app, ["calibrate", "lens", *words, "--out", str(tmp_path / "out")], env={"COLUMNS": "200"}
         )
-        assert done.exit_code == code, (words, done.output)
+        assert done.exit_code == 2, (words, done.output)
         assert said in " ".join(done.stderr.replace("│", " ").split()), (words, done.output)
         assert not (tmp_path / "out").exists()

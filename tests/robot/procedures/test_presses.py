@@ -25,15 +25,8 @@ from calibration.light.noise import measure_noise
 from robot.cli import app
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
-from robot.procedures.presses import (
-    NOISE_FRAMES,
-    REFERENCE,
-    CannotPress,
-    PressPlan,
-    PressRecord,
-    camera_facts,
-    record_presses,
-)
+from robot.procedures.presses import NOISE_FRAMES, REFERENCE, BallPressPlan, record_presses
+from robot.procedures.session import CannotCalibrate, Session, handheld_camera
 from tacsim.config import load_rig
 from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import read_image
@@ -77,16 +70,11 @@ class Person:
         elif words.startswith("Still moving"):
             self._shown = PRESSES[0]
 
-    def led(self, presses: int = 5, **options: object) -> tuple[PressRecord, dict[str, np.ndarray]]:
+    def led(self, presses: int = 5, **options: object) -> tuple[Session[tuple[str, np.ndarray]], dict[str, np.ndarray]]:
         kept: dict[str, np.ndarray] = {}
-        record = record_presses(
-            self,
-            PressPlan(BALL_PX, presses, **options),  # type: ignore[arg-type]
-            kept.__setitem__,
-            self.hear,
-            stop=lambda: False,
-        )
-        return record, kept
+        session: Session[tuple[str, np.ndarray]] = Session(say=self.hear, keep=lambda item: kept.update([item]))
+        self.untouched = record_presses(self, BallPressPlan(BALL_PX, presses, **options), session)  # type: ignore[arg-type]
+        return session, kept
 
     def refused(self) -> list[str]:
         return [words for words in self.said if words.startswith("Not taken")]
@@ -96,9 +84,9 @@ def test_a_person_is_led_from_press_to_press() -> None:
     person = Person(PRESSES[:5])
     record, kept = person.led()
     assert list(kept) == [*UNTOUCHED, *(f"press_0{k}.png" for k in range(1, 6))]
-    assert measure_noise(record.untouched).deviation == pytest.approx([1.53] * 3, rel=0.03)
-    assert person.refused() == record.refused == []
-    for (name, image), shown in zip(record.presses, PRESSES, strict=False):
+    assert measure_noise(person.untouched).deviation == pytest.approx([1.53] * 3, rel=0.03)
+    assert person.refused() == record.left_out == []
+    for (name, image), shown in zip(record.taken, PRESSES, strict=False):
         assert kept[name] is image
         assert np.abs(image.astype(int) - shown).mean() < 2.5
     asked = [words for words in person.said if words.startswith("Press ")]
@@ -137,8 +125,8 @@ def glaring() -> np.ndarray:
 def test_a_press_that_tells_nothing_is_refused_and_asked_for_again(move: np.ndarray, why: str) -> None:
     person = Person([PRESSES[0], move, PRESSES[1]])
     record, kept = person.led(2)
-    assert len(record.presses) == 2 and len(kept) == len(UNTOUCHED) + 2
-    assert np.abs(record.presses[1][1].astype(int) - PRESSES[1]).mean() < 2.5
+    assert len(record.taken) == 2 and len(kept) == len(UNTOUCHED) + 2
+    assert np.abs(record.taken[1][1].astype(int) - PRESSES[1]).mean() < 2.5
     (said,) = person.refused()
     assert re.search(why, said)
     assert [words[:12] for words in person.said].count("Press 2 of 2") == 2
@@ -152,7 +140,7 @@ def test_presses_on_a_gel_with_dots_are_judged_without_them() -> None:
 
     marked = Person([dotted(PRESSES[0], 2.0)], empty=dotted(EMPTY, 0.0))
     record, _ = marked.led(1, markers=True)
-    assert record.refused == [] and len(record.presses) == 1
+    assert record.left_out == [] and len(record.taken) == 1
     with pytest.raises(BadFrames, match="leave --markers out"):
         Person([PRESSES[0]]).led(1, markers=True)
 
@@ -164,7 +152,7 @@ def test_a_press_counts_only_once_it_rests() -> None:
     person = Person([sliding])
     record, _ = person.led(1)
     assert any(words.startswith("Still moving") for words in person.said)
-    assert np.abs(record.presses[0][1].astype(int) - PRESSES[0]).mean() < 2.5  # held still, then
+    assert np.abs(record.taken[0][1].astype(int) - PRESSES[0]).mean() < 2.5  # held still, then
 
 
 def test_a_slow_creep_is_motion_too() -> None:
@@ -172,23 +160,23 @@ def test_a_slow_creep_is_motion_too() -> None:
     person = Person([lambda index: SENSOR.press(float(next(depths)), 130, 100).image])
     record, _ = person.led(1)
     deepest = SENSOR.press(0.6e-3, 130, 100).image
-    assert np.abs(record.presses[0][1].astype(int) - deepest).mean() < 3.5
+    assert np.abs(record.taken[0][1].astype(int) - deepest).mean() < 3.5
 
 
 def test_what_was_taken_stays_when_it_ends_early() -> None:
     record, kept = Person(PRESSES[:2]).led(5)
-    assert len(record.presses) == 2 and len(kept) == len(UNTOUCHED) + 2
+    assert len(record.taken) == 2 and len(kept) == len(UNTOUCHED) + 2
 
 
 def test_a_person_who_does_nothing_is_not_waited_for_for_ever() -> None:
-    with pytest.raises(CannotPress, match="nothing touched the gel"):
+    with pytest.raises(CannotCalibrate, match="nothing touched the gel"):
         Person([EMPTY]).led(1, patience=20.0)
-    with pytest.raises(CannotPress, match="does not look as it did before the presses"):
+    with pytest.raises(CannotCalibrate, match="does not look as it did before the presses"):
         Person(PRESSES, lifts=False).led(2, patience=20.0)
 
     person = Person([])
     person._shown = lambda index: np.roll(PRESSES[0], 3 * index, axis=1)
-    with pytest.raises(CannotPress, match="does not come to rest"):
+    with pytest.raises(CannotCalibrate, match="does not come to rest"):
         person.led(1, patience=20.0)
 
 
@@ -200,11 +188,11 @@ def test_a_dark_picture_without_contact_is_refused() -> None:
 
 
 def test_only_a_camera_with_a_gel_before_it_can_be_pressed() -> None:
-    with pytest.raises(CannotPress, match="is no sensor with a camera; cameras: none"):
-        camera_facts(load_rig("sim").config, "lower")
-    with pytest.raises(CannotPress, match="nobody can press its gel"):
-        camera_facts(load_rig("mock").config, "lower")
-    assert camera_facts(load_rig("ur5e").config, "upper").driver == "camera"
+    with pytest.raises(CannotCalibrate, match="is no sensor with a camera; cameras: none"):
+        handheld_camera(load_rig("sim").config, "lower")
+    with pytest.raises(CannotCalibrate, match="nobody can press its gel"):
+        handheld_camera(load_rig("mock").config, "lower")
+    assert handheld_camera(load_rig("ur5e").config, "upper").driver == "camera"
 
 
 RIG = """
@@ -261,6 +249,7 @@ def lead(
     return process.returncode, lines
 
 
+@pytest.mark.deep
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("answer", [None, "n\ny\n"], ids=["no terminal", "a terminal"])
 def test_the_command_makes_a_bundle_and_keeps_its_frames(answer: str | None, tmp_path: Path) -> None:
@@ -286,6 +275,7 @@ def test_the_command_makes_a_bundle_and_keeps_its_frames(answer: str | None, tmp
     assert live.noise is None and "camera's noise not measured: the pictures" in done.output
 
 
+@pytest.mark.deep
 @pytest.mark.timeout(300)
 def test_a_camera_that_looks_askew_is_led_through_its_view(tmp_path: Path) -> None:
     """What the person is told, and the bundle, are of the metric picture; what is kept is the camera's."""

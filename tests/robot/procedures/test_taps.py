@@ -14,7 +14,8 @@ from calibration.poses.latency import Latency
 from robot.cli import app
 from robot.mock import FaultClient, MockCamera
 from robot.mock.fixtures import mock_host, rig_addresses
-from robot.procedures.taps import AWAY, PAUSE, STAY, CannotTap, TapPlan, entries, schedule, untimed
+from robot.procedures.session import CannotCalibrate
+from robot.procedures.taps import CONTACT_TIME, LIFTED_TIME, PAUSE, TapPlan, latency_entries, schedule, without_latency
 from tacsim.config import load_rig
 from tacsim.models.hardware import UrArmConfig
 
@@ -23,7 +24,7 @@ DELAY = 0.15  # of the camera [s]
 SLACK = 0.05  # what a busy machine may add on either side: the test's own hand between arm and camera [s]
 
 
-def arm_facts(latency: float = 0.0) -> UrArmConfig:
+def arm_config(latency: float = 0.0) -> UrArmConfig:
     found = load_rig("mock").config.arms["upper"]
     assert isinstance(found, UrArmConfig)
     return found.model_copy(update={"latency": latency})
@@ -38,9 +39,9 @@ def test_taps_come_at_uneven_intervals_with_a_pause_before_and_after() -> None:
     moves = schedule(TapPlan(taps=6), travel)
     times, down = [time for time, _ in moves], [each for _, each in moves]
     assert down == [True, False] * 6 + [False]
-    assert times[0] == PAUSE and times[-1] - times[-2] >= PAUSE + travel + AWAY[0]
-    ways = np.diff(times[:-1])
-    assert (ways[::2] >= travel + STAY[0]).all() and (ways[1::2] >= travel + AWAY[0]).all()
+    assert times[0] == PAUSE and times[-1] - times[-2] >= PAUSE + travel + LIFTED_TIME[0]
+    pauses = np.diff(times[:-1])
+    assert (pauses[::2] >= travel + CONTACT_TIME[0]).all() and (pauses[1::2] >= travel + LIFTED_TIME[0]).all()
     assert np.ptp(np.diff(times[:-1:2])) > 0.1  # regular taps fit several latencies
     assert schedule(TapPlan(taps=6), travel) == moves
     assert schedule(TapPlan(taps=6, seed=1), travel) != moves
@@ -59,7 +60,7 @@ def test_taps_come_at_uneven_intervals_with_a_pause_before_and_after() -> None:
 def test_both_times_shall_be_those_of_the_event(
     clock: str, seconds: float, known: float, wanted: dict[str, float]
 ) -> None:
-    found = entries(latency(seconds), clock, "upper", arm_facts(known), "upper")  # type: ignore[arg-type]
+    found = latency_entries(latency(seconds), clock, "upper", arm_config(known), "upper")  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     camera = found.get("sensors.upper.latency", 0.0 if clock != "arrival" else None)
     assert camera is not None
@@ -69,7 +70,7 @@ def test_both_times_shall_be_those_of_the_event(
 
 def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
     config = load_rig("mock", overrides=["arms.upper.latency=10 ms", "sensors.upper.latency=50 ms"]).config
-    bare = untimed(config, "upper", "upper")
+    bare = without_latency(config, "upper", "upper")
     assert bare.contact == "hertz"
     assert bare.arms["upper"].latency == bare.sensors["upper"].latency == 0.0  # type: ignore[union-attr]
     assert not bare.lock_step and bare.arms["lower"] == config.arms["lower"]
@@ -78,15 +79,15 @@ def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
 @pytest.mark.parametrize(
     ("rig", "arm", "sensor", "words"),
     [
-        ("sim", "upper", "upper", "'upper' is no arm that can tap"),
+        ("sim", "upper", "upper", "'upper' is no arm of hardware, real or mock; there are: none"),
         ("mock", "third", "upper", "'third' is no arm.*lower, upper"),
         ("mock", "upper", "third", "'third' is no sensor with a camera.*lower, upper"),
         ("mock", "upper", "lower", "carried by lower, not by 'upper'"),
     ],
 )
 def test_parts_that_cannot_tell_are_refused(rig: str, arm: str, sensor: str, words: str) -> None:
-    with pytest.raises(CannotTap, match=words):
-        untimed(load_rig(rig).config, arm, sensor)
+    with pytest.raises(CannotCalibrate, match=words):
+        without_latency(load_rig(rig).config, arm, sensor)
     done = CliRunner().invoke(app, ["calibrate", "latency", rig, "--arm", arm, "--sensor", sensor])
     assert done.exit_code == 2
 

@@ -1,0 +1,92 @@
+"""A procedure at the terminal: what a person is told and asked, where pictures and records are kept, how it ends."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import ask, made, notes, progress, writing
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from robot.procedures.session import Session
+    from tacsim.models.hardware import CameraSensorConfig
+    from tacsim.models.rig import RigConfig
+
+
+@contextmanager
+def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
+    """A session whose words and progress go to stderr. At the end, a failure included, `note` says where what was
+    taken lies, if it was `kept`. A signal ends the command: its exit is raised at the end of the block."""
+    from robot.procedures.session import Session
+
+    with Interrupt() as interrupt, progress() as bar:
+        row = bar.add_task(what, total=total)
+        session: Session[Any] = Session(
+            say=lambda words: notes.print(words, markup=False),
+            progress=lambda done: bar.update(row, completed=done),
+            stop=interrupt,
+        )
+        try:
+            yield session
+        finally:
+            if kept.exists():
+                notes.print(note, markup=False)
+    if interrupt():
+        complain(f"stopped by a signal; {len(session.taken)} {what} are kept, nothing is calibrated")
+        raise typer.Exit(interrupt.exit_code)
+
+
+def confirm_motion(config: RigConfig, question: str) -> None:
+    """Asks a person, where an arm is no mock. Raises CannotOpen."""
+    from robot.open import CannotOpen
+    from tacsim.models.hardware import UrArmConfig
+
+    real = any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values())
+    if real and not ask(f"Rig '{config.name}': {question}"):
+        raise CannotOpen("nobody confirmed (at a terminal); nothing was moved")
+
+
+def confirm_free_gel() -> None:
+    """Without a terminal nobody is asked: the gel counts as free once its picture rests."""
+    if sys.stdin.isatty():
+        while not typer.confirm("Is nothing touching the gel?", default=True, err=True):
+            notes.print("Take everything off the gel first.")
+
+
+def named_camera(camera: str, overrides: list[str]) -> tuple[CameraSensorConfig, str]:
+    """The sensor RIG/SENSOR, and its name. Raises CannotCalibrate where nobody can be before its camera."""
+    from robot.procedures.session import handheld_camera
+    from tacsim.config import load_rig
+
+    rig, _, sensor = camera.rpartition("/")
+    if not rig:
+        raise typer.BadParameter(
+            f"'{camera}': give rig and sensor, such as ur5e/upper or my.yaml/upper", param_hint="--camera"
+        )
+    return handheld_camera(load_rig(rig, overrides=overrides).config, sensor), sensor
+
+
+def picture_keeper(folder: Path) -> Callable[[tuple[str, NDArray[np.uint8]]], None]:
+    """What writes named pictures into `folder`, which the first one makes."""
+    from tacsim.record.images import encode_png
+
+    def keep(picture: tuple[str, NDArray[np.uint8]]) -> None:
+        with writing(made(folder)):
+            (folder / picture[0]).write_bytes(encode_png(picture[1]))
+
+    return keep
+
+
+def tell_left_out(session: Session[Any]) -> None:
+    for why in session.left_out:
+        notes.print(f"left out: {why}", markup=False)

@@ -67,84 +67,84 @@ def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
 
     if not episode.steps:
         raise ValueError("the episode has no steps, there is nothing to report; record at least the state after reset")
-    config = summary(episode)
+    stats = summary(episode)
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
-    paths["summary.json"].write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     page = figure.overview(
-        episode, _title(config), " · ".join(f"{key}: {value}" for key, value in _headline(config, episode))
+        episode, _title(stats), " · ".join(f"{key}: {value}" for key, value in _headline(stats, episode))
     )
     figure.save(page, paths["report.png"])
-    paths["report.html"].write_text(_html(episode, config), encoding="utf-8")
+    paths["report.html"].write_text(_html(episode, stats), encoding="utf-8")
     return paths
 
 
-def end_table(config: Mapping[str, Any], paths: Iterable[Path]) -> Table:
-    """What a person wants to know at the end of a run, as a rich table. `facts` are those of :func:`summary`."""
+def end_table(stats: Mapping[str, Any], paths: Iterable[Path]) -> Table:
+    """What a person wants to know at the end of a run, as a rich table. `stats` are those of :func:`summary`."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(_title(config)), show_header=False, title_justify="left", min_width=60)
+    table = Table(title=Text(_title(stats)), show_header=False, title_justify="left", min_width=60)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in _results(config):
+    for name, value in _results(stats):
         table.add_row(name, Text(value))
     for number, path in enumerate(paths):
         table.add_row("files" if number == 0 else "", Text(str(path)))
     return table
 
 
-def _results(config: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     from tacsim.report.timing import timing_rows
     from tacsim.report.trust import trust_rows
 
-    known = [(value, k) for k, value in zip(config["step"], config["distance"], strict=True) if value is not None]
+    known = [(value, k) for k, value in zip(stats["step"], stats["distance"], strict=True) if value is not None]
     best = min(known, default=None)
-    rewards = [value for value in config["reward"] if value is not None]
-    rows_of_force = zip(config["step"], config["force"], strict=True)
+    rewards = [value for value in stats["reward"] if value is not None]
+    rows_of_force = zip(stats["step"], stats["force"], strict=True)
     forces = [(value, arm, k) for k, row in rows_of_force for arm, value in row.items() if value is not None]
     peak = max(forces, key=lambda row: row[0], default=None)  # of equal ones the first
     rows = [
-        ("steps", f"{config['steps']}" + ("" if config["complete"] else " (recording incomplete)")),
+        ("steps", f"{stats['steps']}" + ("" if stats["complete"] else " (recording incomplete)")),
         ("best distance", f"{best[0] * 1e3:.3f} mm at step {best[1]}" if best else "–"),
         ("final reward", f"{rewards[-1]:.3f}" if rewards else "–"),
         ("peak force |Fz|", f"{peak[0]:.2f} N ({peak[1]}, step {peak[2]})" if peak else "–"),
-        ("contact signal", _signal_text(config)),
-        ("step time, median", f"{config['seconds_per_step']:.3f} s" if config["seconds_per_step"] is not None else "–"),
+        ("contact signal", _signal_text(stats)),
+        ("step time, median", f"{stats['seconds_per_step']:.3f} s" if stats["seconds_per_step"] is not None else "–"),
     ]
-    if config["settled"] is not None:
-        rows.append(("settled", f"{config['settled']} of {config['steps']} steps"))
-    if config["timing"] is not None:
-        rows += timing_rows(config["timing"])
-    if config["trust"] is not None:
-        rows += trust_rows(config["trust"])
-    if config["dropped"]:
-        rows.append(("dropped", f"{config['dropped']} steps were not recorded"))
+    if stats["settled"] is not None:
+        rows.append(("settled", f"{stats['settled']} of {stats['steps']} steps"))
+    if stats["timing"] is not None:
+        rows += timing_rows(stats["timing"])
+    if stats["trust"] is not None:
+        rows += trust_rows(stats["trust"])
+    if stats["dropped"]:
+        rows.append(("dropped", f"{stats['dropped']} steps were not recorded"))
     return rows
 
 
-def _signal_text(config: Mapping[str, Any]) -> str:
+def _signal_text(stats: Mapping[str, Any]) -> str:
     parts = []
-    for name, values in config["contact_signal"].items():
+    for name, values in stats["contact_signal"].items():
         known = [value for value in values if value is not None]
         if known:
-            correlation = config["correlation"].get(name)
+            correlation = stats["correlation"].get(name)
             with_force = "" if correlation is None else f", r = {correlation:.3f} with force"
             parts.append(f"{name}: peak {max(known):.3g}{with_force}")
     return "; ".join(parts) or "–"
 
 
-def _title(config: Mapping[str, Any]) -> str:
-    return f"{config['task'] or 'episode'} on rig {config['rig']}"
+def _title(stats: Mapping[str, Any]) -> str:
+    return f"{stats['task'] or 'episode'} on rig {stats['rig']}"
 
 
-def _headline(config: Mapping[str, Any], episode: Episode) -> list[tuple[str, str]]:
+def _headline(stats: Mapping[str, Any], episode: Episode) -> list[tuple[str, str]]:
     from tacsim.report.figure import goal_text
 
     return [
-        ("policy", str(config["policy"])),
-        ("seed", str(config["seed"])),
-        ("steps", str(config["steps"])),
+        ("policy", str(stats["policy"])),
+        ("seed", str(stats["seed"])),
+        ("steps", str(stats["steps"])),
         ("goal", goal_text(episode.meta.goal)),
     ]
 
@@ -162,7 +162,7 @@ def _inline(content: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
 
 
-def _html(episode: Episode, config: Mapping[str, Any]) -> str:
+def _html(episode: Episode, stats: Mapping[str, Any]) -> str:
     from jinja2 import Environment, StrictUndefined
 
     from tacsim.report import figure
@@ -177,10 +177,10 @@ def _html(episode: Episode, config: Mapping[str, Any]) -> str:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8"))
     return template.render(
-        title=_title(config),
-        config=[("rig", config["rig"]), ("task", config["task"] or "–"), *_headline(config, episode)],
-        results=_results(config),
-        versions=sorted(config["versions"].items()),
+        title=_title(stats),
+        about=[("rig", stats["rig"]), ("task", stats["task"] or "–"), *_headline(stats, episode)],
+        results=_results(stats),
+        versions=sorted(stats["versions"].items()),
         strips=strips,
         plots=_inline(figure.png_of(figure.plots(episode))),
     )

@@ -38,17 +38,17 @@ def _spread(values: Any) -> dict[str, float]:
     return {"median": median, "p99": p99, "max": largest}
 
 
-def timing_rows(config: dict[str, Any]) -> list[tuple[str, str]]:
+def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
     """The same for a person."""
-    period = config["period"]
+    period = stats["period"]
     ages = "; ".join(
-        f"{name} {1e3 * age['median']:.0f} (at most {1e3 * age['max']:.0f}) ms" for name, age in config["age"].items()
+        f"{name} {1e3 * age['median']:.0f} (at most {1e3 * age['max']:.0f}) ms" for name, age in stats["age"].items()
     )
-    off = max((spread["max"] for spread in config["alignment"].values()), default=0.0)
-    hits = ", ".join(f"{name} {count}" for name, count in config["limits_hit"].items())
+    off = max((spread["max"] for spread in stats["alignment"].values()), default=0.0)
+    hits = ", ".join(f"{name} {count}" for name, count in stats["limits_hit"].items())
     return [
         ("period", f"median {period['median']:.3f}, p99 {period['p99']:.3f}, longest {period['max']:.3f} s"),
-        ("real-time factor", f"{config['real_time_factor']:.2f} (periods of {config['asked_period']:g} s asked)"),
+        ("real-time factor", f"{stats['real_time_factor']:.2f} (periods of {stats['asked_period']:g} s asked)"),
         ("age of pictures", ages or "–"),
         ("arm to picture", f"states at most {1e3 * off:.1f} ms from a package"),
         ("limits hit", hits or "–"),

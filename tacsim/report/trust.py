@@ -42,10 +42,10 @@ def trust(episode: Episode) -> dict[str, dict[str, Any]] | None:
     }
 
 
-def trust_rows(config: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
+def trust_rows(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
     """What a person should look at; nothing where all is well."""
     rows = []
-    for name, told in config.items():
+    for name, told in stats.items():
         if told["stale"]:
             most = "" if told["drift"] is None else f", colour of the untouched gel off by up to {told['drift']:.0%}"
             rows.append(

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -61,13 +62,13 @@ def open_episode(folder: Path) -> Rig:
     task = make_task(loaded.config.task)
     recorders: list[Recorder] = []
     with open_rig(loaded) as rig:
-        config = EpisodeSetup("scripted", 0, {RIG_ATTACHMENT: loaded.text.encode()})
+        setup = EpisodeSetup("scripted", 0, {RIG_ATTACHMENT: loaded.text.encode()})
         run_episode(
             rig,
             task.scripted(),
             task,
             STEPS + 1,
-            config=config,
+            setup=setup,
             recorder=lambda meta: recorders.append(Recorder(path, meta)) or recorders[0],  # type: ignore[func-returns-value]
         )
     recorders[0].close()
@@ -135,14 +136,35 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture
-def live(request: pytest.FixtureRequest, rig: Rig) -> bool:
+def live(rig: Rig) -> bool:
     return rig.name in LIVE
 
 
+@dataclass(frozen=True)
+class Episode:
+    """One episode of each rig, which most tests look at: after reset, then after each step of holding."""
+
+    observations: list[Observation]
+    images: list[dict[str, np.ndarray]]  # copies, taken as they were observed
+    poses: list[dict[str, np.ndarray]]
+    indices: list[list[int]]  # of the frames, step by step
+
+
+@pytest.fixture(scope="module")
+def episode(rig: Rig) -> Episode:
+    done = Episode([], [], [], [])
+    for step in range(STEPS + 1):
+        observation = rig.step(Action())[0] if step else rig.reset()
+        done.observations.append(observation)
+        done.images.append({name: touch.image.copy() for name, touch in observation.tactile.items()})
+        done.poses.append({name: arm.pose.position.copy() for name, arm in observation.arms.items()})
+        done.indices.append([frame.index for frame in rig.frames.values()])
+    return done
+
+
 @pytest.fixture
-def observations(rig: Rig) -> list[Observation]:
-    """Those of an episode: after reset, then after each step of holding."""
-    return [rig.reset(), *(rig.step(Action())[0] for _ in range(STEPS))]
+def observations(episode: Episode) -> list[Observation]:
+    return episode.observations
 
 
 def test_the_spec_says_what_is_observed(rig: Rig, observations: list[Observation]) -> None:
@@ -215,14 +237,9 @@ def test_arms_are_told_of_the_moment_of_exposure(rig: Rig, observations: list[Ob
                 assert abs(observation.arms[arm].time - touch.time) < 20e-3
 
 
-def test_frame_numbers_have_no_gap(rig: Rig, live: bool) -> None:
+def test_frame_numbers_have_no_gap(live: bool, episode: Episode) -> None:
     """A live camera goes on by itself: several frames between two steps, or, on a busy machine, none yet."""
-    rig.reset()
-    numbers = []
-    for _ in range(STEPS):
-        rig.step(Action())
-        numbers.append([frame.index for frame in rig.frames.values()])
-    steps = np.diff(numbers, axis=0)
+    steps = np.diff(episode.indices, axis=0)
     if live:
         assert np.all(steps >= 0)
         assert np.all(np.sum(steps, axis=0) > 0)
@@ -230,8 +247,7 @@ def test_frame_numbers_have_no_gap(rig: Rig, live: bool) -> None:
         assert np.all(steps == 1)
 
 
-def test_references_are_without_contact(rig: Rig) -> None:
-    rig.reset()
+def test_references_are_without_contact(rig: Rig, episode: Episode) -> None:
     assert set(rig.references) == set(rig.spec.sensors)
     for name, frame in rig.references.items():
         assert frame.image.shape == rig.frames[name].image.shape
@@ -255,13 +271,10 @@ def test_a_second_episode_is_the_first_again(rig: Rig, live: bool, observations:
                 assert np.array_equal(arm.wrench, other.arms[name].wrench)
 
 
-def test_what_was_observed_does_not_change_later(rig: Rig) -> None:
-    first = rig.reset()
-    before = {name: touch.image.copy() for name, touch in first.tactile.items()}
-    poses = {name: arm.pose.position.copy() for name, arm in first.arms.items()}
-    rig.step(Action())
-    assert all(np.array_equal(first.tactile[name].image, image) for name, image in before.items())
-    assert all(np.array_equal(first.arms[name].pose.position, place) for name, place in poses.items())
+def test_what_was_observed_does_not_change_later(episode: Episode) -> None:
+    for observation, images, poses in zip(episode.observations, episode.images, episode.poses, strict=True):
+        assert all(np.array_equal(observation.tactile[name].image, image) for name, image in images.items())
+        assert all(np.array_equal(observation.arms[name].pose.position, place) for name, place in poses.items())
 
 
 def test_what_was_sent_is_told_for_every_arm(rig: Rig) -> None:
@@ -276,14 +289,12 @@ def test_what_was_sent_is_told_for_every_arm(rig: Rig) -> None:
             assert observation.arms[name].pose.position == pytest.approx(pose.position, abs=5e-6)
 
 
-def test_an_unknown_arm_is_refused(rig: Rig) -> None:
-    rig.reset()
+def test_an_unknown_arm_is_refused(rig: Rig, episode: Episode) -> None:
     with pytest.raises(ActionError, match="'third_hand'"):
         rig.step(Action({"third_hand": Pose()}))
 
 
-def test_truth_is_there_as_the_spec_says(rig: Rig) -> None:
-    rig.reset()
+def test_truth_is_there_as_the_spec_says(rig: Rig, episode: Episode) -> None:
     truth = rig.truth()
     assert (truth is not None) == rig.spec.truth
     if truth is not None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+pytest_plugins = ["tests.promises"]  # figures of what is promised of arms and cameras
 HERE = Path(__file__).parent
 # Tests here wait for mock hardware more than they compute: one process runs them all, another the rest.
 WIRE = ("robot/arm", "robot/camera", "robot/mock", "robot/procedures", "robot/rig", "robot/doctor")

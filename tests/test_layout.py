@@ -22,6 +22,9 @@ LIGHT_IMPORTS = (*PACKAGES, "tacsim.interface", "tacsim.config", "robot.open", "
 API: dict[str, list[str]] = json.loads((ROOT / "tests/api_surface.json").read_text(encoding="utf-8"))
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in MODULES}
+BENCHMARKS = {  # of the checkout alone: the wheel does not carry them
+    path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in (ROOT / "benchmarks").rglob("*.py")
+}
 
 TEXT = {".py", ".md", ".toml", ".yaml", ".yml", ".txt", ".json", ".jinja", ".html", ".css", ".cfg", ".ini", ""}
 SHIPPED = (*PACKAGES, "configs", "constraints", "docs", "examples", "benchmarks", "tests", ".ci")
@@ -126,19 +129,22 @@ def test_no_file_imports_upward(package: str) -> None:
 
 def test_kernel_files_keep_their_annotations() -> None:
     """Taichi reads annotations of kernels as objects; `from __future__ import annotations` makes them strings."""
-    assert [name(path) for path, tree in TREES.items() if has_kernels(tree) and "__future__" in imports(tree)] == []
+    trees = TREES | BENCHMARKS
+    assert [name(path) for path, tree in trees.items() if has_kernels(tree) and "__future__" in imports(tree)] == []
 
 
 def test_mypy_spares_kernel_files_and_no_other() -> None:
     overrides = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]["overrides"]
     (spared,) = (item["module"] for item in overrides if item.get("check_untyped_defs") is False)
-    benchmarks = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "benchmarks").rglob("*.py")}
-    kernels = {
-        name(path).removesuffix(".py").replace("/", ".")
-        for path, tree in (TREES | benchmarks).items()
-        if has_kernels(tree)
-    }
-    assert set(spared) == kernels
+    kernels = {path for path, tree in (TREES | BENCHMARKS).items() if has_kernels(tree)}
+    assert set(spared) == {name(path).removesuffix(".py").replace("/", ".") for path in kernels}
+
+
+def test_only_the_command_that_runs_benchmarks_imports_them() -> None:
+    found = {name(path) for path, tree in TREES.items() if "benchmarks" in map(top, imports(tree))}
+    assert found == {"robot/cli/bench.py", "robot/cli/doctor.py"}
+    light = {name(path) for path, tree in TREES.items() if "benchmarks" in map(top, loaded_on_import(tree))}
+    assert light == set()
 
 
 def test_every_folder_of_modules_is_a_package() -> None:
@@ -191,6 +197,7 @@ def test_wheel_carries_packages_and_configs(tmp_path: Path) -> None:
     assert {f"tacsim/_configs/{config}" for config in configs} <= carried
     assert {name(path) for path in MODULES} <= carried
     assert {f"{package}/py.typed" for package in PACKAGES} <= carried
+    assert [entry for entry in carried if "bench" in entry] == ["robot/cli/bench.py"]  # which says where they are
     assert {top(entry.partition("/")[0]) for entry in carried} == {
         *PACKAGES,
         "tacsim-0",  # tacsim-0.1.0.dist-info

@@ -10,9 +10,9 @@ from pathlib import Path
 from benchmarks.cases import deep, incline, materials, press, scenes, squeeze
 from benchmarks.cases.real import balls, depths, films, labels, observe, punches, real, touching, twins
 from benchmarks.cases.real.labels import BadData
-from benchmarks.harness.runner import Case, backend, lacking
+from benchmarks.harness.machine import backend
+from benchmarks.harness.runner import Case, lacking
 from benchmarks.harness.schema import Group
-from benchmarks.reliability import reliability
 
 CASES: tuple[Case, ...] = (
     *press.CASES,
@@ -21,7 +21,6 @@ CASES: tuple[Case, ...] = (
     *incline.CASES,
     *materials.CASES,
     *scenes.CASES,
-    *reliability.CASES,
 )
 
 CPU_ONLY = "it runs on the CPU only"

@@ -8,27 +8,18 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
-import os
-import platform
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib import metadata
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.cache import fingerprint
+from benchmarks.harness.machine import Run
 from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
-from benchmarks.harness.schema import Device, Failure, Group, Machine, Metadata, Missing, Report, Row
-from robot.common.realtime import allowed
+from benchmarks.harness.schema import Failure, Group, Missing, Report, Row
 
 EXIT = 10.0  # [s] a process may take to end after its last word
-PACKAGES = ("tacsim", "taichi", "numpy", "scipy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +44,7 @@ class Case:
     @property
     def needs_cpu(self) -> bool:
         """Whether it says nothing of a device. Other methods are written for the CPU, or in NumPy."""
-        return self.cpu or self.method != "tacsim" or self.group == "robot"
+        return self.cpu or self.method != "tacsim"
 
 
 def lacking(group: Group, name: str, why: str, resolution: str = "") -> Case:
@@ -74,8 +65,7 @@ def run_cases(
     on_start: Callable[[Case], None] = lambda case: None, stop: Callable[[], bool] = lambda: False,
 ) -> Report:  # fmt: skip
     """Runs `cases` in turn. A case that raises or dies becomes a failure of the report. Raises Stopped."""
-    began, load = time.perf_counter(), _load()
-    (commit, modified), code = _commit(), fingerprint("tacsim", "robot", "calibration")
+    run = Run()
     rows: list[Row] = []
     failures: list[Failure] = []
     missing = [Missing(**_names(case), cause=case.missing) for case in cases if case.missing]
@@ -94,20 +84,7 @@ def run_cases(
     order = {tuple(_names(case).values()): number for number, case in enumerate(cases)}
     rows.sort(key=lambda row: order[row.group, row.case, row.method, row.resolution])
     return Report(
-        metadata=Metadata(
-            date=datetime.now(UTC).replace(microsecond=0),
-            commit=commit,
-            modified=modified,
-            changed=fingerprint("tacsim", "robot", "calibration") != code,
-            versions=_versions(),
-            machine=_machine(load),
-            groups=groups,
-            baselines=baselines,
-            long=long,
-            repeat=repeat,
-            seconds=time.perf_counter() - began,
-            group_seconds=group_seconds,
-        ),
+        metadata=run.metadata(groups, repeat, baselines=baselines, long=long, group_seconds=group_seconds),
         results=rows,
         failures=failures,
         missing=missing,
@@ -217,89 +194,3 @@ def measure(case: Case, repeat: int) -> list[Row]:
         )
         for one in found
     ]
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return versions
-
-
-def _load() -> list[float] | None:
-    return [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None
-
-
-def _machine(load_before: list[float] | None) -> Machine:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    memory = None
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        memory = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
-    system = f"{platform.system()} {platform.machine()}"
-    return Machine(
-        cpu=_cpu(),
-        cores=cores,
-        memory_gb=memory,
-        system=system,
-        load_before=load_before,
-        load_after=_load(),
-        realtime=allowed(),
-        device=_device(),
-    )
-
-
-def backend() -> str:
-    """Where the processes of cases compute. As tacsim.compute.runtime reads it, which would import Taichi."""
-    return os.environ.get("TACSIM_DEVICE") or "cpu"
-
-
-def _device() -> Device | None:
-    """The GPU that cases compute on, None for the CPU; its name as far as a tool tells it."""
-    if backend() == "cpu":
-        return None
-    if backend() == "cuda":
-        try:
-            name, memory, driver = _nvidia()
-        except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-            return Device(backend="cuda")
-        size = round(int(memory) * 2**20 / 1e9, 1) if memory.isdecimal() else None  # None: it shares the host's
-        return Device(backend="cuda", name=name, memory_gb=size, driver=driver)
-    return Device(backend=backend())
-
-
-def _nvidia() -> list[str]:
-    """Name, memory [MiB] and driver of the first GPU that may be seen, which Taichi takes."""
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").partition(",")[0]
-    words = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"]
-    words += [f"--id={visible}"] if visible else []
-    done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
-    return [word.strip() for word in done.stdout.splitlines()[0].split(",")]
-
-
-def _cpu() -> str:
-    listed = Path("/proc/cpuinfo")
-    if listed.exists():
-        for line in listed.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine() or sys.platform
-
-
-def _commit() -> tuple[str | None, bool | None]:
-    """Commit of the checkout this file lies in, and whether it has changes; None for an installed package."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None, None
-    try:
-        commit = _git(root, "rev-parse", "--short=12", "HEAD")
-        return commit, bool(_git(root, "status", "--porcelain", "--untracked-files=no"))
-    except (OSError, subprocess.SubprocessError):
-        return None, None
-
-
-def _git(root: Path, *words: str) -> str:
-    done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10, check=True)
-    return done.stdout.strip()

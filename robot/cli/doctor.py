@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from robot.cli.bench import require_checkout
 from robot.cli.output import Overrides, busy
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def schema(
     from tacsim.config import KINDS, json_schema
 
     if kind == "bench":
+        require_checkout("tacsim schema bench")
         from benchmarks.harness import schema as report
 
         typer.echo(json.dumps(report.json_schema(), indent=2))

@@ -207,6 +207,6 @@ def test_the_fingerprint_follows_the_sources(tmp_path: Path, monkeypatch: pytest
 
 def test_a_report_says_when_the_code_changed_under_it(monkeypatch: pytest.MonkeyPatch) -> None:
     versions = iter(("one", "two", "two", "two"))
-    monkeypatch.setattr("benchmarks.harness.runner.fingerprint", lambda *packages: next(versions))
+    monkeypatch.setattr("benchmarks.harness.machine.fingerprint", lambda *packages: next(versions))
     assert run_cases([], 1, baselines=False).metadata.changed
     assert not run_cases([], 1, baselines=False).metadata.changed

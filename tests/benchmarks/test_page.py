@@ -12,6 +12,7 @@ from matplotlib.image import imread
 from typer.testing import CliRunner, Result
 
 from benchmarks.harness.schema import Report
+from benchmarks.pages import reliability
 from benchmarks.pages.page import cells, costs, markdown
 from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
 from robot.cli import app
@@ -29,12 +30,12 @@ def tacsim(*words: str | Path) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
 
 
-def test_the_published_page_is_that_of_the_published_report(report: Report) -> None:
-    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    gpus = sorted((ROOT / "benchmarks" / "gpu").glob("*.json"))
-    devices = [Report.model_validate_json(path.read_bytes()) for path in gpus]
-    files = [path.relative_to(ROOT) for path in (REFERENCE, *gpus)]
-    assert page == markdown(report, devices), f"run: tacsim bench --from {' --from '.join(map(str, files))} --docs docs"
+def test_the_published_pages_are_those_of_the_published_reports(report: Report) -> None:
+    gpus = [Report.model_validate_json(p.read_bytes()) for p in sorted((ROOT / "benchmarks" / "gpu").glob("*.json"))]
+    robot = Report.model_validate_json((ROOT / "benchmarks" / "reliability.json").read_bytes())
+    pages = {"benchmarks.md": markdown(report, gpus), "reliability.md": reliability.markdown(robot)}
+    stale = [name for name, made in pages.items() if (ROOT / "docs" / name).read_text(encoding="utf-8") != made]
+    assert stale == [], "run `tacsim bench --from benchmarks/NAME.json --docs docs`, with every report of the page"
 
 
 def test_the_published_report_is_whole(report: Report) -> None:
@@ -108,13 +109,38 @@ def test_the_robot_is_measured_once_without_long(
 ) -> None:
     asked = []
 
-    def run(cases: object, repeat: int, **_: object) -> Report:
-        asked.append(repeat)
+    def run(first: object, repeat: int | None = None, **_: object) -> Report:
+        asked.append(first if repeat is None else repeat)
         return report
 
-    monkeypatch.setattr("benchmarks.harness.runner.run_cases", run)
+    monkeypatch.setattr("benchmarks.command.run_cases", run)
+    monkeypatch.setattr("benchmarks.command._measure_robot", run)
     assert tacsim("bench", *words).exit_code == 0
     assert asked == [repetitions]
+
+
+@pytest.mark.parametrize("words", [("bench", "press"), ("schema", "bench")])
+def test_without_a_checkout_it_says_where_the_benchmarks_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    """As from a wheel; a foreign package `benchmarks` beside it, or on the path, is not taken for ours."""
+    installed = tmp_path / "robot" / "cli" / "bench.py"
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "benchmarks" / "command.py").write_text("raise AssertionError")
+    monkeypatch.setattr(sys.modules["robot.cli.bench"], "__file__", str(installed))
+    result = tacsim(*words)
+    assert result.exit_code == 2
+    assert f"tacsim {' '.join(words[:1])}" in result.output and "needs a checkout of tacsim" in result.output
+
+
+def test_a_foreign_package_of_that_name_is_not_taken(tmp_path: Path) -> None:
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "benchmarks" / "__init__.py").write_text("raise AssertionError")
+    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; from robot.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "schema", "bench"], capture_output=True, text=True, cwd=ROOT, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_page_shows_figures_and_a_missed_one(report: Report) -> None:

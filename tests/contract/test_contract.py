@@ -167,6 +167,7 @@ def observations(episode: Episode) -> list[Observation]:
     return episode.observations
 
 
+@pytest.mark.promise(12)
 def test_the_spec_says_what_is_observed(rig: Rig, observations: list[Observation]) -> None:
     assert isinstance(rig.spec, RigSpec)
     assert rig.spec.period == pytest.approx(PERIOD)
@@ -182,6 +183,7 @@ def test_the_spec_says_what_is_observed(rig: Rig, observations: list[Observation
             assert spec.arm is None or spec.arm in rig.spec.arms
 
 
+@pytest.mark.promise(12)
 def test_touch_has_the_canonical_shapes_types_and_ranges(rig: Rig, observations: list[Observation]) -> None:
     for touch in (touch for observation in observations for touch in observation.tactile.values()):
         assert touch.image.shape == (GRID * SCALE, GRID * SCALE, 3)
@@ -201,6 +203,7 @@ def test_touch_has_the_canonical_shapes_types_and_ranges(rig: Rig, observations:
             assert np.isfinite(touch.gradient).all()
 
 
+@pytest.mark.promise(12)
 def test_arms_speak_si_in_world_and_sensor_axes(rig: Rig, observations: list[Observation]) -> None:
     for arm in (arm for observation in observations for arm in observation.arms.values()):
         assert isinstance(arm.pose, Pose)
@@ -213,6 +216,7 @@ def test_arms_speak_si_in_world_and_sensor_axes(rig: Rig, observations: list[Obs
         assert arm.joints is None or arm.joints.dtype == np.float64
 
 
+@pytest.mark.promise(12)
 def test_times_run_on_one_clock(rig: Rig, live: bool, observations: list[Observation]) -> None:
     """From zero, a period a step; on a live rig that of the wall, which only grows."""
     times = [observation.time for observation in observations]
@@ -303,6 +307,7 @@ def test_truth_is_there_as_the_spec_says(rig: Rig, episode: Episode) -> None:
         assert set(truth.poses) == set(rig.spec.sensors)
 
 
+@pytest.mark.promise(12)
 def test_an_image_policy_runs_and_every_step_is_recorded(rig: Rig) -> None:
     episode = run_episode(rig, Grip(rig.spec), None, STEPS)
     assert len(episode.steps) == STEPS + 1

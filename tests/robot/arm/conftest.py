@@ -12,9 +12,9 @@ from tests.robot.arm.mocked import HOST, config
 
 
 @pytest.fixture(scope="module")
-def controller() -> Iterator[MockUR]:
+def controller(measuring: bool) -> Iterator[MockUR]:
     pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this Python")
-    with MockUR(HOST) as mock:
+    with MockUR(HOST, realtime=measuring) as mock:
         yield mock
 
 
@@ -26,6 +26,6 @@ def mock(controller: MockUR) -> MockUR:
 
 
 @pytest.fixture
-def arm(mock: MockUR) -> Iterator[URArm]:
-    with URArm(config(), "left") as opened:
+def arm(mock: MockUR, measuring: bool) -> Iterator[URArm]:
+    with URArm(config(realtime=measuring), "left") as opened:
         yield opened

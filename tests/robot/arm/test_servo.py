@@ -139,6 +139,7 @@ def test_the_calibration_of_a_true_arm_does_not_move_the_target() -> None:
     assert np.allclose(bench.at.position, target.position, atol=1e-8)
 
 
+@pytest.mark.promise(2)
 @pytest.mark.parametrize(
     "row",
     [
@@ -192,6 +193,7 @@ def test_a_turn_at_full_speed_close_to_a_wall_does_not_bulge_out() -> None:
     assert np.allclose(bench.at.position, start.position + [0.1, 0.1, -0.1], atol=1e-8)
 
 
+@pytest.mark.promise(5)
 def test_an_old_command_is_not_followed_and_a_late_one_brakes() -> None:
     bench = Bench()
     bench.ask(shifted(bench.at, 0.1))
@@ -212,6 +214,7 @@ def test_an_old_command_is_not_followed_and_a_late_one_brakes() -> None:
     assert np.allclose(bench.path()[-1], here, atol=1e-9)
 
 
+@pytest.mark.promise(5)
 def test_after_a_hold_it_goes_on_from_where_the_arm_is() -> None:
     bench = Bench()
     start = bench.at
@@ -228,6 +231,7 @@ def test_after_a_hold_it_goes_on_from_where_the_arm_is() -> None:
     assert np.linalg.norm(first - here) <= 0.5 * PERIOD**2 * (1 + 1e-6)
 
 
+@pytest.mark.promise(3)
 def test_too_much_force_stops_from_the_measured_pose() -> None:
     bench = Bench(action_timeout=60.0)
     bench.ask(shifted(bench.at, 0.0, 0.0, -0.1))
@@ -247,6 +251,7 @@ def test_too_much_force_stops_from_the_measured_pose() -> None:
     assert np.ptp(bench.path()[-40:, 2]) < 1e-9
 
 
+@pytest.mark.promise(3)
 def test_a_force_that_is_no_number_is_too_much() -> None:
     bench = Bench()
     bench.look(force=(math.nan,) * 6)
@@ -264,6 +269,7 @@ def test_an_arm_that_is_pushed_out_of_its_box_stops() -> None:
     assert bench.servo.status == ArmStatus.WORKSPACE_LIMIT
 
 
+@pytest.mark.promise(2)
 def test_joint_steps_and_singularities_slow_it_down() -> None:
     bench = Bench(action_timeout=60.0, lower=[-2.0, -2.0, -1.0], upper=[2.0, 2.0, 2.0], speed=1.0, acceleration=5.0)
     bench.ask(shifted(bench.at, 0.0, 0.0, 1.5))  # beyond its reach
@@ -284,6 +290,7 @@ def other(position: list[float], stop: list[float] | None = None, status: ArmSta
     return record
 
 
+@pytest.mark.promise(15)
 def test_another_arm_is_not_come_near_and_parting_is_free() -> None:
     bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
     start = bench.at
@@ -298,6 +305,7 @@ def test_another_arm_is_not_come_near_and_parting_is_free() -> None:
     assert np.allclose(bench.at.position, start.position, atol=1e-9)
 
 
+@pytest.mark.promise(15)
 def test_the_braking_way_of_the_other_arm_counts() -> None:
     bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
     start = bench.at

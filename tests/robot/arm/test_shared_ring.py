@@ -57,6 +57,7 @@ def test_records_in_order_and_the_past_that_fits(segment: shared_ring.Segment) -
     segment.close()
 
 
+@pytest.mark.promise(10)
 def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> None:
     """Another process writes as fast as it can; every copy here is of one record."""
     writer = child(

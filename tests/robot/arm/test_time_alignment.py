@@ -111,6 +111,7 @@ def test_what_is_no_next_state_is_refused() -> None:
             ArmHistory("left", **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.promise(10)
 def test_injected_latencies_leave_less_than_a_millisecond_of_motion() -> None:
     """Promise 10: camera 125 ms late, arm 10 ms late, both jittering; times of arrival minus latency find the pose."""
     rng = np.random.default_rng(0)

@@ -85,6 +85,7 @@ def test_from_rest_straight_to_the_end_without_overshoot(
         assert moving * PERIOD <= length / peak + peak / quick.acceleration + 4 * PERIOD
 
 
+@pytest.mark.promise(2)
 @settings(deadline=None, max_examples=30)
 @given(inside, st.lists(st.tuples(inside, turns, st.integers(1, 120)), min_size=2, max_size=8), rates)
 def test_targets_that_change_on_the_way_never_lead_outside(

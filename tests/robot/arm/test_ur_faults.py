@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import HISTORY, ArmStatus
+from robot.arm.servo import HARD
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.errors import (
@@ -19,44 +20,62 @@ from robot.errors import (
 from robot.mock import MockUR
 from tacsim import pose as se3
 from tacsim.control.gel_monitor import GelReading
+from tests.promises import Record
 from tests.robot.arm.mocked import (
     HOST,
+    STILL,
+    at_full_speed,
     check_path,
     config,
     go,
     in_motion,
     leftovers,
     moved,
+    records,
     sensor_path,
     servo_targets,
+    servo_ticks,
     until,
 )
 
 # -- force -----------------------------------------------------------------------------------------------------------
 
 
-def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR) -> None:
+@pytest.mark.promise(3)
+def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR, measuring: bool, figure: Record) -> None:
     stiffness, limit, speed = 2000.0, 20.0, 0.05
-    with URArm(config(limits={"force": limit, "speed": speed}), "left") as arm:
-        start = arm.state().pose
-        mock.faults.wall(mock.faults.state().pose[2] - 0.02, stiffness)
+    with URArm(config(realtime=measuring, limits={"force": limit, "speed": speed}), "left") as arm:
+        start, state = arm.state().pose, mock.faults.state()
+        ahead = state.tick - round(state.time / PERIOD)  # the mock's count of periods, against its clock
+        mock.faults.wall(state.pose[2] - 0.02, stiffness)
         since = mock.faults.received().last
         arm.command(moved(start, z=-0.1))
         until(lambda: arm.status() == ArmStatus.FORCE_LIMIT, "force limit")
         until(lambda: arm._channel.states.latest()["resting"] == 1, "rest")  # type: ignore[index]
-        records = arm._channel.states.recent(HISTORY)
-        over = np.linalg.norm(records["tcp_force"][:, :3], axis=1) > limit
-        first = records[over][0]
-        of_that_package = records[records["stamp"] == first["stamp"]]
+        until(lambda: bool(np.linalg.norm(arm._channel.states.latest()["tcp_speed"][:3]) < STILL), "standstill")  # type: ignore[index]
+        seen, sent = records(arm), mock.faults.received(since).entries
+        felt = np.linalg.norm(seen["tcp_force"][:, :3], axis=1)
+        first = seen[felt > limit][0]
+        told = seen[seen["status"] == ArmStatus.FORCE_LIMIT][0]
+        slow = np.linalg.norm(seen["tcp_speed"][:, :3], axis=1) < STILL
+        rest = seen[slow & (seen["stamp"] >= first["stamp"])][0]
+        # No further approach: after the fault the target lies no deeper than the arm's own braking path.
+        height, ticks = sensor_path(arm, servo_targets(sent))[:, 2, 3], servo_ticks(sent)
+        late = ticks > round(float(first["stamp"]) / PERIOD) + ahead  # a period after that package was sent
+        braking = float(np.sum(first["tcp_speed"][:3] ** 2)) / (2 * HARD)
+        deeper = height[late] < float(first["position"][2]) - braking - 1e-5
+        figure("approach commands later than 2 ms after the package", deeper.sum())
+        figure("standstill, from 50 mm/s", 1e3 * float(rest["stamp"] - first["stamp"]), "ms", at_most=150)
+        figure("status published", 1e3 * float(told["written"] - first["time"]), "ms", at_most=4)
+        over = max(0.0, float(felt.max()) - limit)
+        figure("force beyond the limit, wall of 2 N/mm at 50 mm/s", over, "N", at_most=2)
+        of_that_package = seen[seen["stamp"] == first["stamp"]]
         assert (of_that_package["status"] == ArmStatus.FORCE_LIMIT).any()  # published before the next package
-        # No further approach: after the fault the target lies no deeper than the arm's own braking way.
-        path = sensor_path(arm, servo_targets(mock.faults.received(since).entries))[:, 2, 3]
-        deepest_allowed = float(first["position"][2]) - speed**2 / (2 * 5.0) - 1e-5
-        assert path[-1] >= deepest_allowed
-        jump = int(np.argmax(np.diff(path)))  # where the target is drawn back to the arm
-        assert (path[jump + 1 :] >= deepest_allowed).all()
-        peak = float(np.linalg.norm(records["tcp_force"][:, :3], axis=1).max())
-        assert peak <= float(np.linalg.norm(first["tcp_force"][:3])) + stiffness * speed * 0.2  # ten times 20 ms
+        deepest_allowed = float(first["position"][2]) - speed**2 / (2 * HARD) - 1e-5
+        assert height[-1] >= deepest_allowed
+        jump = int(np.argmax(np.diff(height)))  # where the target is drawn back to the arm
+        assert (height[jump + 1 :] >= deepest_allowed).all()
+        assert felt.max() <= float(np.linalg.norm(first["tcp_force"][:3])) + stiffness * speed * 0.2  # ten times 20 ms
         with pytest.raises(SafetyViolation, match=r"felt more than limits.force.* of 20 N"):
             arm.command(start)
         assert mock.faults.state().program  # the controller itself saw nothing wrong
@@ -106,12 +125,18 @@ def test_an_arm_whose_sensors_are_not_seen_any_more_stands(mock: MockUR) -> None
 # -- time-outs -------------------------------------------------------------------------------------------------------
 
 
-def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR) -> None:
-    with URArm(config(action_timeout=0.3), "left") as arm:
-        start = arm.state().pose
+@pytest.mark.promise(5)
+def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR, measuring: bool, figure: Record) -> None:
+    timeout = 0.2 if measuring else 0.3
+    with URArm(config(realtime=measuring, action_timeout=timeout), "left") as arm:
+        start, limits = arm.state().pose, arm.config.limits
         far = moved(start, x=0.12)
+        asked = time.monotonic()
         in_motion(arm, far)
         until(lambda: arm.status() == ArmStatus.HOLD, "hold")
+        seen = records(arm)
+        held_at = seen[(seen["status"] == ArmStatus.HOLD) & (seen["written"] > asked + 0.5 * timeout)][0]["written"]
+        figure("hold told after the last action (time-out 200 ms)", 1e3 * float(held_at - asked), "ms", at_most=210)
         until(arm.at_rest, "rest")
         held = arm.state().pose
         assert 2e-3 < se3.distance(start, held)[0] < 0.1  # stopped on the way
@@ -121,38 +146,49 @@ def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR) -> N
         mark = mock.faults.received().last
         in_motion(arm, far)
         sent = servo_targets(mock.faults.received(mark).entries)
-        first = sensor_path(arm, sent)[:, :3, 3]
-        limits = arm.config.limits
-        assert np.linalg.norm(first[0] - held.position) <= limits.acceleration * PERIOD**2 + 60e-6
+        path = sensor_path(arm, sent)[:, :3, 3]
+        steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        first = float(steps[steps > 1e-9][0]) / (limits.acceleration * PERIOD**2)
+        figure("first step when it goes on, of one period's limit", 100 * first, "%", at_most=101)
+        assert np.linalg.norm(path[0] - held.position) <= limits.acceleration * PERIOD**2 + 60e-6
         check_path(arm, sent)
 
 
 # -- stops of the controller -----------------------------------------------------------------------------------------
 
 
-def test_a_protective_stop_is_told_and_only_recover_ends_it(arm: URArm, mock: MockUR) -> None:
+@pytest.mark.promise(7)
+def test_a_protective_stop_is_told_and_only_recover_ends_it(arm: URArm, mock: MockUR, figure: Record) -> None:
     start = arm.state().pose
-    in_motion(arm, moved(start, x=0.1))
+    at_full_speed(arm, moved(start, x=0.12))
+    asked = time.monotonic()
     mock.faults.protective_stop()
-    until(lambda: arm.status() == ArmStatus.PROTECTIVE_STOP, "protective stop")
-    with pytest.raises(ProtectiveStop, match="protective stop; look why, then recover"):
-        arm.command(start)
+    told = until(lambda: arm.status() == ArmStatus.PROTECTIVE_STOP, "protective stop", pause=2e-4)
+    figure("protective stop told", 1e3 * (told - asked), "ms", at_most=20)
     until(lambda: mock.faults.state().rests, "rest")
-    where, mark = mock.faults.state().joints, mock.faults.received().last
-    time.sleep(0.3)
+    before, mark = mock.faults.state(), mock.faults.received().last
+    for _ in range(20):
+        with pytest.raises(ProtectiveStop, match="protective stop; look why, then recover"):
+            arm.command(start)
+        time.sleep(0.01)
     assert arm.status() == ArmStatus.PROTECTIVE_STOP
     assert arm.state().time > 0.0  # it can still be looked at
     assert mock.faults.received(mark).entries == ()
     arm.recover()
     assert arm.status() == ArmStatus.HOLD
-    time.sleep(0.3)
-    assert servo_targets(mock.faults.received(mark).entries).size == 0  # nothing old is asked again
-    assert np.allclose(mock.faults.state().joints, where, atol=1e-9)
+    time.sleep(0.1)
+    again, after = servo_targets(mock.faults.received(mark).entries), mock.faults.state()
+    moved_by = 1e3 * float(np.linalg.norm(np.subtract(after.pose[:3], before.pose[:3])))
+    figure("motion before and by recover() (it settles to less)", moved_by, "mm", at_most=1e-3)
+    figure("old commands that came again", len(again))
+    assert len(again) == 0  # nothing old is asked again
+    assert np.allclose(after.joints, before.joints, atol=1e-9)
     mark = mock.faults.received().last
     go(arm, start)
     check_path(arm, servo_targets(mock.faults.received(mark).entries))
 
 
+@pytest.mark.promise(7)
 def test_an_emergency_stop_waits_for_a_person(arm: URArm, mock: MockUR) -> None:
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.1))
@@ -173,6 +209,7 @@ def test_an_emergency_stop_waits_for_a_person(arm: URArm, mock: MockUR) -> None:
     go(arm, start)
 
 
+@pytest.mark.promise(7)
 def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> None:
     from robot.arm.dashboard import Dashboard
 
@@ -186,6 +223,7 @@ def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> Non
     assert arm.status() == ArmStatus.HOLD
 
 
+@pytest.mark.promise(7)
 def test_connecting_to_a_stopped_arm_says_so(mock: MockUR) -> None:
     mock.faults.protective_stop()
     with pytest.raises(ProtectiveStop, match="arm 'left': protective stop"):

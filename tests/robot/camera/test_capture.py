@@ -224,6 +224,7 @@ def test_servers_that_drip_or_say_nothing(server: Server, first: bytes, again: b
     assert len(server.requests) >= 2  # it was tried again
 
 
+@pytest.mark.promise(9)
 def test_a_black_hole(monkeypatch: pytest.MonkeyPatch) -> None:
     """A listener whose queue is full drops what knocks: nobody answers, nobody refuses."""
     with socket.socket() as hole:
@@ -251,6 +252,7 @@ def test_pictures_that_are_none_are_passed_over(server: Server) -> None:
         assert camera.status.damaged == 4 and camera.status.reopened == 0
 
 
+@pytest.mark.promise(11)
 def test_a_frame_that_is_sent_again_is_no_new_one(server: Server) -> None:
     """Some servers greet a new client with the last frame they have: after a stall it is old news."""
     mark = stamp.Stamp(frame=7, image=0, clock=time.monotonic_ns() // 1000)
@@ -266,6 +268,7 @@ def test_a_frame_that_is_sent_again_is_no_new_one(server: Server) -> None:
         assert camera.status.reopened >= 2 and camera.status.frames == 1 and camera.read(1.0) is first
 
 
+@pytest.mark.promise(11)
 @pytest.mark.parametrize(
     ("source", "text"),
     [
@@ -381,6 +384,7 @@ def test_uvc_leaves_alone_what_was_not_asked_for(uvc: type[FakeCapture]) -> None
     assert not {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_AUTO_WB} & set(uvc.made[0].order)
 
 
+@pytest.mark.promise(11)
 @pytest.mark.parametrize(
     ("setting", "value", "text"),
     [

@@ -41,6 +41,7 @@ for k in range(100000):
 """
 
 
+@pytest.mark.promise(14)
 def test_every_flushed_step_survives_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "killed.mcap"
     with subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True) as process:

@@ -1,0 +1,161 @@
+"""What `tacsim bench` does: measure or read reports, show them, write files and pages. The options are in
+robot/cli/bench.py."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.cases.real.labels import BadData
+from benchmarks.cases.registry import chosen
+from benchmarks.harness.machine import backend
+from benchmarks.harness.runner import Case, Stopped, run_cases
+from benchmarks.harness.schema import GROUPS, Report
+from benchmarks.pages.page import COLUMNS, cells, setting, write_page
+from benchmarks.pages.picture import PICTURE, draw
+from benchmarks.pages.reliability import ROOT, write_reliability
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import busy, notes, progress, results, say_files
+
+
+def read(paths: Sequence[Path]) -> list[Report]:
+    """Reports of earlier runs. Raises BadParameter."""
+    return [_read(path) for path in paths]
+
+
+def _read(path: Path) -> Report:
+    from pydantic import ValidationError
+
+    try:
+        return Report.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise typer.BadParameter(f"{path} cannot be read: {error.strerror}", param_hint="--from") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the whole file"
+        words = f"{path} is no report of tacsim bench: {place}: {first['msg']} ({error.error_count()} problems)"
+        raise typer.BadParameter(words, param_hint="--from") from None
+
+
+def require_cpu_for_a_page() -> None:
+    """Raises BadParameter on a GPU: the page is the CPU's, with GPUs beside it."""
+    if backend() != "cpu":
+        words = f"TACSIM_DEVICE is '{backend()}', but a page needs the CPU's report too: use --json now, then --from"
+        raise typer.BadParameter(words, param_hint="--docs")
+
+
+def for_a_page(reports: Sequence[Report], paths: Sequence[Path]) -> list[Report]:
+    """The one report of the CPU, then those of devices. Raises BadParameter."""
+    of_cpu = [report.metadata.machine.device is None for report in reports]
+    if sum(of_cpu) != 1:
+        found = ", ".join(str(path) for path, cpu in zip(paths, of_cpu, strict=True) if cpu) or "none"
+        raise typer.BadParameter(f"a page is made of one report of the CPU; given are: {found}", param_hint="--from")
+    report = reports[of_cpu.index(True)]
+    if len(reports) > 1 and report.metadata.groups == ["robot"]:
+        raise typer.BadParameter("reports of GPUs belong to one of the physics, not of the robot", param_hint="--from")
+    return [report, *(each for each in reports if each is not report)]
+
+
+def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data: Path | None) -> Report:
+    """A run of a group, or of all but robot. Raises BadParameter; Exit when it is stopped."""
+    if group == "real" and data is None:
+        raise typer.BadParameter("the group real needs frames of a real sensor: --data DIR", param_hint="--data")
+    if group not in ("real", "all") and data is not None:
+        raise typer.BadParameter(f"the group {group} looks at no real frames", param_hint="--data")
+    if group == "robot":
+        return _measure_robot(repeat or (5 if long else 1))
+    wanted = [name for name in GROUPS if group == name or (group == "all" and name != "robot")]
+    try:
+        cases = chosen(wanted, baselines=baselines, long=long, data=data)
+    except BadData as error:
+        raise typer.BadParameter(str(error), param_hint="--data") from None
+    with Interrupt() as interrupt, progress() as bar:
+        row = bar.add_task("starting", total=len(cases))
+        begun = 0
+
+        def say(case: Case) -> None:
+            nonlocal begun
+            words = f"{case.name}, {case.method}, {case.resolution}"
+            bar.update(row, completed=begun, description=words)
+            if not notes.is_terminal:  # a log has no bar
+                notes.print(f"{begun + 1}/{len(cases)} {words}", markup=False)
+            begun += 1
+
+        try:
+            return run_cases(cases, repeat or 5, baselines=baselines, long=long, on_start=say, stop=interrupt)
+        except Stopped:
+            raise _stopped(interrupt) from None
+
+
+def _measure_robot(repeat: int) -> Report:
+    """The figures that tests of the promises record (tests/promises.py)."""
+    if find_spec("pytest") is None or not (ROOT / "tests").is_dir():
+        raise typer.BadParameter("the group robot is measured by tests: pip install -e '.[dev]'", param_hint="GROUP")
+    with tempfile.TemporaryDirectory() as folder, Interrupt() as interrupt:
+        report = Path(folder) / "reliability.json"
+        options = ["-q", "-p", "no:cacheprovider", "-m", "promise", "--repeat", str(repeat), "--reliability"]
+        words = [sys.executable, "-m", "pytest", *options, str(report)]
+        with subprocess.Popen(words, cwd=ROOT, stdout=sys.stderr, start_new_session=True) as tests:
+            while tests.poll() is None:
+                if interrupt():
+                    tests.terminate()
+                    tests.wait()
+                    raise _stopped(interrupt)
+                time.sleep(0.1)
+        if not report.is_file():
+            complain(f"the tests of the promises ended with exit code {tests.returncode} before any of them ran")
+            raise typer.Exit(1)
+        return _read(report)
+
+
+def _stopped(interrupt: Interrupt) -> typer.Exit:
+    complain("stopped by a signal; nothing is written")
+    return typer.Exit(interrupt.exit_code)
+
+
+def show(reports: Sequence[Report]) -> None:
+    """The rows on stdout, what is missing and what failed on stderr."""
+    for report in reports:
+        table = Table(box=None, padding=(0, 1))
+        for column in COLUMNS:
+            table.add_column(column, justify="left" if column in COLUMNS[:3] else "right", overflow="fold")
+        for row in report.results:
+            table.add_row(*cells(row))
+        # a file or a pipe has no width; a table folded to 80 columns cannot be read there
+        console = Console(width=None if results.is_terminal else 160, highlight=False)
+        if len(reports) > 1:
+            console.print(setting(report), markup=False)
+        console.print(table)
+        for lack in report.missing:
+            notes.print(f"not measured: {lack.case}: {lack.cause}", markup=False)
+        for failure in report.failures:
+            complain(f"{failure.case}, {failure.method}, {failure.resolution}: {failure.cause}")
+
+
+def write(reports: Sequence[Report], json: Path | None, docs: Path | None) -> None:
+    """The first report as a file and picture, all of them as pages. Raises OSError."""
+    report, *devices = reports
+    physics = report.metadata.groups != ["robot"]
+    written: list[Path] = []
+    with busy("writing") if json or docs else progress():
+        if json is not None:
+            json.parent.mkdir(parents=True, exist_ok=True)
+            json.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
+            written.append(json)
+            if physics:
+                draw(report.results, json.with_name(PICTURE))
+                written.append(json.with_name(PICTURE))
+        if docs is not None:
+            written += write_page(report, docs, devices) if physics else []
+            written += [write_reliability(report, docs)] if "robot" in report.metadata.groups else []
+    say_files(*written)

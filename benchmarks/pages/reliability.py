@@ -1,0 +1,213 @@
+"""docs/reliability.md, from a report with rows of the group robot: the figures that tests record of what is promised.
+
+A test marked `promise(n)` checks promise n; those that take the fixture `figure` (tests/promises.py) also say how late,
+how far, how often. A row of the report is one figure: its case is the promise's name, its variant the figure's.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness.schema import Report, Row
+from benchmarks.pages.page import setting, table
+
+PAGE = "reliability.md"
+ROOT = Path(__file__).resolve().parents[2]
+HEADER = ("promise", "figure", "measured", "worst", "promised", "verdict")
+COUNT = "count"  # unit of what must not happen even once
+PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
+    ("Box", "No target leaves the workspace, whatever is asked; an arm without limits does not connect."),
+    (
+        "Speed",
+        "Speed, acceleration and joint steps of what is sent stay within their limits; what is no pose makes it hold.",
+    ),
+    ("Force", "Too much force stops the arm in the period of its package."),
+    ("Stale", "A silent link is told and outlived; a frame beyond its age is refused."),
+    ("Late policy", "Without a fresh action the arm holds, says so, and goes on from where it is measured."),
+    ("Death", "A policy or a worker that is killed leaves a standing arm; another worker is there soon."),
+    ("Stops", "A stop is told by its kind; nothing moves before recover(), and no old command comes again."),
+    ("One commander", "A second driver is refused, the first goes on."),
+    ("Connecting", "Connecting to nobody ends with its time-out and holds up no other thread."),
+    ("One instant", "All fields of a state are of one package; a pose is that of the picture's exposure."),
+    (
+        "Camera",
+        "The newest frame, never an old one as new; back by itself; a source that is not the one described is refused.",
+    ),
+    ("One contract", "A policy sees the same keys, types, shapes, units and frames on every kind of rig."),
+    ("Rate", "500 periods a second, also with two arms."),
+    ("Shutdown", "Closing ends soon, twice does no harm, and nothing is left; an episode survives a kill."),
+    ("Two arms", "They keep apart whoever moves, and both stop when one does."),
+)
+SAFETY = (
+    "**None of this is a safety function.** What guards here is software on an ordinary computer; it protects the work "
+    "and the sensors, not people. Safety planes, speed and force limits belong into the safety configuration on the "
+    "pendant, and a risk assessment before anything moves. All figures are of mock controllers and mock cameras on "
+    "loopback: the drivers and the wire are the true ones, brakes, cables and the controller's own delays are not. No "
+    "real arm was measured."
+)
+READING = (
+    "- **Measured** is the median of {repeat}, *worst* the worst of them; what must not happen at all is "
+    "summed over all. The verdict is on the median; *met, worst beyond* says that a repetition was not within it.\n"
+    "- **An idle machine** is meant. Others that work on it are told above by the load; with a load near the number of "
+    "cores or beyond it the times here say more about them than about us. `make test` runs the same tests once, with "
+    "longer time-outs and bounds ten times wider.\n"
+    "- **Rerun:** `make reliability`, or `tacsim bench robot --long --json benchmarks/reliability.json --docs docs`: "
+    "the tests below that record a figure, five times each. `tacsim bench all` leaves this group out. ur_rtde has no "
+    "wheel for Python 3.13; there only the guard and the camera are measured."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """What one repetition of a test found."""
+
+    promise: int  # its number
+    name: str
+    value: float
+    unit: str
+    at_most: float | None  # what is promised; None: to compare with
+    test: str  # that recorded it
+    seconds: float  # the test took
+    cpu_seconds: float
+
+
+def rows(figures: Iterable[Figure], peak_mb: float) -> list[Row]:
+    """A row for each figure, over its repetitions: the median of what is measured, the sum of what is counted."""
+    together: dict[tuple[int, str], list[Figure]] = {}
+    for figure in figures:
+        together.setdefault((figure.promise, figure.name), []).append(figure)
+    return [_row(found, peak_mb) for _, found in sorted(together.items(), key=lambda item: item[0][0])]
+
+
+def _row(found: Sequence[Figure], peak_mb: float) -> Row:
+    first, values = found[0], [each.value for each in found]
+    suffix = {"%": "percent", "µs": "us"}.get(first.unit, first.unit)
+    numbers = {} if first.at_most is None else {f"promised_{suffix}": first.at_most}
+    if first.unit != COUNT:
+        numbers[f"worst_{suffix}"] = max(values)
+    if first.unit != COUNT and len(values) > 2:
+        low, high = np.percentile(values, [25, 75])
+        numbers[f"spread_{suffix}"] = float(high - low)
+    return Row(
+        group="robot",
+        case=PROMISES[first.promise - 1][0],
+        variant=first.name,
+        method="tacsim",
+        resolution="mock",
+        seconds=float(np.median([each.seconds for each in found])),
+        spread=None,
+        cpu_seconds=float(np.median([each.cpu_seconds for each in found])),
+        repeats=len(found),
+        error=float(sum(values) if first.unit == COUNT else np.median(values)),
+        error_unit=first.unit,
+        against=first.test,
+        peak_mb=peak_mb,
+        figures=numbers,
+    )
+
+
+def write_reliability(report: Report, folder: Path) -> Path:
+    """Writes reliability.md into `folder`; returns its path. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    page = folder / PAGE
+    page.write_text(markdown(report), encoding="utf-8")
+    return page
+
+
+def markdown(report: Report) -> str:
+    """The page. The same report and the same tests give the same text."""
+    measured, count, tests = _of_robot(report), report.metadata.repeat, marked_tests()
+    failures = [failure for failure in report.failures if failure.group == "robot"]
+    parts = [
+        "# Reliability",
+        "Fifteen promises of arms and cameras, as figures that their own tests record. Written by `make reliability`, "
+        "or `tacsim bench --from FILE --docs docs`; do not edit.",
+        SAFETY,
+        setting(report) + _busy(report),
+        "## Figures",
+        table(HEADER, lines(measured)),
+        "## How to read and rerun",
+        READING.format(repeat=f"{count} repetition{'s' * (count > 1)}"),
+        "## What a promise says, and which tests check it",
+        "\n".join(_checked(number, tests.get(number, [])) for number in range(1, len(PROMISES) + 1)),
+    ]
+    if failures:
+        parts += ["## Failed", *(f"- {each.case}: {each.cause}" for each in failures)]
+    return "\n\n".join(parts) + "\n"
+
+
+def lines(measured: Sequence[Row]) -> list[list[str]]:
+    """The table as text, a list of cells a figure."""
+    found = []
+    for number, (promise, _) in enumerate(PROMISES, start=1):
+        mine = [row for row in measured if row.case == promise]
+        found += [[f"{number} {promise}", *_cells(row)] for row in mine]
+        if not mine:
+            found.append([f"{number} {promise}", "no figure: see its tests below", "", "", "", ""])
+    return found
+
+
+def _cells(row: Row) -> list[str]:
+    unit = "" if row.error_unit == COUNT else row.error_unit
+    worst, promised = (
+        next((value for name, value in row.figures.items() if name.startswith(kind)), None)
+        for kind in ("worst", "promised")
+    )
+    if promised is None:
+        verdict = "to compare with"
+    elif row.error > promised:
+        verdict = "**missed**"
+    else:
+        verdict = "met" if worst is None or worst <= promised else "met, worst beyond"
+    return [row.variant, _words(row.error, unit), _words(worst, unit), _words(promised, unit), verdict]
+
+
+def _words(value: float | None, unit: str) -> str:
+    return "" if value is None else f"{value:.3g} {unit}".strip()
+
+
+def _of_robot(report: Report) -> list[Row]:
+    return [row for row in report.results if row.group == "robot"]
+
+
+@cache
+def marked_tests() -> dict[int, list[str]]:
+    """Of each promise the tests that are marked with its number, as `tests/path.py::name`, read from the checkout."""
+    found: dict[int, list[str]] = {}
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        text = path.read_text(encoding="utf-8")
+        functions = [node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)]
+        for node in functions if "mark.promise" in text else ():
+            for mark in node.decorator_list:
+                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.promise":
+                    for number in map(ast.literal_eval, mark.args):
+                        found.setdefault(number, []).append(f"{path.relative_to(ROOT).as_posix()}::{node.name}")
+    return found
+
+
+def _checked(number: int, tests: Iterable[str]) -> str:
+    files: dict[str, list[str]] = {}
+    for test in tests:
+        file, _, function = test.partition("::")
+        files.setdefault(file, []).append(f"`{function.removeprefix('test_')}`")
+    listed = "; ".join(f"`{file}`: {', '.join(functions)}" for file, functions in files.items())
+    name, text = PROMISES[number - 1]
+    return f"{number}. **{name}.** {text} {listed}."
+
+
+def _busy(report: Report) -> str:
+    machine = report.metadata.machine
+    priority = ""
+    if machine.realtime is not None:
+        granted = "allowed" if machine.realtime else "not allowed"
+        priority = f" Real-time priority, which workers and mock controllers ask for, was {granted}."
+    loads = [each[0] for each in (machine.load_before, machine.load_after) if each is not None]
+    if loads and max(loads) > 0.5 * machine.cores:
+        return priority + " **The machine was not idle**: take the times as upper bounds."
+    return priority + (" The machine was idle otherwise." if loads else "")

@@ -72,9 +72,9 @@ def open_rig(
     if dry_run and config.clock != "wall":
         raise CannotOpen(f"rig '{config.name}': a dry run is for hardware; this rig moves no real or mock arm")
     if config.clock == "wall":
-        from robot.rig.hardware_rig import open_wall
+        from robot.rig.hardware_rig import open_hardware
 
-        return open_wall(config, confirm, dry_run=dry_run)
+        return open_hardware(config, confirm, dry_run=dry_run)
     return _open_sim(config) if config.clock == "sim" else _open_replay(config)
 
 

@@ -30,8 +30,8 @@ from robot.procedures.session import (
     hardware_arm,
     move_to,
 )
-from robot.rig.reset import NoTouch
 from tacsim import pose as se3
+from tacsim.control.approach import NoTouch
 from tacsim.interface import FloatArray, Pose, TactileObservation
 from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig

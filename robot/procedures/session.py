@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from robot.errors import DeviceError
-from robot.rig.hardware_rig import RigArm
+from robot.rig.commanded_arm import CommandedArm
 from tacsim import pose as se3
 from tacsim.interface import ArmState, EndOfEpisode, Pose, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
@@ -136,8 +136,8 @@ def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[
 def move_to(arm: MovableArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:
     """Moves an arm to a pose of its sensor and waits for standstill. Raises OutsideLimits, ActionError for what is out
     of reach, DeviceError after `timeout` [s] and for what stops an arm."""
-    if isinstance(arm, RigArm):
-        arm.unwatch()  # nothing is observed on the way
+    if isinstance(arm, CommandedArm):
+        arm.suspend_tactile_guard()  # nothing is observed on the way
     deadline = time.monotonic() + timeout
     while True:
         sent = arm.command(target)

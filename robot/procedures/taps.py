@@ -15,7 +15,7 @@ import numpy as np
 from calibration.poses.latency import Latency
 from robot.camera.camera import Camera, ClockSource
 from robot.procedures.session import POLL, CannotCalibrate, along_z, camera_sensor, hardware_arm
-from robot.rig.hardware_rig import RigArm
+from robot.rig.commanded_arm import CommandedArm
 from tacsim import pose as se3
 from tacsim.interface import Arm, Pose
 from tacsim.models.hardware import UrArmConfig
@@ -90,8 +90,8 @@ def record_taps(
     limits = hardware_arm(config, arm).limits
     rig.reset()
     mover, camera = rig.arms[arm], rig.sensors[sensor]
-    assert isinstance(mover, RigArm)
-    mover.unwatch()  # pictures are looked at one by one here, not observed
+    assert isinstance(mover, CommandedArm)
+    mover.suspend_tactile_guard()  # pictures are looked at one by one here, not observed
     start = mover.state().pose
     axis = se3.rotation(start).apply([0.0, 0.0, 1.0])
     above, below = along_z(start, -plan.lift), along_z(start, plan.depth)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -10,21 +9,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from calibration.errors import error_context
-from robot.arm.time_alignment import ArmHistory
-from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock.cell.cell import MockCell
-from robot.rig.clock import Driven, LockStep, WallClock
-from robot.rig.reset import GuidedStart
-from robot.rig.twin_sensor import TwinSensor
-from tacsim import pose as se3
+from robot.rig.clock import LockStep, WallClock
+from robot.rig.commanded_arm import CommandedArm
+from robot.rig.reset import HardwareReset
 from tacsim.control.admittance import held_loads
 from tacsim.control.contact_signal import contact_signal
 from tacsim.control.gel_monitor import GelMonitor
-from tacsim.interface import ArmState, Normaliser, Pose, TactileSource
-from tacsim.limits import ActionError
+from tacsim.interface import Normaliser, Pose, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.report.timing import ALIGNMENT, LIMITS
@@ -34,77 +29,43 @@ if TYPE_CHECKING:
     from calibration.normaliser import FrameNormaliser
 
 Confirm = Callable[[str], bool]
-SHORTENED = 1e-7  # a target that was changed by more counts as shortened [m, rad]
 QUESTION = "Is the body in its place between the sensors, and everybody out of reach of the arms?"
 
 
-class RigArm:
-    """One UR arm as the rig has it: it remembers where it was asked to go, for the clock to wait for.
+class CellSensor:
+    """A simulated sensor on a real or mock arm, without a camera: the mock cell's gel at the arm's measured pose."""
 
-    still: no motion is ever sent (a dry run).
-    """
+    def __init__(self, cell: MockCell, name: str, config: SimSensorConfig) -> None:
+        geometry = config.model.geometry
+        self._cell, self._name = cell, name
+        self.spec = SensorSpec(
+            (geometry.height, geometry.width), height=True, flow=config.model.markers is not None, arm=config.arm
+        )
 
-    def __init__(self, driven: Driven, *, still: bool = False) -> None:
-        self._driven, self._still = driven, still
-        self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
-        self.limits_hit = 0  # targets that were shortened or refused
-
-    def state(self, at: float | None = None) -> ArmState:
-        """Raises NotAligned for a moment of which no package tells."""
-        arm = self._driven.arm
-        if at is None:
-            return arm.state()
-        deadline = time.monotonic() + arm.config.link_timeout
-        while arm.state().time < at and time.monotonic() < deadline:  # a package comes later than what it tells of
+    def read(self, timeout: float) -> TactileFrame:
+        """The picture of the newest simulated state. Raises TimeoutError when there is none within `timeout` [s]."""
+        deadline = time.monotonic() + timeout
+        while (frame := self._cell.scene_frame) is None:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"sensor '{self._name}': the mock cell has simulated nothing within {timeout:g} s")
             time.sleep(1e-3)
-        packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
-        history = ArmHistory(arm.name, max_gap=arm.config.link_timeout)  # a longer gap is a lost link
-        for state in arm.history(packages):
-            history.append(state)
-        aligned = history.at(at)
-        self.alignment = aligned.error
-        return aligned.state
-
-    def command(self, target: Pose | None) -> Pose | None:
-        """With `still` nothing is sent, and None says so."""
-        if self._still:
-            return None
-        try:
-            sent = self._driven.arm.command(target)
-        except ActionError:
-            self.limits_hit += 1
-            raise
-        self.limits_hit += target is not None and sent is not None and max(se3.distance(target, sent)) > SHORTENED
-        self._driven.target = sent
-        return sent
-
-    def unwatch(self) -> None:
-        """For motions that are not decided by observations: they need not be fresh, until the next one is made."""
-        self._driven.arm.report_tactile(None)
-
-    def stop(self) -> None:
-        self._driven.target = None
-        self._driven.arm.stop()
-
-    def recover(self) -> None:
-        self._driven.target = None
-        self._driven.arm.recover()
+        return TactileFrame(frame.images[self._name], frame.time, frame.index, frame.surfaces[self._name])
 
     def close(self) -> None:
-        self._driven.arm.close()
+        """The rig closes the cell."""
 
 
-def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = False) -> Rig:
+def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = False) -> Rig:
     """Opens a rig of hardware. Starts the mocks that its file asks for. Connects; moves nothing.
 
-    confirm: asks a person a question before anything approaches the body; not needed where all arms are mocks.
-    dry_run: connects, sees, feels, times and records, but no motion is sent, neither by reset nor by step.
+    confirm: asks a person before anything approaches the body; not needed where all arms are mocks.
+    dry_run: connects, observes and records, but sends no motion, neither in a reset nor in a step.
 
     Raises DeviceError for what cannot be opened, calibration.errors.CalibrationError for a calibration,
     ValueError for a rig that makes no sense.
     """
     real = [name for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is None]
-    # first, because a wrong calibration is known before anything is connected
+    # first: a wrong calibration is known before anything is connected
     normalisers = {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()}
     with ExitStack() as stack:
         cell = stack.enter_context(MockCell(config))
@@ -112,17 +73,15 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
         for name, sensor in config.sensors.items():
             sensors[name] = _sensor(name, sensor, cell)
             stack.callback(sensors[name].close)
-        arms: dict[str, Driven] = {}
+        arms: dict[str, CommandedArm] = {}
         for name, arm in config.arms.items():
             assert isinstance(arm, UrArmConfig)
-            opened = URArm(arm, name, keep_out=config.kept_out(name))
-            stack.callback(opened.close)
-            arms[name] = Driven(opened)
+            arms[name] = CommandedArm(URArm(arm, name, keep_out=config.kept_out(name)), dry_run=dry_run)
+            stack.callback(arms[name].close)
         cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
         fed = {name: camera for name, camera in cameras.items() if name in cell.cameras}
-        lock_step = config.lock_step and not real and cell.simulated
         clock: LockStep | WallClock
-        if lock_step:
+        if config.lock_step and not real and cell.simulated:
             clock = LockStep(config.period, arms, fed, cell)
         elif cell.simulated:
             cell.run_free()
@@ -133,36 +92,34 @@ def open_wall(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = Fal
             found = normalisers[name]
             camera.spec = replace(camera.spec, height=found.finds_height, flow=found.finds_flow)
         task = config.task
-        start = GuidedStart(
+        reset = HardwareReset(
             arms={} if dry_run else arms,
             sensors=sensors,
-            start=_starts(config, cell),
+            start=_start_poses(config, cell),
             clock=clock,
             config=config.start,
-            feel=None if dry_run else _feel(config, arms, sensors, normalisers),
-            confirm=_confirmed(config, cell, confirm, real=bool(real) and not dry_run),
+            contact=None if dry_run else _contact(config, arms, sensors, normalisers),
+            confirm=_confirmation(config, cell, confirm, real=bool(real) and not dry_run),
             placement=0.0 if task is None else task.placement,
         )
 
-        behind = {name: RigArm(driven, still=dry_run) for name, driven in arms.items()}
-
         def diagnostics() -> Mapping[str, float]:
             found = {**cell.diagnostics(), **clock.diagnostics()}
-            for name, arm in behind.items():
+            for name, arm in arms.items():
                 found |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
             return found
 
         rig = Rig(
             name=config.name,
             sensors=sensors,
-            arms=behind,
+            arms=arms,
             clock=clock,
             normalisers=normalisers,
-            reset=start,
+            reset=reset,
             truth=cell.truth if cell.knows_truth else None,
             diagnostics=diagnostics,
             on_close=cell.close,
-            on_tactile=_watch(config, sensors, arms),
+            on_tactile=_gel_monitor(config, sensors, arms),
             admittance=held_loads(config.task),
         )
         stack.pop_all()
@@ -173,10 +130,10 @@ def _sensor(name: str, config: object, cell: MockCell) -> TactileSource:
     if isinstance(config, CameraSensorConfig):
         return Camera(config, name)
     assert isinstance(config, SimSensorConfig)
-    return TwinSensor(cell, name, config)
+    return CellSensor(cell, name, config)
 
 
-def _starts(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
+def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
     starts = dict(cell.start)
     for name, arm in config.arms.items():
         assert isinstance(arm, UrArmConfig)
@@ -187,13 +144,14 @@ def _starts(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
     return starts
 
 
-def _feel(
+def _contact(
     config: RigConfig,
-    arms: Mapping[str, Driven],
+    arms: Mapping[str, CommandedArm],
     sensors: Mapping[str, TactileSource],
     normalisers: Mapping[str, Normaliser],
 ) -> Callable[[], float] | None:
-    """How hard the gels touch over what counts as touch: by the picture if `touch_signal` is given, else by force."""
+    """How hard the gels touch, as a multiple of what counts as touch: by the picture if `touch_signal` is given, else
+    by force. None where neither is given."""
     signal = config.start.touch_signal
     if signal is not None:
 
@@ -208,23 +166,25 @@ def _feel(
         return None
 
     def felt() -> float:
-        return min(-float(arms[name].arm.state().wrench[2]) for name in carrying) / force
+        return min(-float(arms[name].state().wrench[2]) for name in carrying) / force
 
     return felt
 
 
-def _watch(config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mapping[str, Driven]) -> GelMonitor:
-    """Tells the arms what their gels show, and guards those by it. Raises DeviceError for a limit that cannot be
-    watched, because its sensor delivers no height or flow."""
+def _gel_monitor(
+    config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mapping[str, CommandedArm]
+) -> GelMonitor:
+    """Reports to the arms what their gels show, and guards the gels. Raises DeviceError for a limit that cannot be
+    guarded because its sensor delivers no height or flow."""
     limits = {name: arm.limits for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
-    tell = {name: driven.arm.report_tactile for name, driven in arms.items()}
+    tell = {name: arm.driver.report_tactile for name, arm in arms.items()}
     try:
         return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, tell, SafetyViolation)
     except ValueError as failure:
         raise DeviceError(str(failure)) from None
 
 
-def _confirmed(config: RigConfig, cell: MockCell, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
+def _confirmation(config: RigConfig, cell: MockCell, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
     def ask() -> bool:
         if real:
             return confirm is not None and confirm(f"Rig '{config.name}': {QUESTION}")

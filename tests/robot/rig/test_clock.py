@@ -10,7 +10,9 @@ import pytest
 from robot.errors import DeviceError, ProtectiveStop
 from robot.mock.cell.cell import MockCell
 from robot.rig import clock as clocks
-from robot.rig.clock import Driven, LockStep, WallClock, drive
+from robot.rig import commanded_arm
+from robot.rig.clock import LockStep, WallClock
+from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
 from tacsim.interface import Pose
 
 PERIOD = 0.1  # [s]
@@ -34,6 +36,7 @@ class Time:
 def time(monkeypatch: pytest.MonkeyPatch) -> Time:
     made = Time()
     monkeypatch.setattr(clocks, "time", made)
+    monkeypatch.setattr(commanded_arm, "time", made)
     return made
 
 
@@ -60,8 +63,8 @@ class StubArm:
         return "follows its target"
 
 
-def driven(arm: StubArm, target: Pose | None = None) -> Driven:
-    made = Driven(arm)  # type: ignore[arg-type]
+def driven(arm: StubArm, target: Pose | None = None) -> CommandedArm:
+    made = CommandedArm(arm)  # type: ignore[arg-type]
     made.target = target
     return made
 
@@ -104,21 +107,21 @@ def test_after_a_reset_the_time_it_took_counts_for_nothing(time: Time) -> None:
 def test_looking_takes_a_tenth_of_a_second_at_least(time: Time) -> None:
     for period, wanted in ((0.02, 0.1), (0.5, 0.5)):
         before = time.now
-        WallClock(period).look()
+        WallClock(period).wait_for_data()
         assert time.now - before == pytest.approx(wanted)
 
 
 def test_a_command_is_repeated_until_its_arm_is_there(time: Time) -> None:
     arms = {"left": StubArm(3), "right": StubArm(7)}
     target = Pose(np.array([1.0, 2.0, 3.0]))
-    drive({name: driven(arm, target) for name, arm in arms.items()}, timeout=1.0)
+    wait_for_arrival({name: driven(arm, target) for name, arm in arms.items()}, timeout=1.0)
     assert [len(arm.commands) for arm in arms.values()] == [3, 7]
     assert all(sent is target for arm in arms.values() for sent in arm.commands)
 
 
 def test_an_arm_without_target_is_only_waited_for(time: Time) -> None:
     arm = StubArm()
-    drive({"left": driven(arm)}, timeout=1.0)
+    wait_for_arrival({"left": driven(arm)}, timeout=1.0)
     assert arm.commands == []
 
 
@@ -126,13 +129,13 @@ def test_an_arm_that_does_not_arrive_is_named(time: Time) -> None:
     arms = {"left": driven(StubArm(0), Pose()), "right": driven(StubArm(10**9), Pose())}
     before = time.now
     with pytest.raises(DeviceError, match=r"arm 'right' did not come to its target within 2 s; it follows its target"):
-        drive(arms, timeout=2.0)
+        wait_for_arrival(arms, timeout=2.0)
     assert time.now - before == pytest.approx(2.0, abs=0.02)
 
 
 def test_what_stops_an_arm_is_what_is_raised(time: Time) -> None:
     with pytest.raises(ProtectiveStop):
-        drive({"left": driven(StubArm(error=ProtectiveStop("stopped")), Pose())}, timeout=2.0)
+        wait_for_arrival({"left": driven(StubArm(error=ProtectiveStop("stopped")), Pose())}, timeout=2.0)
 
 
 def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Time) -> None:
@@ -157,7 +160,7 @@ def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Tim
 def test_a_look_waits_for_the_simulator_first() -> None:
     """Else an approach would go on while the simulator is busy with the first touch."""
     seen: list[str] = []
-    WallClock(PERIOD, lambda: seen.append("caught up")).look()
+    WallClock(PERIOD, lambda: seen.append("caught up")).wait_for_data()
     assert seen == ["caught up"]
 
 

@@ -32,9 +32,10 @@ from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.cell import MockCell
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.open import open_rig
-from robot.rig.hardware_rig import RigArm
-from robot.rig.reset import NotConfirmed, NoTouch
+from robot.rig.commanded_arm import CommandedArm
+from robot.rig.reset import NotConfirmed
 from tacsim.config import ConfigError, load_rig
+from tacsim.control.approach import NoTouch
 from tacsim.interface import Action, ArmState, Needs, Observation, Pose
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import RigConfig
@@ -235,23 +236,23 @@ def test_arms_never_come_nearer_than_the_keep_out(bare: Opened) -> None:
 
 
 def test_arms_are_told_what_is_seen_from_the_first_observation_on(bare: Opened) -> None:
-    links = [arm._driven.arm._channel for arm in bare.rig.arms.values()]  # type: ignore[attr-defined]
+    channels = [arm.driver._channel for arm in bare.rig.arms.values()]  # type: ignore[attr-defined]
     observation, _ = bare.rig.step(Action())
     oldest = min(touch.time for touch in observation.tactile.values())
-    shown = [link.tactile.latest() for link in links]
+    shown = [channel.tactile.latest() for channel in channels]
     assert [float(touch["exposed"]) for touch in shown] == [oldest, oldest]
     assert all(np.isnan(touch["depth"]) for touch in shown)  # grey pictures tell of no height
-    bare.rig._start.clear(0)
-    assert all(np.isnan(link.tactile.latest()["exposed"]) for link in links)
+    bare.rig._reset.clear(0)
+    assert all(np.isnan(channel.tactile.latest()["exposed"]) for channel in channels)
 
 
 def test_a_start_aside_is_drawn_from_the_seed(shared: Opened) -> None:
-    start = shared.rig._start
-    shared.rig._start._placement = 2e-3  # type: ignore[attr-defined]
+    reset = shared.rig._reset
+    shared.rig._reset._placement = 2e-3  # type: ignore[attr-defined]
     try:
         places = [shared.rig.reset(seed).arms["left"].pose.position for seed in (1, 1, 2)]
     finally:
-        start._placement = 0.0  # type: ignore[attr-defined]
+        reset._placement = 0.0  # type: ignore[attr-defined]
     assert places[0] == pytest.approx(places[1], abs=20e-6)
     assert float(np.abs(places[0] - places[2]).max()) > 50e-6
     assert float(np.abs(places).max()) <= 2e-3 + 20e-6
@@ -270,7 +271,7 @@ def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_tim
         state=lambda: states[-1],
         history=lambda number: states,
     )
-    arm = RigArm(SimpleNamespace(arm=stub))  # type: ignore[arg-type]
+    arm = CommandedArm(stub)  # type: ignore[arg-type]
     if lost:
         with pytest.raises(NotAligned, match="was the link lost"):
             arm.state(now - 0.1)
@@ -347,15 +348,15 @@ def test_ctrl_c_in_a_reset_leaves_arms_that_rest(shared: Opened) -> None:
 
 
 def test_without_a_yes_nothing_approaches(shared: Opened) -> None:
-    start = shared.rig._start
+    reset = shared.rig._reset
     asked: list[float] = []
-    before = start._confirm  # type: ignore[attr-defined]
-    start._confirm = lambda: bool(asked.append(time.monotonic()))  # type: ignore[attr-defined]
+    before = reset._confirm  # type: ignore[attr-defined]
+    reset._confirm = lambda: bool(asked.append(time.monotonic()))  # type: ignore[attr-defined]
     try:
         with pytest.raises(NotConfirmed, match="nothing approaches"):
             shared.rig.reset()
     finally:
-        start._confirm = before  # type: ignore[attr-defined]
+        reset._confirm = before  # type: ignore[attr-defined]
     assert len(asked) == 1
     assert shared.rig.observe().arms["right"].pose.position == pytest.approx([0, 0, 30e-3], abs=50e-6)
 
@@ -458,11 +459,12 @@ def one_killed(folder: Path, first: int, victim: Callable[[Opened], int]) -> Epi
 
 
 @needs_proc
+@pytest.mark.deep
 @pytest.mark.parametrize(
     ("victim", "errors", "words"),
     [
         (lambda found: found.cell._controllers.pid, (LinkLost, DeviceNotConnectedError, DeviceError), "arm '"),
-        (lambda found: found.rig.arms["east"]._driven.arm._process.pid, (DeviceError,), "worker|the other arm did"),
+        (lambda found: found.rig.arms["east"].driver._process.pid, (DeviceError,), "worker|the other arm did"),
         (lambda found: found.cameras["west"].pid, (StaleFrame,), "sensor 'west'"),
     ],
     ids=["controllers", "worker", "camera"],
@@ -487,6 +489,7 @@ def runs(pid: int) -> bool:
 
 
 @needs_proc
+@pytest.mark.deep
 def test_mocks_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     code = (
         "import sys, time; from robot.open import open_rig\n"
@@ -518,30 +521,36 @@ for _name in ("lower", "upper"):
 TINY = ["scene.body.geometry.size=[4 mm, 4 mm, 4 mm]", "scene.gel.size=[8 mm, 8 mm, 2 mm]"]
 
 
-def test_arms_of_a_mock_rig_hold_the_loads_of_their_task() -> None:
-    """Before `simulated` is opened, whose arms have the same names."""
+@pytest.fixture(scope="module")
+def loaded() -> Iterator[Opened]:
+    """A task whose upper arm holds a load."""
     reposition = ["task=reposition", "task.touch_force=0.3 N", "task.loads={upper: 0.6 N}"]
     with opened("mock", *SMALL, *TINY, *reposition, *rig_addresses(), "start.approach_step=0.2 mm") as found:
-        start = found.rig.reset().arms["upper"].pose
-        for count in range(1, 7):
-            asked = Pose(start.position + [count * 0.05e-3, 0.0, 0.0], start.quaternion)
-            observation, _ = found.rig.step(Action({"upper": asked}))
-        arm = observation.arms["upper"]
+        yield found
+
+
+@pytest.fixture
+def simulated(loaded: Opened, monkeypatch: pytest.MonkeyPatch) -> Opened:
+    """The same rig without the load."""
+    monkeypatch.setattr(loaded.rig, "_admittance", None)
+    return loaded
+
+
+def test_arms_of_a_mock_rig_hold_the_loads_of_their_task(loaded: Opened) -> None:
+    start = loaded.rig.reset().arms["upper"].pose
+    for count in range(1, 7):
+        asked = Pose(start.position + [count * 0.05e-3, 0.0, 0.0], start.quaternion)
+        observation, _ = loaded.rig.step(Action({"upper": asked}))
+    arm = observation.arms["upper"]
     assert -arm.wrench[2] == pytest.approx(0.6, rel=0.05)
     assert arm.pose.position[0] - start.position[0] == pytest.approx(0.3e-3, abs=10e-6)
-
-
-@pytest.fixture(scope="module")
-def simulated() -> Iterator[Opened]:
-    with opened("mock", *SMALL, *TINY, *rig_addresses(), "start.approach_step=0.2 mm") as found:
-        yield found
 
 
 def test_a_mock_rig_begins_in_gentle_touch_and_knows_the_truth(simulated: Opened) -> None:
     rig = simulated.rig
     observation = rig.reset()
     forces = [-arm.wrench[2] for arm in observation.arms.values()]
-    assert min(forces) > 0.05  # task.touch_force [N]
+    assert min(forces) > 0.3  # task.touch_force [N]
     assert max(forces) < 10.0
     assert all(touch.height is not None for touch in observation.tactile.values())
     before = rig.truth()
@@ -559,14 +568,14 @@ def test_a_mock_rig_begins_in_gentle_touch_and_knows_the_truth(simulated: Opened
 
 
 def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
-    start = simulated.rig._start
-    config = start._facts  # type: ignore[attr-defined]
-    start._facts = config.model_copy(update={"approach_way": 0.1e-3})  # type: ignore[attr-defined]
+    reset = simulated.rig._reset
+    config = reset._config  # type: ignore[attr-defined]
+    reset._config = config.model_copy(update={"approach_way": 0.1e-3})  # type: ignore[attr-defined]
     try:
         with pytest.raises(NoTouch, match=r"no touch after an approach of 0\.\d mm.*back at their start"):
             simulated.rig.reset()
     finally:
-        start._facts = config  # type: ignore[attr-defined]
+        reset._config = config  # type: ignore[attr-defined]
     for name, pose in simulated.cell.start.items():
         assert simulated.rig.arms[name].state().pose.position == pytest.approx(pose.position, abs=50e-6)
 

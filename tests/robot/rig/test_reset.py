@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from robot.errors import EmergencyStop
-from robot.rig import reset as starts
-from robot.rig.clock import Driven
-from robot.rig.reset import RETREAT, GuidedStart, NotConfirmed, NoTouch
+from robot.rig import reset as resets
+from robot.rig.commanded_arm import CommandedArm
+from robot.rig.reset import RETREAT, HardwareReset, NotConfirmed
 from tacsim import pose as se3
+from tacsim.control.approach import NoTouch
 from tacsim.interface import ArmState, Pose, SensorSpec, TactileFrame
 from tacsim.models.hardware import HardwareStart
 
@@ -72,19 +73,19 @@ class Scene:
 
     def __post_init__(self) -> None:
         self.lower, self.upper = StubArm("lower", LOWER, self.log), StubArm("upper", UPPER, self.log)
-        driven = {"lower": Driven(self.lower), "upper": Driven(self.upper)}  # type: ignore[arg-type]
-        self.start = GuidedStart(
-            arms=driven if self.arms else {},
+        commanded = {"lower": CommandedArm(self.lower), "upper": CommandedArm(self.upper)}  # type: ignore[arg-type]
+        self.reset = HardwareReset(
+            arms=commanded if self.arms else {},
             sensors={"finger": StubSensor(self.log)},
             start={"lower": LOWER, "upper": UPPER},
             clock=self,
             config=PARAMS,
-            feel=None if self.touch_at is None else self.feel,
+            contact=None if self.touch_at is None else self.contact,
             confirm=self.confirm,
             placement=self.placement,
         )
 
-    def look(self) -> None:
+    def wait_for_data(self) -> None:
         self.log.append("look")
 
     def restart(self) -> None:
@@ -94,7 +95,7 @@ class Scene:
         self.log.append("asked")
         return self.yes
 
-    def feel(self) -> float:
+    def contact(self) -> float:
         assert self.touch_at is not None
         return float(self.lower.pose.position[2] - LOWER.position[2]) / self.touch_at
 
@@ -104,7 +105,7 @@ class Scene:
 
 @pytest.fixture(autouse=True)
 def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(starts.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(resets.time, "sleep", lambda seconds: None)
 
 
 def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
@@ -113,7 +114,7 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
         Pose(np.array([5e-3, 0, 0])),
         Pose(np.array([5e-3, 0, 10e-3]), UPPER.quaternion),
     )
-    scene.start.clear(0)
+    scene.reset.clear(0)
     assert scene.lower.told is scene.upper.told is None  # until it sees anew, nothing is decided by what it saw
     back = dict(scene.motions()[:2])
     assert back["lower"].position == pytest.approx([5e-3, 0, -RETREAT])
@@ -124,7 +125,7 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
 
 def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last() -> None:
     scene = Scene()
-    scene.start.clear(0)
+    scene.reset.clear(0)
     assert scene.log[4:] == ["look", ("lower", "zero"), ("upper", "zero"), "look", "reference"]
 
 
@@ -132,7 +133,7 @@ def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms(
     found = []
     for seed in (3, 3, 4):
         scene = Scene(placement=2e-3)
-        scene.start.clear(seed)
+        scene.reset.clear(seed)
         shifts = [
             pose.position - there.position for (_, pose), there in zip(scene.motions()[2:], (LOWER, UPPER), strict=True)
         ]
@@ -144,9 +145,9 @@ def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms(
 
 def test_both_approach_by_steps_until_they_feel_enough() -> None:
     scene = Scene(touch_at=3.5e-3)
-    scene.start.clear(0)
+    scene.reset.clear(0)
     before = len(scene.motions())
-    scene.start.touch()
+    scene.reset.touch()
     steps = scene.motions()[before:]
     lower = [pose.position[2] - LOWER.position[2] for name, pose in steps if name == "lower"]
     upper = [UPPER.position[2] - pose.position[2] for name, pose in steps if name == "upper"]
@@ -158,18 +159,18 @@ def test_both_approach_by_steps_until_they_feel_enough() -> None:
 
 def test_without_a_yes_nothing_moves() -> None:
     scene = Scene(touch_at=1e-3, yes=False)
-    scene.start.clear(0)
+    scene.reset.clear(0)
     before = len(scene.motions())
     with pytest.raises(NotConfirmed, match="nothing approaches"):
-        scene.start.touch()
+        scene.reset.touch()
     assert len(scene.motions()) == before and "restart" not in scene.log
 
 
 def test_no_touch_goes_back_to_the_start() -> None:
     scene = Scene(touch_at=1.0)
-    scene.start.clear(0)
+    scene.reset.clear(0)
     with pytest.raises(NoTouch, match=r"no touch after an approach of 1[01] mm.*back at their start"):
-        scene.start.touch()
+        scene.reset.touch()
     assert scene.lower.pose.position == pytest.approx(LOWER.position)
     assert scene.upper.pose.position == pytest.approx(UPPER.position)
     farthest = max(pose.position[2] for name, pose in scene.motions() if name == "lower")
@@ -180,13 +181,13 @@ def test_an_arm_that_is_stopped_ends_it() -> None:
     scene = Scene(touch_at=1.0)
     scene.upper.stopped = True
     with pytest.raises(EmergencyStop):
-        scene.start.clear(0)
+        scene.reset.clear(0)
     assert "reference" not in scene.log
 
 
 def test_a_dry_run_moves_nothing_and_still_asks_and_looks() -> None:
     scene = Scene(arms=False, touch_at=1.0)
-    scene.start.clear(0)
-    scene.start.touch()
+    scene.reset.clear(0)
+    scene.reset.touch()
     assert scene.motions() == [] and ("lower", "zero") not in scene.log
     assert scene.log == ["look", "reference", "asked", "look", "restart"]

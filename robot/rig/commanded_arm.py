@@ -1,0 +1,102 @@
+"""A UR arm as a rig has it: it remembers where it was sent, and says what it did when a picture was exposed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+
+from robot.arm.time_alignment import ArmHistory
+from robot.arm.trajectory import PERIOD
+from robot.arm.ur import URArm
+from robot.errors import DeviceError
+from tacsim import pose as se3
+from tacsim.interface import ArmState, Pose
+from tacsim.limits import ActionError
+
+NEAR, TURN = 2e-6, 2e-5  # an arm this near to its target has arrived [m, rad]
+POLL = 4e-3  # between two looks at moving arms [s]
+SHORTENED = 1e-7  # a target that was changed by more counts as shortened [m, rad]
+
+
+class CommandedArm:
+    """Implements tacsim.interface.Arm; the target it was sent last is what the clock waits for.
+
+    dry_run: no motion is ever sent.
+    """
+
+    def __init__(self, driver: URArm, *, dry_run: bool = False) -> None:
+        self.driver, self._dry_run = driver, dry_run
+        self.target: Pose | None = None
+        self.alignment = 0.0  # of the last aligned state: time to the nearest package [s]
+        self.limits_hit = 0  # targets that were shortened or refused
+
+    def state(self, at: float | None = None) -> ArmState:
+        """Raises NotAligned for a moment that no package covers."""
+        driver = self.driver
+        if at is None:
+            return driver.state()
+        deadline = time.monotonic() + driver.config.link_timeout
+        while driver.state().time < at and time.monotonic() < deadline:  # its package is still on the way
+            time.sleep(1e-3)
+        packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
+        history = ArmHistory(driver.name, max_gap=driver.config.link_timeout)  # a longer gap is a lost link
+        for state in driver.history(packages):
+            history.append(state)
+        aligned = history.at(at)
+        self.alignment = aligned.error
+        return aligned.state
+
+    def command(self, target: Pose | None) -> Pose | None:
+        """In a dry run nothing is sent, and None says so."""
+        if self._dry_run:
+            return None
+        try:
+            sent = self.send(target)
+        except ActionError:
+            self.limits_hit += 1
+            raise
+        self.limits_hit += target is not None and sent is not None and max(se3.distance(target, sent)) > SHORTENED
+        return sent
+
+    def send(self, target: Pose | None) -> Pose | None:
+        """`command` for motions of a reset, which count no limits."""
+        self.target = self.driver.command(target)
+        return self.target
+
+    def advance(self) -> bool:
+        """Repeats the last command, so that it does not time out; True once the arm rests at its target."""
+        if self.target is None:
+            return self.driver.at_rest()
+        if self.driver.arrived(self.target, within=NEAR, turn=TURN):
+            return True
+        self.driver.command(self.target)
+        return False
+
+    def suspend_tactile_guard(self) -> None:
+        """For motions that no observation decides: depth, shear and the age of observations are not guarded until the
+        next observation is made."""
+        self.driver.report_tactile(None)
+
+    def stop(self) -> None:
+        self.target = None
+        self.driver.stop()
+
+    def recover(self) -> None:
+        self.target = None
+        self.driver.recover()
+
+    def close(self) -> None:
+        self.driver.close()
+
+
+def wait_for_arrival(arms: Mapping[str, CommandedArm], timeout: float) -> None:
+    """Waits until all arms rest at their targets. Raises DeviceError after `timeout` [s], and what stops an arm."""
+    deadline = time.monotonic() + timeout
+    while moving := [name for name, arm in arms.items() if not arm.advance()]:
+        if time.monotonic() > deadline:
+            name = moving[0]
+            raise DeviceError(
+                f"arm '{name}' did not come to its target within {timeout:g} s; it {arms[name].driver.explain()}"
+            )
+        time.sleep(POLL)

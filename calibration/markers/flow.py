@@ -125,7 +125,7 @@ class MarkerFlow:
         seen = self._present.copy()
         seen[self._present] = tracked.seen
         self._seen = seen
-        if tracked.kept < LEAST_KEPT:
+        if tracked.visible_share < LEAST_KEPT:
             self._tracker.reset()  # what so few say is no motion to go on from
             raise MarkersLost(
                 f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {LEAST_KEPT:.0%} are needed "

@@ -108,7 +108,7 @@ def test_nothing_seen_keeps_the_last_and_says_so() -> None:
     tracker = DotTracker(REST, PITCH)
     tracker(REST + 0.2)
     blind = tracker(np.zeros((0, 2)))
-    assert blind.kept == 0.0
+    assert blind.visible_share == 0.0
     np.testing.assert_allclose(blind.displacement, 0.2)
     tracker.reset()
     np.testing.assert_allclose(tracker(np.zeros((0, 2))).displacement, 0.0)
@@ -117,7 +117,7 @@ def test_nothing_seen_keeps_the_last_and_says_so() -> None:
 def test_too_few_or_scattered_dots_are_refused() -> None:
     with pytest.raises(ValueError, match="3 dots are no lattice"):
         DotTracker(REST[:3], PITCH)
-    with pytest.raises(ValueError, match="no neighbour within"):
+    with pytest.raises(ValueError, match=r"no neighbour within 2\.4"):
         DotTracker(REST * 3, PITCH)
 
 
@@ -126,8 +126,21 @@ def test_a_drag_that_snaps_back_is_followed_by_what_the_neighbours_do() -> None:
     tracker = DotTracker(REST, PITCH)
     for far in (0.3, 0.6, 0.9, 0.5, 0.0):
         found = tracker(REST + drag((far, 0.0), centre=(0.0, 0.0)))
-        assert found.kept == 1.0
+        assert found.visible_share == 1.0
         np.testing.assert_allclose(found.displacement, drag((far, 0.0), centre=(0.0, 0.0)), atol=1e-9)
+
+
+@pytest.mark.parametrize("gap", [2, 40])
+def test_another_drag_after_a_gap_is_recognised_from_rest(gap: int) -> None:
+    """Neither the last displacement nor a shift of it is near; the border of the gel has hardly moved from rest."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        tracker = DotTracker(REST, PITCH)
+        for step in range(7):
+            tracker(seen_points(drag((0.35 * step, 0.1 * step)), rng)[0])
+        moved = drag((-1.2, 0.8), 4.0, (-2.0, -1.0))
+        points, there = seen_points(moved, rng)
+        assert wrong(tracker, points, there, moved, gap) == (0, len(REST))
 
 
 def test_a_speck_where_a_dot_was_expected_is_not_taken_for_it() -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -186,12 +186,9 @@ class WorkerConfig:
         fixed = (self.world_from_base, self.flange_from_tool, self.tool_from_sensor)
         return ArmFrames(*map(np.array, fixed))
 
-    def to_json(self) -> str:
-        return json.dumps(asdict(self))
-
     @staticmethod
-    def from_json(text: str) -> WorkerConfig:
-        given = json.loads(text)
+    def of(given: dict[str, Any]) -> WorkerConfig:
+        """From the dictionary that `asdict` makes, as JSON carries it."""
         return WorkerConfig(**{**given, "partners": [Partner(**partner) for partner in given["partners"]]})
 
 

@@ -7,23 +7,16 @@ belong into the safety configuration on the pendant.
 
 from __future__ import annotations
 
-import ipaddress
-import json
 import math
 import os
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import IO, Self
+from dataclasses import asdict, dataclass
+from typing import Self
 
 import numpy as np
 
-from robot import errors
 from robot.arm import shared_ring
 from robot.arm.channel import (
     HISTORY,
@@ -38,6 +31,8 @@ from robot.arm.channel import (
 from robot.arm.dashboard import Dashboard
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import Kinematics, pose
+from robot.common.loopback import is_loopback
+from robot.common.process import Child
 from robot.common.tcp import pose_of
 from robot.errors import (
     DeviceAlreadyConnectedError,
@@ -98,8 +93,7 @@ class URArm:
         self._kinematics = Kinematics(config.model)
         self._lock = threading.RLock()
         self._closed = False
-        self._process: subprocess.Popen[bytes] | None = None
-        self._errors: IO[bytes] | None = None
+        self._worker: Child | None = None
         shared_ring.sweep()
         try:
             self._segment = shared_ring.create(shared_ring.segment_name(os.getpid(), name), Channel.SIZE)
@@ -124,7 +118,7 @@ class URArm:
         """How the arm is now; never raises."""
         if self._closed:
             return ArmStatus.CLOSED
-        ended = self._process is None or self._process.poll() is not None
+        ended = self._worker is None or not self._worker.running
         record = self._channel.states.latest()
         last = ArmStatus.WORKER_DEAD if record is None else ArmStatus(int(record["status"]))
         if ended:
@@ -260,73 +254,30 @@ class URArm:
 
     def _start(self) -> None:
         """Starts a worker and waits until it is connected."""
-        root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the worker
-        written = self._channel.states.count
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "robot.arm.worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            env={**os.environ, "PYTHONPATH": path},
+        self._worker = Child(
+            "robot.arm.worker", name=f"the worker of arm '{self.name}'", advice="see why, then recover()"
         )
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(self._worker_config.to_json().encode())
-            self._process.stdin.close()
-        except BrokenPipeError:
-            pass  # it is dead already, which is found below
         deadline = time.monotonic() + self._timeout
-        while True:
-            ended = self._process.poll() is not None
-            record = self._channel.states.latest() if self._channel.states.count > written else None
-            if record is not None and record["status"] != ArmStatus.CONNECTING:
-                return
-            if ended:
-                raise self._failure()
-            if time.monotonic() > deadline:
-                self._end_worker()
-                raise DeviceNotConnectedError(
-                    f"arm '{self.name}': the controller at {self.config.host} fell silent while connecting; nothing "
-                    f"for {self._timeout:g} s. Restart it, or look what else holds it"
-                )
-            time.sleep(POLL)
+        try:
+            self._worker.ask(asdict(self._worker_config), timeout=self._timeout)
+        except DeviceNotConnectedError as failure:
+            if time.monotonic() < deadline:
+                raise
+            raise DeviceNotConnectedError(
+                f"arm '{self.name}': the controller at {self.config.host} fell silent while connecting; nothing for "
+                f"{self._timeout:g} s. Restart it, or look what else holds it"
+            ) from failure
 
     def _end_worker(self) -> None:
         """Asks the worker to ramp down and end, then kills it."""
-        process = self._process
-        if process is None:
+        if self._worker is None:
             return
-        if process.poll() is None:
-            record = self._channel.states.latest()
-            if record is not None and record["status"] != ArmStatus.CONNECTING:
-                self._send(CommandKind.CLOSE)
-                deadline = time.monotonic() + CLOSE_TIMEOUT
-                while process.poll() is None and time.monotonic() < deadline:
-                    time.sleep(POLL)
-            process.kill()  # SIGKILL: a wedged library hears nothing else
-        process.wait()
-        assert process.stdout is not None and self._errors is not None
-        process.stdout.close()
-        self._errors.close()
-        self._process = None
-
-    def _failure(self) -> DeviceError:
-        """Why the worker ended while it was connecting."""
-        process = self._process
-        assert process is not None and process.stdout is not None and self._errors is not None
-        said = process.stdout.read().decode(errors="replace")
-        try:
-            told = json.loads(said)
-            kind, text = getattr(errors, told["error"]), told["text"]
-        except (ValueError, KeyError, AttributeError):
-            self._errors.seek(0)
-            last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
-            kind = DeviceNotConnectedError
-            text = f"arm '{self.name}': its worker ended with {process.returncode} while connecting: {' '.join(last)}"
-        failure: DeviceError = kind(text)
-        return failure
+        record = self._channel.states.latest()
+        connected = self._worker.running and record is not None and record["status"] != ArmStatus.CONNECTING
+        if connected:
+            self._send(CommandKind.CLOSE)
+        self._worker.close(CLOSE_TIMEOUT if connected else 0.0)
+        self._worker = None
 
     def _send(self, kind: CommandKind, target: Pose | None = None) -> None:
         vector = None if target is None else np.concatenate([target.position, target.quaternion])
@@ -423,10 +374,7 @@ def _fresh(record: shared_ring.Record, now: float, link_timeout: float) -> bool:
 
 def _check_host(config: UrArmConfig, name: str) -> None:
     """A mock lives on loopback and nothing else does: neither may be taken for the other."""
-    try:
-        loopback = ipaddress.ip_address(config.host).is_loopback
-    except ValueError:
-        loopback = config.host.lower().rstrip(".") == "localhost"
+    loopback = is_loopback(config.host)
     if config.mock is not None and not loopback:
         raise DeviceNotConnectedError(
             f"arm '{name}' has a `mock:` block, but its host {config.host} is outside this machine; a mock's host is a "

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import json
 import os
 import signal
 import socket
@@ -29,6 +28,7 @@ from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, motion
+from robot.common.process import Parent
 from robot.common.realtime import WORKER, ask_for_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 
@@ -155,7 +155,8 @@ class Worker:
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
-    def run(self) -> NoReturn:
+    def run(self, parent: Parent) -> NoReturn:
+        """Runs until the driver closes, or driver or connection is gone; tells `parent` of the first status."""
         gc.freeze()  # keeps what is loaded out of collections in the middle of a period
         self._last = time.monotonic()
         deadline = self._last + PERIOD
@@ -181,6 +182,8 @@ class Worker:
             self.servo.on_tactile(*self.channel.tactile.newest(), self.state)
             if self.servo.status != before:
                 self._publish(self.servo.status)
+                if before == ArmStatus.CONNECTING:
+                    parent.send({"connected": True})
             self.servo.on_command(*self.channel.commands.newest())
             if ending is None and (orphan or self.servo.close_requested):
                 ending = now + (PARENTLESS if orphan else CLOSING)
@@ -318,22 +321,19 @@ _CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmSt
 
 
 def main() -> NoReturn:
-    # The library prints to stdout, which is reserved for the reason of a failure.
-    answer = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+    parent = Parent()  # the library prints
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which stops the arm gently
-    config = WorkerConfig.from_json(sys.stdin.read())
+    config = WorkerConfig.of(parent.receive())
     if config.realtime:
         ask_for_realtime(WORKER)  # before the library starts its threads
     try:
         worker = Worker(config)
         worker.connect()
     except (DeviceError, OSError) as failure:
-        kind = type(failure).__name__ if isinstance(failure, DeviceError) else DeviceNotConnectedError.__name__
-        answer.write(json.dumps({"error": kind, "text": str(failure)}))
-        answer.flush()
+        kind = type(failure) if isinstance(failure, DeviceError) else DeviceNotConnectedError
+        parent.send({"error": str(failure), "kind": kind.__name__})
         os._exit(FAILED)
-    worker.run()
+    worker.run(parent)
 
 
 if __name__ == "__main__":

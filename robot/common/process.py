@@ -1,7 +1,8 @@
 """Child processes of this program (`python -m MODULE`), and the messages between them and their parent.
 
 A message is one line of JSON. Arrays go behind it as bytes: the key "arrays" of the line gives name, type and shape of
-each. A message with the key "error" says that the child could not do what it was asked.
+each. A message with the key "error" says why the child could not do what it was asked; with "kind", a class of
+robot.errors, it is the whole text of that error.
 
 A child ends when its standard input does, so that it never outlives its parent. Ctrl-C reaches the parent alone.
 """
@@ -23,6 +24,7 @@ from typing import IO, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from robot import errors
 from robot.errors import DeviceError, DeviceNotConnectedError
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -71,14 +73,19 @@ class Child:
         self.pid = self._process.pid
 
     @property
+    def exit_status(self) -> int | None:
+        """Of the process; None while it runs."""
+        return self._process.poll()
+
+    @property
     def running(self) -> bool:
         """False once the process has ended."""
-        return self._process.poll() is None
+        return self.exit_status is None
 
     def check(self) -> None:
         """Raises `error` if the process has ended."""
         if not self.running:
-            raise self._failure(f"has ended, exit status {self._process.returncode}")
+            raise self._failure(f"has ended, exit status {self.exit_status}")
 
     def receive(self, timeout: float) -> Message:
         """The child's next message; its first one says that it is ready. Raises `error`: it says that it cannot, it has
@@ -135,9 +142,7 @@ class Child:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(PATIENCE)
                 late = time.monotonic() >= deadline
-                told = (
-                    f"gave no answer within {timeout:g} s" if late else f"has ended, exit status {self._process.poll()}"
-                )
+                told = f"gave no answer within {timeout:g} s" if late else f"has ended, exit status {self.exit_status}"
                 raise self._ended(told) from failure
             except ValueError as failure:
                 raise self._ended(f"sent what is no message: {failure}") from failure
@@ -146,6 +151,8 @@ class Child:
                 raise
             finally:
                 watchdog.cancel()
+        if "kind" in answer[0]:
+            raise getattr(errors, answer[0]["kind"])(answer[0]["error"])
         if "error" in answer[0]:
             raise self._error(f"{self._name}: {answer[0]['error']}")
         return answer
@@ -171,6 +178,13 @@ class Parent:
     def __init__(self) -> None:
         self._answers = os.fdopen(os.dup(1), "wb")
         os.dup2(2, 1)
+
+    def receive(self) -> dict[str, Any]:
+        """The parent's next message. Raises EOFError when there is none."""
+        message = read_message(sys.stdin.buffer)
+        if message is None:
+            raise EOFError("the parent has closed the pipe")
+        return message[0]
 
     def send(self, message: dict[str, Any], arrays: Arrays | None = None) -> None:
         write_message(self._answers, message, arrays)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 
 import numpy as np
@@ -353,7 +355,7 @@ def test_a_worse_fault_replaces_a_lesser_one() -> None:
 
 def test_a_worker_config_travels_as_json() -> None:
     given = worker_config(partners=[Partner("a", 0.1)], planes=[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-    assert WorkerConfig.from_json(given.to_json()) == given
+    assert WorkerConfig.of(json.loads(json.dumps(dataclasses.asdict(given)))) == given
 
 
 def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:

@@ -17,6 +17,7 @@ import pytest
 from robot.arm import shared_ring, ur
 from robot.arm.channel import ArmStatus
 from robot.arm.ur import URArm
+from robot.common.process import Child
 from robot.errors import (
     DeviceAlreadyConnectedError,
     DeviceBusyError,
@@ -45,8 +46,8 @@ def test_a_killed_worker_is_told_and_replaced(mock: MockUR, measuring: bool, fig
     with URArm(config(realtime=measuring, watchdog=10.0), "left") as arm:
         start = arm.state().pose
         at_full_speed(arm, moved(start, x=0.14))
-        assert arm._process is not None
-        os.kill(arm._process.pid, signal.SIGKILL)
+        assert arm._worker is not None
+        os.kill(arm._worker.pid, signal.SIGKILL)
         killed = time.monotonic()
         stood = until(lambda: stands(mock.faults.state()), "standstill", pause=5e-4)
         figure("worker killed at 0.1 m/s: the watchdog's stop", 1e3 * (stood - killed), "ms", at_most=250)
@@ -68,8 +69,8 @@ def test_a_killed_worker_is_told_and_replaced(mock: MockUR, measuring: bool, fig
 def test_a_stopped_worker_is_a_lost_link_and_can_be_replaced(mock: MockUR) -> None:
     with URArm(config(watchdog=10.0, link_timeout=0.5), "left") as arm:
         start = arm.state().pose
-        assert arm._process is not None
-        os.kill(arm._process.pid, signal.SIGSTOP)
+        assert arm._worker is not None
+        os.kill(arm._worker.pid, signal.SIGSTOP)
         until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link")
         arm.recover()  # SIGKILL ends even a stopped process
         go(arm, moved(start, x=0.01))
@@ -83,7 +84,7 @@ from tests.robot.arm.mocked import at_full_speed, moved
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where whoever runs the tests ignores it
 arm = URArm(UrArmConfig.model_validate_json(sys.argv[1]), "policy")
 at_full_speed(arm, moved(arm.state().pose, x=0.14))
-print(arm._segment.name, arm._process.pid, flush=True)
+print(arm._segment.name, arm._worker.pid, flush=True)
 time.sleep(60)
 """
 
@@ -166,7 +167,7 @@ def test_nothing_is_left_after_close(mock: MockUR, measuring: bool, figure: Reco
     before = open_files()
     arm = URArm(config(realtime=measuring), "left")
     at_full_speed(arm, moved(arm.state().pose, x=0.12))
-    worker = arm._process
+    worker = arm._worker
     assert worker is not None and leftovers("left")
     asked = time.monotonic()
     arm.close()
@@ -176,7 +177,7 @@ def test_nothing_is_left_after_close(mock: MockUR, measuring: bool, figure: Reco
         "processes, shared memory, files left by close()",
         sum((running(worker.pid), len(leftovers("left")), abs(open_files() - before))),
     )
-    assert worker.returncode == 0  # it ended by itself
+    assert worker.exit_status == 0  # it ended by itself
     assert leftovers("left") == []
     assert open_files() == before
     until(lambda: mock.faults.state().rests, "rest")
@@ -195,12 +196,12 @@ def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
     before = open_files()
     arm = URArm(config(watchdog=10.0), "left")
     in_motion(arm, moved(arm.state().pose, x=0.1))
-    worker = arm._process
+    worker = arm._worker
     assert worker is not None
     os.kill(worker.pid, signal.SIGKILL)
     until(lambda: arm.status() == ArmStatus.WORKER_DEAD, "death")
     arm.close()
-    assert worker.returncode == -signal.SIGKILL  # reaped, no zombie
+    assert worker.exit_status == -signal.SIGKILL  # reaped, no zombie
     assert leftovers("left") == []
     assert open_files() == before
     until(lambda: not mock.faults.state().program, "the watchdog's stop")
@@ -210,13 +211,13 @@ def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
 @pytest.mark.promise(14)
 def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
     arm = URArm(config(), "left")
-    assert arm._process is not None
-    worker = arm._process
+    assert arm._worker is not None
+    worker = arm._worker
     os.kill(worker.pid, signal.SIGSTOP)
     begun = time.monotonic()
     arm.close()
     assert time.monotonic() - begun < 15.0  # ten times the promise
-    assert worker.returncode == -signal.SIGKILL
+    assert worker.exit_status == -signal.SIGKILL
     assert leftovers("left") == []
 
 
@@ -224,11 +225,11 @@ def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
 def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle of connecting: no worker and no memory stay behind."""
     mock.faults.black_hole(True)
-    workers: list[subprocess.Popen[bytes]] = []
+    workers: list[Child] = []
     true_start = URArm._start
 
     def interrupted(self: URArm) -> None:
-        threading.Timer(0.5, lambda: (workers.append(self._process), os.kill(os.getpid(), signal.SIGINT))).start()  # type: ignore[arg-type,func-returns-value]
+        threading.Timer(0.5, lambda: (workers.append(self._worker), os.kill(os.getpid(), signal.SIGINT))).start()  # type: ignore[arg-type,func-returns-value]
         true_start(self)
 
     monkeypatch.setattr(URArm, "_start", interrupted)
@@ -238,5 +239,5 @@ def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) 
             URArm(config(), "left", timeout=PATIENCE).close()
     finally:
         signal.signal(signal.SIGINT, found)
-    assert workers[0].poll() is not None
+    assert not workers[0].running
     assert leftovers("left") == []

@@ -33,10 +33,10 @@ def worker_config(segment: str, **changes: object) -> WorkerConfig:
     return dataclasses.replace(_worker_config(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
 
 
-def start(text: str) -> subprocess.CompletedProcess[str]:
+def start(config: WorkerConfig) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "robot.arm.worker"],
-        input=text,
+        input=json.dumps(dataclasses.asdict(config)) + "\n",
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
@@ -80,11 +80,11 @@ def test_nobody_else_imports_the_library() -> None:
 def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
     segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "failing"), Channel.SIZE)
     try:
-        done = start(worker_config(segment.name).to_json())
+        done = start(worker_config(segment.name))
         assert done.returncode == worker.FAILED
         told = json.loads(done.stdout)
-        assert told["error"] == "DeviceNotConnectedError"
-        assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["text"]
+        assert told["kind"] == "DeviceNotConnectedError"
+        assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["error"]
         latest = Channel(segment).states.latest()
         assert latest is not None and latest["status"] == ArmStatus.CONNECTING
     finally:
@@ -92,6 +92,6 @@ def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
 
 
 def test_without_memory_to_write_to_it_says_so() -> None:
-    done = start(worker_config("tacsim-0-missing").to_json())
+    done = start(worker_config("tacsim-0-missing"))
     assert done.returncode == worker.FAILED
-    assert "No such file" in json.loads(done.stdout)["text"]
+    assert "No such file" in json.loads(done.stdout)["error"]

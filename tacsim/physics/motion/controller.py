@@ -31,7 +31,7 @@ def force_floor(modulus: float, thickness: float) -> float:
 
 
 @dataclass(frozen=True)
-class Scheme:
+class StepNumbers:
     """By which numbers a launch was advanced."""
 
     step: float = 0.0  # time step [mm, wave speed 1]
@@ -40,7 +40,7 @@ class Scheme:
 
 
 @dataclass(frozen=True)
-class Reading:
+class ForceReading:
     """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
 
     moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
@@ -56,11 +56,11 @@ class Reading:
     moment: NDArray[np.float64] | None = None  # (gels, 3)
     load: NDArray[np.float64] | None = None  # (3,) of the body from elsewhere: its weight
     torque: NDArray[np.float64] | None = None  # (3,)
-    scheme: Scheme = Scheme()
+    scheme: StepNumbers = StepNumbers()
     gel_overlap: float = 0.0  # of the gels with one another [mm]
 
 
-def residual(now: Reading, before: Reading, balanced: bool) -> float:
+def residual(now: ForceReading, before: ForceReading, balanced: bool) -> float:
     """Largest imbalance of forces or moments, or their change since `before`, relative to the largest force [-].
 
     `balanced`: the contact forces on all gels must add up to the body's load, zero without weight (a free body), and
@@ -98,7 +98,7 @@ class Launch:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedLaunch:
     """A launch that one environment is ready for: its grid is laid and its numbers are set."""
 
     launch: Launch
@@ -107,7 +107,7 @@ class Prepared:
     good: State  # the environment's arrays before it
 
 
-class Kernels(Protocol):
+class KernelState(Protocol):
     """The arrays of some environments, and the kernel that advances them."""
 
     def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
@@ -118,11 +118,11 @@ class Kernels(Protocol):
 class Environment(Protocol):
     """A world as one environment of such arrays."""
 
-    def prepare(self, launch: Launch) -> Prepared:
+    def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets everything of this environment for the launch. Raises SimulationDiverged if it cannot be done."""
         ...
 
-    def outcome(self, prepared: Prepared) -> Reading:
+    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         ...
 
@@ -130,10 +130,10 @@ class Environment(Protocol):
 # The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the Reading at its end, or
 # thrown the SimulationDiverged that the launch ended in. So whoever advances many worlds in one launch of kernels holds
 # one motion for each, all at their own phases; `run` is that for a single world.
-Motion = Generator[Launch, Reading, MoveStats]
+Motion = Generator[Launch, ForceReading, MoveStats]
 
 
-def run(motion: Motion, advance: Callable[[Path, int, int], Reading]) -> MoveStats:
+def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> MoveStats:
     """Runs one world's motion to its end. A motion cut short (an interruption, say) is closed, so it rolls back."""
     try:
         wanted = next(motion)
@@ -152,11 +152,11 @@ def run(motion: Motion, advance: Callable[[Path, int, int], Reading]) -> MoveSta
 
 
 def advance_all(
-    kernels: Kernels, environments: Sequence[Environment], wanted: Mapping[int, Launch]
-) -> dict[int, Reading | SimulationDiverged]:
+    kernels: KernelState, environments: Sequence[Environment], wanted: Mapping[int, Launch]
+) -> dict[int, ForceReading | SimulationDiverged]:
     """One launch of kernels for all environments that want one; what each came to, a failure in its own place only."""
-    results: dict[int, Reading | SimulationDiverged] = {}
-    ready: dict[int, Prepared] = {}
+    results: dict[int, ForceReading | SimulationDiverged] = {}
+    ready: dict[int, PreparedLaunch] = {}
     for index, launch in wanted.items():
         try:
             ready[index] = environments[index].prepare(launch)
@@ -188,14 +188,14 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
     return _stats(seen, path.substeps, held, worst, settling)
 
 
-def move_in_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Goes along `path` and holds nowhere; the residual says how far from rest the scene is at the end."""
     seen = yield from _driven(path)
     worst = residual(seen[-1], seen[-2], balanced) if len(seen) > 1 else math.inf
     return _stats(seen, path.substeps, 0, worst, settling)
 
 
-def move_on(path: Path, settling: Settling, *, balanced: bool) -> Motion:
+def move_flowing(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Goes along `path`, whose end is no rest; the residual is the imbalance of forces there."""
     if not path.substeps:
         return (yield from move_and_settle(path, settling, balanced=balanced))
@@ -211,17 +211,17 @@ def come_to_rest(path: Path, motion: Motion) -> Motion:
     return replace(stats, substeps=path.substeps + stats.substeps)
 
 
-def _driven(path: Path) -> Generator[Launch, Reading, list[Reading]]:
-    seen: list[Reading] = []
+def _driven(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
+    seen: list[ForceReading] = []
     for first in range(0, path.substeps, PIECE):
         seen.append((yield Launch(path, first, min(first + PIECE, path.substeps))))
     return seen
 
 
-def _stats(seen: Sequence[Reading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
+def _stats(seen: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
     overlap = seen[-1].overlap / MM if seen else 0.0
     hits = sum(reading.guard_hits for reading in seen)
-    last = seen[-1].scheme if seen else Scheme()
+    last = seen[-1].scheme if seen else StepNumbers()
     return MoveStats(
         substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
         time_step=last.step / MM, damping=last.damping,

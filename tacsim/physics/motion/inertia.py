@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from tacsim.interface import Pose
 from tacsim.physics.gel.gel import MM, MPA, GelParams
 from tacsim.physics.motion.controller import Launch
-from tacsim.physics.motion.path import MOST, PEAK, ROUNDING, Path, longest_way
+from tacsim.physics.motion.path import MOST, PEAK, ROUNDING, Path, path_length
 from tacsim.physics.move import is_number
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
@@ -53,7 +53,7 @@ def kernel_density(density: float, second: float) -> float:
     return density * (second / MM) ** 2 * MPA
 
 
-def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
+def plan_real_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
     """The path of a dynamic motion; `lever` [mm]: see `longest_way`.
 
     Raises ValueError for a duration [s] that is not positive, that has far too many substeps or nothing of one, or in
@@ -70,7 +70,7 @@ def plan_in_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, in
             f"{ROUNDING * substep:.3g} and {MOST * substep:.3g} s: is it in seconds? if so, make several motions of it"
         )
     kernel_time, wave = duration * inertia.second, inertia.second / MM
-    peak = PEAK * longest_way(start, end, lever) / kernel_time
+    peak = PEAK * path_length(start, end, lever) / kernel_time
     if peak > FASTEST_DRIVE:
         raise ValueError(
             f"within {duration:.3g} s a frame would reach {peak * wave:.3g} m/s; the limit is {FASTEST_DRIVE:g} of the "

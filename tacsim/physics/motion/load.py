@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
-from tacsim.physics.motion.controller import Launch, Motion, Reading, move_and_settle
+from tacsim.physics.motion.controller import ForceReading, Launch, Motion, move_and_settle
 from tacsim.physics.motion.path import Path
 from tacsim.physics.move import MoveStats, is_number
 
@@ -33,7 +33,7 @@ class LoadNotReached(RuntimeError):
     """A load that a sensor's travel along its z axis does not bring about. The world is as it was before the motion."""
 
 
-class Loadable(Protocol):
+class LoadableWorld(Protocol):
     """What a motion at constant load needs of a world."""
 
     scene: Scene
@@ -82,7 +82,7 @@ class _Axis:
 
 
 def keep_loads(
-    world: Loadable, start: Mapping[str, Pose], end: dict[str, Pose], loads: Mapping[str, float], refine: int, *,
+    world: LoadableWorld, start: Mapping[str, Pose], end: dict[str, Pose], loads: Mapping[str, float], refine: int, *,
     balanced: bool,
 ) -> Motion:  # fmt: skip
     """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion came to.
@@ -98,7 +98,7 @@ def keep_loads(
     def force(name: str) -> float:
         return 0.0 - float(world.wrench(name)[2])  # never -0
 
-    def go(share: float) -> Generator[Launch, Reading, None]:
+    def go(share: float) -> Generator[Launch, ForceReading, None]:
         poses = {name: _between(start[name], target, share) for name, target in targets.items()}
         for name, axis in axes.items():
             z = Rotation.from_quat(poses[name].quaternion).as_matrix()[:, 2]
@@ -107,7 +107,7 @@ def keep_loads(
         done.append((yield from move_and_settle(path, scene.settling, balanced=balanced)))
         end.update(poses)
 
-    def correct(share: float) -> Generator[Launch, Reading, float]:
+    def correct(share: float) -> Generator[Launch, ForceReading, float]:
         for _ in range(CORRECTIONS):
             errors = {name: axis.wanted - force(name) for name, axis in axes.items()}
             wrong = [name for name, axis in axes.items() if not abs(errors[name]) <= axis.tolerance]

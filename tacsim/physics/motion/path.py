@@ -90,7 +90,7 @@ class Path:
     def _way(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 6) way of a frame from its start [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
         t = np.clip(knots, 0.0, 1.0)[:, None]
-        whole = way_between(self.start[index], self.end[index])
+        whole = displacement_between(self.start[index], self.end[index])
         if self.rates is None:
             ramped: NDArray[np.float64] = ramp(t, self.rise) * whole
             return ramped
@@ -114,7 +114,7 @@ class Path:
         return LaunchSpan(f"in {part}", poses)
 
 
-def way_between(a: Pose, b: Pose) -> NDArray[np.float64]:
+def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
     """(6,) from a to b: position [mm], rotation vector [rad], world axes."""
     way = np.zeros(6)
     way[:3] = (b.position - a.position) * MM
@@ -129,9 +129,9 @@ def longest(ways: NDArray[np.float64], lever: float) -> float:
     return float((linear + lever * angular).max())
 
 
-def longest_way(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
+def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
     """The way of the fastest point [mm]; `lever` [mm] turns rotation into a way at the gel's rim."""
-    return longest(np.array([way_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
+    return longest(np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
 
 
 def plan(
@@ -147,7 +147,7 @@ def plan(
     Raises ValueError for a way that takes more than MOST substeps.
     """
     look = math.ceil(LOOK * thickness / dt)
-    length = longest_way(start, end, lever)
+    length = path_length(start, end, lever)
     if length == 0:
         return Path(start, end, 0, dt, look=look)
     if yields:
@@ -156,14 +156,14 @@ def plan(
     return Path(start, end, _substeps(lasting / dt, length, mach), dt, look=look, rise=RAMP * thickness / 2 / lasting)
 
 
-def plan_on(
+def plan_flow(
     start: Sequence[Pose], end: Sequence[Pose], rates: NDArray[np.float64], mach: float, dt: float, lever: float,
     thickness: float,
 ) -> Path:  # fmt: skip
     """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at the mean speed of
     the step as if it were the same all the way; at most Mach `mach`. Where speeds change it lasts longer, up to twice
     as long from rest. Without a way and at rest it has no substeps. Raises ValueError as `plan` does."""
-    ways = np.array([way_between(a, b) for a, b in zip(start, end, strict=True)])
+    ways = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
     look = math.ceil(LOOK * thickness / dt)
     if not (ways.any() or rates.any()):
         return Path(start, end, 0, dt, look=look)

@@ -21,7 +21,7 @@ from tacsim.interface import Pose, Truth
 from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
-from tacsim.physics.motion.controller import Motion, Reading, Scheme, move_and_settle, run
+from tacsim.physics.motion.controller import ForceReading, Motion, StepNumbers, move_and_settle, run
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import MM, Path, plan, resolve_targets
 from tacsim.physics.motion.retry import retried
@@ -239,7 +239,7 @@ class SeedWorld(BaseWorld):
                 f"of its {thickness * MM:.3g} mm; keep the upper at least {-thickness * MM:.3g} mm above the lower"
             )
 
-    def _advance(self, path: Path, first: int, last: int) -> Reading:
+    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
         """Substeps first to last of a path, in one launch."""
         aside = int(self._aside.sum())
         where = path.span(self.sensors, first, last)
@@ -259,9 +259,9 @@ class SeedWorld(BaseWorld):
         if not len(self._body_points()):
             cause = "every particle of the body left the grid"
             raise SimulationDiverged(cause, where, quantity="particle speed", good=good, failed=self.arrays())
-        scheme = Scheme(path.step, GEL_DAMPING, health.courant)
+        scheme = StepNumbers(path.step, GEL_DAMPING, health.courant)
         overlap = self._overlap(path, last)
-        return Reading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
+        return ForceReading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
 
     @launching()
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:

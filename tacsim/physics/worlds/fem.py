@@ -18,19 +18,19 @@ from tacsim.physics.failure.diagnosis import element_lengths
 from tacsim.physics.failure.health import LARGEST_COURANT
 from tacsim.physics.gel.gel import MM, GelParams, GelState, gel_surface
 from tacsim.physics.motion.controller import (
+    ForceReading,
     Launch,
     Motion,
-    Prepared,
-    Reading,
+    PreparedLaunch,
     come_to_rest,
     move_and_settle,
-    move_in_time,
-    move_on,
+    move_flowing,
+    move_real_time,
     run,
 )
-from tacsim.physics.motion.inertia import Inertia, plan_in_time
+from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
-from tacsim.physics.motion.path import Path, plan, plan_on, resolve_targets
+from tacsim.physics.motion.path import Path, plan, plan_flow, resolve_targets
 from tacsim.physics.motion.retry import retried
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import restore_arrays, snapshot_of
@@ -82,7 +82,7 @@ class FemWorld(BaseWorld):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Views of all that changes in a motion, by name."""
 
-    def _numbers(self) -> dict[str, NDArray[Any]]:
+    def _scalars(self) -> dict[str, NDArray[Any]]:
         """What a snapshot holds besides: of how the last motion has left this world."""
         return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.true))}
 
@@ -91,23 +91,23 @@ class FemWorld(BaseWorld):
         """Sets the speed of everything to zero."""
 
     @abstractmethod
-    def prepare(self, launch: Launch) -> Prepared:
+    def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's numbers for a launch. Raises SimulationDiverged if that cannot be done."""
 
     @abstractmethod
-    def outcome(self, prepared: Prepared) -> Reading:
+    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
 
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        return snapshot_of({**self.arrays(), **self._numbers()}, self._poses)
+        return snapshot_of({**self.arrays(), **self._scalars()}, self._poses)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See World."""
-        numbers = self._numbers()
+        numbers = self._scalars()
         self._poses = restore_arrays({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
-        self._take(self._true if numbers["true_inertia"] else self._scaled)
+        self._use_inertia(self._true if numbers["true_inertia"] else self._scaled)
 
     def wrench(self, name: str) -> NDArray[np.float64]:
         first = FORCE + 6 * self._sensor(name)
@@ -122,20 +122,20 @@ class FemWorld(BaseWorld):
 
     # ---------------------------------------------------------------- inertia
 
-    def _take(self, inertia: Inertia) -> None:
+    def _use_inertia(self, inertia: Inertia) -> None:
         """Answers to forces by `inertia` from now on."""
         self._inertia = inertia
-        self._answer(None)
+        self._write_inertia(None)
 
-    def _answer(self, launch: Launch | None) -> None:
+    def _write_inertia(self, launch: Launch | None) -> None:
         entries = self._inertia.entries(launch)
         self._state.params[self._index, list(entries)] = list(entries.values())
 
-    def _change(self, inertia: Inertia) -> None:
+    def _switch_inertia(self, inertia: Inertia) -> None:
         """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
         if inertia is not self._inertia:
             self._stop()
-            self._take(inertia)
+            self._use_inertia(inertia)
 
     def _courant(self) -> float:
         """The time step over the time of the pressure wave through the most squeezed gel element [-].
@@ -168,16 +168,16 @@ class FemWorld(BaseWorld):
         a, b = list(begin.values()), list(end.values())
         timed = None
         if order.duration is not None:
-            timed = plan_in_time(a, b, order.duration, self._true, max(self._gel.half))
-        onward = self._plan_on(a, b if order.flow else a)  # or to where they are: a stop
+            timed = plan_real_time(a, b, order.duration, self._true, max(self._gel.half))
+        onward = self._plan_flow(a, b if order.flow else a)  # or to where they are: a stop
         if timed is None and not order.flow:
             self.plan(a, b)  # raises ValueError for a way that is far too long, before a stop
 
         def after_stop(refine: int) -> Motion:
-            self._change(self._scaled if timed is None else self._true)
+            self._switch_inertia(self._scaled if timed is None else self._true)
             settling, balanced = self.scene.settling, self.balanced
             if timed is not None:
-                return (yield from move_in_time(replace(timed, refine=refine), settling, balanced=balanced))
+                return (yield from move_real_time(replace(timed, refine=refine), settling, balanced=balanced))
             if order.loads:
                 end.update(goals)
                 return (yield from keep_loads(self, begin, end, order.loads, refine, balanced=balanced))
@@ -185,8 +185,8 @@ class FemWorld(BaseWorld):
 
         def tried(refine: int) -> Motion:
             if order.flow:
-                self._change(self._scaled)
-                return move_on(replace(onward, refine=refine), self.scene.settling, balanced=self.balanced)
+                self._switch_inertia(self._scaled)
+                return move_flowing(replace(onward, refine=refine), self.scene.settling, balanced=self.balanced)
             if self._rates.any():
                 return come_to_rest(replace(onward, refine=refine), after_stop(refine))
             return after_stop(refine)
@@ -201,12 +201,12 @@ class FemWorld(BaseWorld):
         mach, gel = self.scene.peak_mach, self._gel
         return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness, yields=self.yields)
 
-    def _plan_on(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
+    def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.settling.flow_mach, self._gel
-        return plan_on(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
+        return plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
 
     @launching()  # whole: worlds of a batch share arrays, among them those that say who takes part
-    def _advance(self, path: Path, first: int, last: int) -> Reading:
+    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
         prepared = self.prepare(Launch(path, first, last))
         self._state.advance({self._index: prepared.drive})
         return self.outcome(prepared)

@@ -47,7 +47,7 @@ from tacsim.physics.exec.layout import (
 from tacsim.physics.exec.team import run_team
 from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
 from tacsim.physics.gel.gel import MM, MPA, GelState, gel_params, one_lattice
-from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
+from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.snapshot import copies
 from tacsim.physics.worlds.device import Mirror, run_hybrid
@@ -75,7 +75,7 @@ class HybridState:
         start()
         self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
         self.gels = GelState(one_lattice(self.gel), len(scenes), 2)
-        placed = [_placed(scene) for scene in scenes]
+        placed = [_body_at_start(scene) for scene in scenes]
         self.body = [body for body, _, _ in placed]
         self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
@@ -101,7 +101,7 @@ class HybridState:
             )  # fmt: skip
 
 
-def _placed(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
+def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
     """A scene's body: facts; particles at construction (n, 3) [mm]; their tangent planes (n, 3) [1/mm]."""
     assert scene.body is not None
     height = float(extent(scene.body.geometry)[2])
@@ -136,8 +136,8 @@ class HybridWorld(FemWorld):
         self._speed = self._mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
-        self._pull = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
-        self._weight = self._pull * self._body.volume * len(self._state.particles.x(index))  # [N]
+        self._body_force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
+        self._weight = self._body_force * self._body.volume * len(self._state.particles.x(index))  # [N]
         params = {
             **self._gel.params(), **self._body.params(),
             FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
@@ -145,7 +145,7 @@ class HybridWorld(FemWorld):
         }  # fmt: skip
         self._state.params[index, list(params)] = list(params.values())
         self._scaled, self._true = self._scaled_inertia(height * MM), self._true_inertia()
-        self._take(self._scaled)
+        self._use_inertia(self._scaled)
 
     # ---------------------------------------------------------------- inertia
 
@@ -180,7 +180,7 @@ class HybridWorld(FemWorld):
         # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
         share = gel * self._gel.spacing * self._body.spacing**2 / 2
         reduced = 1.0 / (1.0 / particle + 1.0 / share)
-        gravity = self._pull / body  # [1/mm]
+        gravity = self._body_force / body  # [1/mm]
         return {
             GEL_DENSITY: gel, BODY_MASS: particle, STIFFNESS: reduced / step**2,
             GRAVITY: gravity[0], GRAVITY + 1: gravity[1], GRAVITY + 2: gravity[2],
@@ -208,8 +208,8 @@ class HybridWorld(FemWorld):
             "planes": b.plane(i), "contact": state.memory[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
 
-    def _numbers(self) -> dict[str, np.ndarray]:
-        return {**super()._numbers(), "speed": np.array(self._speed)}
+    def _scalars(self) -> dict[str, np.ndarray]:
+        return {**super()._scalars(), "speed": np.array(self._speed)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         super().restore(state)
@@ -222,7 +222,7 @@ class HybridWorld(FemWorld):
 
     # ----------------------------------------------------------------- motion
 
-    def prepare(self, launch: Launch) -> Prepared:
+    def prepare(self, launch: Launch) -> PreparedLaunch:
         """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
         state, index, path = self._state, self._index, launch.path
         span = (launch.last - launch.first) * path.dt
@@ -242,12 +242,12 @@ class HybridWorld(FemWorld):
             raise SimulationDiverged(f"no memory for the grid round the particles ({error})", where, NO_ROOM) from None
         good = copies(self.arrays())
         state.params[index, STEP] = path.step
-        self._note_inertia(x)
-        self._answer(launch)
+        self._write_body_inertia(x)
+        self._write_inertia(launch)
         Health.clear(state.partial[index])
-        return Prepared(launch, drive, where, good)
+        return PreparedLaunch(launch, drive, where, good)
 
-    def _note_inertia(self, x: np.ndarray) -> None:
+    def _write_body_inertia(self, x: np.ndarray) -> None:
         """Centre and inverse moment of inertia of the particles (n, 3) [mm], where the kernels find them."""
         params = self._state.params[self._index]
         centre = centre_of(x)
@@ -258,7 +258,7 @@ class HybridWorld(FemWorld):
         params[CENTRE : CENTRE + 3] = centre
         params[TURNING : TURNING + 6] = [*np.diagonal(inverse), inverse[0, 1], inverse[0, 2], inverse[1, 2]]
 
-    def outcome(self, prepared: Prepared) -> Reading:
+    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
         health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
@@ -274,13 +274,13 @@ class HybridWorld(FemWorld):
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
         meeting = self._gel_overlap(prepared)
-        return Reading(
+        return ForceReading(
             contact, backing, self._floor, health.overlap, health.capped + (meeting > 0.0),
             moment / lever, self._weight, torque / lever,
-            Scheme(prepared.launch.path.step, self._damping(), health.courant), meeting,
+            StepNumbers(prepared.launch.path.step, self._damping(), health.courant), meeting,
         )  # fmt: skip
 
-    def _gel_overlap(self, prepared: Prepared) -> float:
+    def _gel_overlap(self, prepared: PreparedLaunch) -> float:
         """Of the two gels with one another, which they do not feel [mm]. Raises SimulationDiverged for too much."""
         last = prepared.drive[-1].astype(np.float64)
         found = gel_overlap(self._gel, self._state.gels.u[self._index, :, :, :, -1], last[:, :3], last[:, 3])

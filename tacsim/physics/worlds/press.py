@@ -67,7 +67,7 @@ from tacsim.physics.gel.gel import (
     gel_params,
     one_lattice,
 )
-from tacsim.physics.motion.controller import Launch, Prepared, Reading, Scheme, force_floor
+from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.snapshot import copies
 from tacsim.physics.worlds.device import Mirror, run_press
@@ -233,7 +233,7 @@ class PressWorld(FemWorld):
             FRICTION: scene.indenter.friction,
         }  # fmt: skip
         self._state.params[index, list(params)] = list(params.values())
-        self._take(self._scaled)
+        self._use_inertia(self._scaled)
         height = float(extent(scene.indenter.geometry)[2])
         turned = np.array([0.0, 0.0, np.sin(scene.indenter.yaw / 2), np.cos(scene.indenter.yaw / 2)])
         self._rates = np.zeros((2, 6))
@@ -252,7 +252,7 @@ class PressWorld(FemWorld):
     def truth(self) -> None:
         return None
 
-    def prepare(self, launch: Launch) -> Prepared:
+    def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's numbers for a launch. Raises SimulationDiverged: too much of a mesh to lay."""
         path = launch.path
         where = path.span(self._poses, launch.first, launch.last)
@@ -268,7 +268,7 @@ class PressWorld(FemWorld):
         good = copies(self.arrays())
         self._state.params[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
-        return Prepared(launch, drive, where, good)
+        return PreparedLaunch(launch, drive, where, good)
 
     def _cover(self, drive: np.ndarray) -> None:
         """A mesh's distances wherever the gel's surface may meet it in this launch."""
@@ -289,7 +289,7 @@ class PressWorld(FemWorld):
         top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         return top.reshape(-1, 3)
 
-    def outcome(self, prepared: Prepared) -> Reading:
+    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
         partial = self._state.partial[self._index]
         health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
@@ -298,12 +298,12 @@ class PressWorld(FemWorld):
         backing = sums[None, BACKING : BACKING + 3]
         if not force.any() and (prepared.launch.held or prepared.launch.last == prepared.launch.path.substeps):
             self._require_touch(prepared)
-        return Reading(
+        return ForceReading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
-            scheme=Scheme(prepared.launch.path.step, self._damping(), health.courant),
+            scheme=StepNumbers(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
 
-    def _require_touch(self, prepared: Prepared) -> None:
+    def _require_touch(self, prepared: PreparedLaunch) -> None:
         """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points."""
         assert self.scene.indenter is not None
         rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing

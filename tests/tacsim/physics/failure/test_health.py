@@ -21,7 +21,7 @@ from tacsim.physics.failure.health import (
     check_launch,
     require_room,
 )
-from tacsim.physics.motion.controller import Launch, Motion, Reading, run
+from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
 from tacsim.physics.motion.path import Path
 from tacsim.physics.motion.retry import RETRIES, retried
 from tacsim.physics.move import MoveCommand, MoveStats
@@ -31,7 +31,7 @@ from tacsim.physics.worlds.press import PressWorld
 
 BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3, 10e-3, 4e-3)))
 STILL = Path([Pose()], [Pose()], substeps=0, dt=0.4)
-REST = Reading(np.zeros((1, 3)), np.zeros((1, 3)), 1.0, 0.0, 0)
+REST = ForceReading(np.zeros((1, 3)), np.zeros((1, 3)), 1.0, 0.0, 0)
 STATS = MoveStats(10, 5, 0.001, True, 0.0, 0)
 HERE = LaunchSpan("in substeps 0 to 20 of 40 of the motion", {"lower": Pose(np.array([0, 0, 1e-3]))})
 WELL = Health(1.0, 0, 1.0, 0.01, 0, 0.0)
@@ -123,7 +123,7 @@ def test_a_gel_node_that_races_and_a_crushed_particle_are_seen() -> None:
 def test_a_motion_starts_again_from_the_state_before_it() -> None:
     world, seen = Particles(), []
 
-    def advance(path: Path, first: int, last: int) -> Reading:
+    def advance(path: Path, first: int, last: int) -> ForceReading:
         seen.append((path.refine, float(world.state["position"][0, 0])))
         world.state["position"] += 1.0
         world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
@@ -138,7 +138,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
     world, steps = Particles(), []
     before = world.snapshot()
 
-    def advance(path: Path, first: int, last: int) -> Reading:
+    def advance(path: Path, first: int, last: int) -> ForceReading:
         steps.append(path.refine)
         world.launch(nothing)
         world.launch(lambda a: (a["position"].__iadd__(2.0), a["velocity"].__setitem__((1, 0), np.inf)))
@@ -173,7 +173,7 @@ def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
 def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None:
     world = Particles()
 
-    def advance(path: Path, first: int, last: int) -> Reading:
+    def advance(path: Path, first: int, last: int) -> ForceReading:
         world.state["position"] += 1.0
         raise error
 

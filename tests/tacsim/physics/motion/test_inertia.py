@@ -108,7 +108,7 @@ def test_without_a_duration_what_moved_stops() -> None:
     world = HybridWorld(Scene(gravity=(0, 0, -9.81), body=CUBE, gel=GEL))
     world.move({}, duration=2e-3)
     assert world.snapshot()["velocity"][:, 2].mean() < 0
-    world._change(world._scaled)
+    world._switch_inertia(world._scaled)
     assert np.abs(world.snapshot()["velocity"]).max() == 0
 
 
@@ -119,7 +119,7 @@ def test_a_snapshot_keeps_the_kind_of_inertia() -> None:
     falling = world.snapshot()
     world.move({}, duration=1e-3)
     end = world.truth().position
-    world._change(world._scaled)
+    world._switch_inertia(world._scaled)
     world.restore(falling)
     world.move({}, duration=1e-3)
     assert np.array_equal(world.truth().position, end)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere
-from tacsim.physics.motion.controller import Reading, run
+from tacsim.physics.motion.controller import ForceReading, run
 from tacsim.physics.motion.load import LEAST, LoadNotReached, keep_loads
 from tacsim.physics.motion.path import Path, plan
 from tacsim.physics.world import World, make_world
@@ -73,7 +73,7 @@ def test_loads_that_make_no_sense_are_refused() -> None:
 
 def test_the_sensor_that_went_too_far_is_named() -> None:
     """Beside one that is wrong too, but in place: it sticks, and swings about its load."""
-    scene, rest = press().scene, Reading(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0.0, 0)
+    scene, rest = press().scene, ForceReading(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0.0, 0)
     end = {"lower": Pose(), "upper": Pose()}
 
     class Stuck:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.motion.path import MOST, PEAK, plan, plan_on, ramp
+from tacsim.physics.motion.path import MOST, PEAK, plan, plan_flow, ramp
 
 
 @pytest.mark.parametrize("rise", [0.5, 0.1])
@@ -83,6 +83,6 @@ def test_a_way_that_would_take_for_ever_is_refused() -> None:
     with pytest.raises(ValueError, match=words):
         plan([Pose()], far, mach=0.03, dt=0.4, lever=10.0, thickness=4.0)
     with pytest.raises(ValueError, match=r"500 m at Mach 0\.01 would take 1\.2e\+08 substeps"):
-        plan_on([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
+        plan_flow([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
     slow = plan([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
     assert 0.7 * MOST < slow.substeps < MOST

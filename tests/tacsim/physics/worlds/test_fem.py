@@ -64,7 +64,7 @@ def test_equal_steps_make_a_steady_motion() -> None:
     counts = [world.move(nearer(world), flow=True).substeps for _ in range(4)]
     assert counts[1] == counts[2] == counts[3]
     assert counts[0] == pytest.approx(2 * counts[1], abs=1)
-    path = world._plan_on(list(world._poses.values()), list(nearer(world).values()))
+    path = world._plan_flow(list(world._poses.values()), list(nearer(world).values()))
     speeds = path.drive(0, path.substeps)[:, :, 4, 2]
     assert path.substeps == counts[1]
     steady = STEP / 2 * 1e3 / (path.substeps * path.dt)
@@ -114,7 +114,7 @@ def test_other_motions_first_bring_it_to_rest() -> None:
         world.move(nearer(world), flow=True)
         settled.move(nearer(settled))
     still = world.snapshot()
-    stopping = world._plan_on(list(world._poses.values()), list(world._poses.values())).substeps
+    stopping = world._plan_flow(list(world._poses.values()), list(world._poses.values())).substeps
     stats = world.move(nearer(world))
     assert stats.settled and stats.substeps > stopping and not world.snapshot()["rates"].any()
     settled.move(nearer(settled))

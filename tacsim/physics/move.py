@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Real
 
 from tacsim.interface import Pose
 
@@ -43,8 +42,3 @@ class MoveCommand:
         if self.flow and (self.loads or self.duration is not None):
             what = "loads are held in settled states" if self.loads else "a duration makes a motion dynamic"
             raise ValueError(f"{what}, and a flowing motion is neither: give one of the two")
-
-
-def is_number(value: object) -> bool:
-    """Whether it is one real number, of Python or NumPy."""
-    return isinstance(value, Real)

@@ -25,17 +25,12 @@ def snapshot_of(arrays: State, poses: Mapping[str, Pose]) -> dict[str, NDArray[A
     return state
 
 
-def restore_arrays(
-    arrays: State, frames: Sequence[str], state: State,
-    finite: Sequence[str] = (),
-) -> dict[str, Pose]:  # fmt: skip
+def restore_arrays(arrays: State, frames: Sequence[str], state: State, finite: Sequence[str] = ()) -> dict[str, Pose]:
     """Copies a snapshot into a world's arrays; returns the poses.
 
-    finite: those of the arrays that no motion can begin from unless they are. Raises TypeError for what is no snapshot,
-    ValueError for one that does not fit; then nothing is changed.
+    finite: names of arrays from which no motion can begin unless they are finite. Raises ValueError for a snapshot that
+    does not fit; then nothing is changed.
     """
-    if not isinstance(state, Mapping):
-        raise TypeError(f"a snapshot holds arrays by their names, as World.snapshot gives them; found {state!r}")
     found = {name: np.asarray(state[name]) for name in (*arrays, "poses") if name in state}
     for name, wanted in {**arrays, "poses": np.empty((len(frames), 7))}.items():
         if name not in found or found[name].shape != wanted.shape:

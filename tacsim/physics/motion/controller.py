@@ -1,7 +1,7 @@
 """The quasi-static controller: ramped motion of driven frames, then a hold until the measured residual is small.
 
-Materials are rate-independent, so only the path counts (tacsim.physics.motion.path says which); the hold waits for what
-still moves at its end.
+Materials are rate-independent, so only the path counts (tacsim.physics.motion.path); the hold waits for what still
+moves at its end.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from tacsim.physics.motion.path import MM, Path
 from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
 
-PIECE = 20  # substeps of one launch on the way
-LOOKS = 2  # earlier looks that a look is compared with: one alone may meet the same phase of what rings
+LAUNCH = 20  # substeps of one launch while frames are driven
+COMPARED = 2  # earlier readings that one is compared with: a single one may meet the same phase of what rings
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
@@ -32,7 +32,7 @@ def force_floor(modulus: float, thickness: float) -> float:
 
 @dataclass(frozen=True)
 class StepNumbers:
-    """By which numbers a launch was advanced."""
+    """The numbers that a launch was integrated with."""
 
     step: float = 0.0  # time step [mm, wave speed 1]
     damping: float = 0.0  # of the gel: its rate times the wave's time through it [-]
@@ -44,7 +44,7 @@ class ForceReading:
     """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
 
     moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
-    load: external force on the body besides contact, world axes; None is none.
+    load: external force on the body besides contact, world axes.
     torque: of all contact on a free body about its centre, world axes, over half the gel's width [N].
     """
 
@@ -63,8 +63,7 @@ class ForceReading:
 def residual(now: ForceReading, before: ForceReading, balanced: bool) -> float:
     """Largest imbalance of forces or moments, or their change since `before`, relative to the largest force [-].
 
-    `balanced`: the contact forces on all gels must add up to the body's load, zero without weight (a free body), and
-    turn it nowhere.
+    `balanced`: the contact forces on all gels must add up to the load of a free body, its weight, and have no torque.
     """
     scale = max(float(np.abs(now.contact).max()), now.floor)
     parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
@@ -88,30 +87,30 @@ class Launch:
 
     @property
     def held(self) -> bool:
-        """Nothing is driven any more."""
+        """Nothing is driven in it."""
         return self.path.substeps == 0
 
     @property
     def flowing(self) -> bool:
-        """Of a motion that flows into the next."""
+        """It belongs to a motion that flows into the next."""
         return self.path.rates is not None
 
 
 @dataclass(frozen=True)
 class PreparedLaunch:
-    """A launch that one environment is ready for: its grid is laid and its numbers are set."""
+    """A launch that one environment is ready for: its grid is laid and its parameters are set."""
 
     launch: Launch
     drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel
     where: LaunchSpan
-    good: State  # the environment's arrays before it
+    good: State  # copies of the environment's arrays before it
 
 
 class KernelState(Protocol):
     """The arrays of some environments, and the kernel that advances them."""
 
     def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
-        """One launch: every environment named goes along its own drive, however long; all others rest."""
+        """One launch: every environment named is driven by its own drive (n, frames, 6, 3), n its own; others rest."""
         ...
 
 
@@ -123,18 +122,18 @@ class Environment(Protocol):
         ...
 
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         ...
 
 
-# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the Reading at its end, or
-# thrown the SimulationDiverged that the launch ended in. So whoever advances many worlds in one launch of kernels holds
-# one motion for each, all at their own phases; `run` is that for a single world.
+# The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the ForceReading at its end,
+# or thrown the SimulationDiverged that the launch ended in. So many worlds can advance in one launch of kernels, each
+# at its own phase of its own motion; `run` runs the motion of a single world.
 Motion = Generator[Launch, ForceReading, MoveStats]
 
 
 def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> MoveStats:
-    """Runs one world's motion to its end. A motion cut short (an interruption, say) is closed, so it rolls back."""
+    """Runs one world's motion to its end. An interrupted motion is closed, so it rolls back."""
     try:
         wanted = next(motion)
         while True:
@@ -154,7 +153,8 @@ def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> Mo
 def advance_all(
     kernels: KernelState, environments: Sequence[Environment], wanted: Mapping[int, Launch]
 ) -> dict[int, ForceReading | SimulationDiverged]:
-    """One launch of kernels for all environments that want one; what each came to, a failure in its own place only."""
+    """One launch of kernels for all environments that want one; the outcome of each by its index. An environment that
+    fails does not touch the others."""
     results: dict[int, ForceReading | SimulationDiverged] = {}
     ready: dict[int, PreparedLaunch] = {}
     for index, launch in wanted.items():
@@ -173,58 +173,58 @@ def advance_all(
 
 
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
-    """Goes along `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
-    seen = yield from _driven(path)
+    """Follows `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
+    readings = yield from _driven(path)
     rest = replace(path, start=path.end, substeps=0, rates=None)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
-        count = min(path.look, settling.max_substeps - held)
-        seen.append((yield Launch(rest, 0, count)))
+        count = min(path.interval, settling.max_substeps - held)
+        readings.append((yield Launch(rest, 0, count)))
         held += count
-        if len(seen) > LOOKS:
-            worst = max(residual(seen[-1], earlier, balanced) for earlier in seen[-1 - LOOKS : -1])
+        if len(readings) > COMPARED:
+            worst = max(residual(readings[-1], earlier, balanced) for earlier in readings[-1 - COMPARED : -1])
             if worst <= settling.tolerance:
                 break
-    return _stats(seen, path.substeps, held, worst, settling)
+    return _stats(readings, path.substeps, held, worst, settling)
 
 
 def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
-    """Goes along `path` and holds nowhere; the residual says how far from rest the scene is at the end."""
-    seen = yield from _driven(path)
-    worst = residual(seen[-1], seen[-2], balanced) if len(seen) > 1 else math.inf
-    return _stats(seen, path.substeps, 0, worst, settling)
+    """Follows `path` without a hold; the residual says how far from rest the scene is at the end."""
+    readings = yield from _driven(path)
+    worst = residual(readings[-1], readings[-2], balanced) if len(readings) > 1 else math.inf
+    return _stats(readings, path.substeps, 0, worst, settling)
 
 
 def move_flowing(path: Path, settling: Settling, *, balanced: bool) -> Motion:
-    """Goes along `path`, whose end is no rest; the residual is the imbalance of forces there."""
+    """Follows `path`, which does not end at rest; the residual is the imbalance of forces there."""
     if not path.substeps:
         return (yield from move_and_settle(path, settling, balanced=balanced))
-    seen = yield from _driven(path)
-    stats = _stats(seen, path.substeps, 0, residual(seen[-1], seen[-1], balanced), settling)
+    readings = yield from _driven(path)
+    stats = _stats(readings, path.substeps, 0, residual(readings[-1], readings[-1], balanced), settling)
     return replace(stats, settled=False)
 
 
 def come_to_rest(path: Path, motion: Motion) -> Motion:
-    """Goes along `path`, then does `motion`."""
+    """Follows `path`, which ends at rest, then does `motion`."""
     yield from _driven(path)
     stats = yield from motion
     return replace(stats, substeps=path.substeps + stats.substeps)
 
 
 def _driven(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
-    seen: list[ForceReading] = []
-    for first in range(0, path.substeps, PIECE):
-        seen.append((yield Launch(path, first, min(first + PIECE, path.substeps))))
-    return seen
+    readings: list[ForceReading] = []
+    for first in range(0, path.substeps, LAUNCH):
+        readings.append((yield Launch(path, first, min(first + LAUNCH, path.substeps))))
+    return readings
 
 
-def _stats(seen: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
-    overlap = seen[-1].overlap / MM if seen else 0.0
-    hits = sum(reading.guard_hits for reading in seen)
-    last = seen[-1].scheme if seen else StepNumbers()
+def _stats(readings: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
+    overlap = readings[-1].overlap / MM if readings else 0.0
+    hits = sum(reading.guard_hits for reading in readings)
+    last = readings[-1].scheme if readings else StepNumbers()
     return MoveStats(
         substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
         time_step=last.step / MM, damping=last.damping,
-        courant=max((reading.scheme.courant for reading in seen), default=0.0),
-        gel_overlap=seen[-1].gel_overlap / MM if seen else 0.0,
+        courant=max((reading.scheme.courant for reading in readings), default=0.0),
+        gel_overlap=readings[-1].gel_overlap / MM if readings else 0.0,
     )  # fmt: skip

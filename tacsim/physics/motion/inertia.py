@@ -15,31 +15,30 @@ from dataclasses import dataclass, field
 from tacsim.interface import Pose
 from tacsim.physics.gel.gel import MM, MPA, GelParams
 from tacsim.physics.motion.controller import Launch
-from tacsim.physics.motion.path import MOST, PEAK, ROUNDING, Path, path_length
-from tacsim.physics.move import is_number
+from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, ROUNDING, Path, path_length
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """The entries of the array `facts` (tacsim.physics.exec.layout) by which a scene answers to forces, and its
-    time."""
+    """The entries of the array `params` (tacsim.physics.exec.layout) that say how a scene answers to forces, and its
+    time scale."""
 
     params: Mapping[int, float]
     step: float  # nominal substep [mm]
     second: float = math.nan  # kernel time of one second [mm]; quasi-static motions have no real time
-    held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven any more
-    flowing: Mapping[int, float] = field(default_factory=dict)  # and those of motions that flow into one another
+    held: Mapping[int, float] = field(default_factory=dict)  # entries that differ while nothing is driven
+    flowing: Mapping[int, float] = field(default_factory=dict)  # and in motions that flow into one another
 
     def entries(self, launch: Launch | None = None) -> dict[int, float]:
-        """The entries for a launch; None: while something is driven."""
+        """The entries for a launch; None: of one that drives something."""
         if launch is None:
             return dict(self.params)
         return {**self.params, **(self.held if launch.held else self.flowing if launch.flowing else {})}
 
     @property
-    def true(self) -> bool:
+    def real_time(self) -> bool:
         return math.isfinite(self.second)
 
 
@@ -54,23 +53,22 @@ def kernel_density(density: float, second: float) -> float:
 
 
 def plan_real_time(start: Sequence[Pose], end: Sequence[Pose], duration: float, inertia: Inertia, lever: float) -> Path:
-    """The path of a dynamic motion; `lever` [mm]: see `longest_way`.
+    """The path of a dynamic motion; `lever` [mm]: see `of_fastest_point`.
 
-    Raises ValueError for a duration [s] that is not positive, that has far too many substeps or nothing of one, or in
-    which the fastest frame would race the gel's own waves; TypeError for what is no number.
+    Raises ValueError for a duration [s] that is not positive, has too many substeps or less than one, or in which a
+    frame would come near the speed of the gel's own waves.
     """
-    if not is_number(duration):
-        raise TypeError(f"duration must be a number [s], or None for a quasi-static motion; found {duration!r}")
     if not (math.isfinite(duration) and duration > 0):
         raise ValueError(f"duration is {duration:g} s: give a positive time, or None for a quasi-static motion")
     substep = inertia.step / inertia.second
-    if not ROUNDING <= duration / substep <= MOST:
+    if not ROUNDING <= duration / substep <= MOST_SUBSTEPS:
         raise ValueError(
-            f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (the materials say so) it must lie between "
-            f"{ROUNDING * substep:.3g} and {MOST * substep:.3g} s: is it in seconds? if so, make several motions of it"
+            f"duration is {duration:.3g} s; at substeps of {substep:.3g} s (of the materials) it must lie"
+            f" between {ROUNDING * substep:.3g} and {MOST_SUBSTEPS * substep:.3g} s: is it in seconds? if so, make "
+            f"several motions of it"
         )
     kernel_time, wave = duration * inertia.second, inertia.second / MM
-    peak = PEAK * path_length(start, end, lever) / kernel_time
+    peak = PEAK_SLOPE * path_length(start, end, lever) / kernel_time
     if peak > FASTEST_DRIVE:
         raise ValueError(
             f"within {duration:.3g} s a frame would reach {peak * wave:.3g} m/s; the limit is {FASTEST_DRIVE:g} of the "

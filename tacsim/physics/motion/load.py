@@ -1,6 +1,6 @@
 """Motion at a constant normal load: a sensor follows its target but along its own z axis, where its force is held.
 
-The way is cut into pieces, each a settled motion; after each the sensor moves along its z until the force is right, by
+The path is cut into pieces, each a settled motion; after each the sensor moves along its z until the force is right, by
 the secant of the last two settled states (the first steps are short, for the stiffness is not known yet).
 """
 
@@ -13,19 +13,19 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.motion.controller import ForceReading, Launch, Motion, move_and_settle
 from tacsim.physics.motion.path import Path
-from tacsim.physics.move import MoveStats, is_number
+from tacsim.physics.move import MoveStats
 
 # All as shares of the gel's thickness
-PIECE = 0.06  # longest way between two corrections
-STEP = 0.025  # longest correction
+PIECE = 0.06  # longest path between two corrections
+CORRECTION = 0.025  # longest correction
 TRAVEL = 0.6  # furthest from the target along z; beyond, the load counts as out of reach
-LEAST = 1e-3  # load that the tolerance is relative to at least, as a share of E thickness^2
+SMALLEST_LOAD = 1e-3  # that the tolerance is relative to at least, as a share of E thickness^2
 CORRECTIONS = 60  # after one piece
 
 
@@ -45,20 +45,16 @@ class LoadableWorld(Protocol):
 
 
 def require_loads(loads: Mapping[str, float], sensors: Sequence[str]) -> None:
-    """Raises KeyError for what is no sensor, ValueError for a load that is negative or not finite, and TypeError."""
-    if not isinstance(loads, Mapping):
-        raise TypeError(f"loads are forces [N] by the names of sensors ({', '.join(sensors)}), found {loads!r}")
+    """Raises KeyError for what is no sensor, ValueError for a load that is negative or not finite."""
     for name, load in loads.items():
         if name not in sensors:
             raise KeyError(f"no sensor '{name}' to hold a load; this world has {', '.join(sensors)}")
-        if not is_number(load):
-            raise TypeError(f"load of '{name}' must be a number [N], found {load!r}")
         if not (math.isfinite(load) and load >= 0.0):
             raise ValueError(f"load of '{name}' is {load:g} N; give 0 or more (positive = pressed)")
 
 
 @dataclass
-class _Axis:
+class _NormalAxis:
     """One sensor's z: the load wanted [N], travel from the target along z [m], and the settled state before."""
 
     wanted: float
@@ -66,8 +62,8 @@ class _Axis:
     travel: float = 0.0
     before: tuple[float, float] | None = None  # travel, force
 
-    def step(self, force: float, longest: float) -> float:
-        """The next correction [m]; positive = press."""
+    def correct(self, force: float, longest: float) -> None:
+        """Travels towards the load, at most by `longest` [m]: by the secant of two settled states where it is one."""
         error = self.wanted - force
         step = math.copysign(longest, error)
         if self.before is not None and self.travel != self.before[0]:
@@ -78,7 +74,6 @@ class _Axis:
             step = min(step, -longest / 4)
         self.before = self.travel, force
         self.travel += step
-        return step
 
 
 def keep_loads(
@@ -91,35 +86,37 @@ def keep_loads(
     """
     scene, targets = world.scene, dict(end)
     thickness = scene.gel.size[2]
-    least = LEAST * scene.gel.material.youngs_modulus * thickness**2
-    axes = {name: _Axis(load, scene.settling.tolerance * max(load, least)) for name, load in loads.items()}
+    smallest = SMALLEST_LOAD * scene.gel.material.youngs_modulus * thickness**2
+    axes = {name: _NormalAxis(load, scene.settling.tolerance * max(load, smallest)) for name, load in loads.items()}
     done: list[MoveStats] = []
 
     def force(name: str) -> float:
         return 0.0 - float(world.wrench(name)[2])  # never -0
 
-    def go(share: float) -> Generator[Launch, ForceReading, None]:
-        poses = {name: _between(start[name], target, share) for name, target in targets.items()}
+    def settle_at(share: float) -> Generator[Launch, ForceReading, None]:
+        """At `share` of the path, each loaded sensor off it by its travel."""
+        poses = {name: se3.interpolate(start[name], target, share) for name, target in targets.items()}
         for name, axis in axes.items():
-            z = Rotation.from_quat(poses[name].quaternion).as_matrix()[:, 2]
+            z = se3.rotation(poses[name]).as_matrix()[:, 2]
             poses[name] = Pose(poses[name].position + axis.travel * z, poses[name].quaternion)
         path = replace(world.plan(list(end.values()), list(poses.values())), refine=refine)
         done.append((yield from move_and_settle(path, scene.settling, balanced=balanced)))
         end.update(poses)
 
-    def correct(share: float) -> Generator[Launch, ForceReading, float]:
+    def correct_at(share: float) -> Generator[Launch, ForceReading, float]:
+        """The largest error [N] that is left."""
         for _ in range(CORRECTIONS):
-            errors = {name: axis.wanted - force(name) for name, axis in axes.items()}
-            wrong = [name for name, axis in axes.items() if not abs(errors[name]) <= axis.tolerance]
+            errors = {name: abs(axis.wanted - force(name)) for name, axis in axes.items()}
+            wrong = [name for name, axis in axes.items() if not errors[name] <= axis.tolerance]
             if not wrong:
-                return max(abs(error) for error in errors.values())
+                return max(errors.values())
             for name in wrong:
-                axes[name].step(force(name), STEP * thickness)
+                axes[name].correct(force(name), CORRECTION * thickness)
             beyond = [name for name in wrong if abs(axes[name].travel) > TRAVEL * thickness]
             if beyond:
                 wrong = beyond
                 break
-            yield from go(share)
+            yield from settle_at(share)
         name = wrong[0]
         raise LoadNotReached(
             f"'{name}' does not reach a load of {axes[name].wanted:g} N: {force(name):.3g} N after "
@@ -127,26 +124,16 @@ def keep_loads(
             f"mm); bring its target nearer to contact, or ask for another load"
         )
 
-    world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a way that is far too long
+    world.plan(list(start.values()), list(targets.values()))  # raises ValueError for a path that is far too long
     end.update(start)
-    way = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
-    pieces = max(1, math.ceil(way / (PIECE * thickness)))
-    off = 0.0
+    length = max(float(np.linalg.norm(targets[name].position - start[name].position)) for name in targets)
+    pieces = max(1, math.ceil(length / (PIECE * thickness)))
     for piece in range(1, pieces + 1):
-        touching = all(force(name) > 0.0 for name in loads)
-        if piece > 1 and touching:
-            yield from correct((piece - 1) / pieces)
-        yield from go(piece / pieces)
-    off = yield from correct(1.0)
-    last = done[-1]
+        if piece > 1 and all(force(name) > 0.0 for name in loads):
+            yield from correct_at((piece - 1) / pieces)
+        yield from settle_at(piece / pieces)
+    error = yield from correct_at(1.0)
     return replace(
-        last, substeps=sum(s.substeps for s in done), hold=sum(s.hold for s in done),
-        guard_hits=sum(s.guard_hits for s in done), load_error=off, courant=max(s.courant for s in done),
+        done[-1], substeps=sum(s.substeps for s in done), hold=sum(s.hold for s in done),
+        guard_hits=sum(s.guard_hits for s in done), load_error=error, courant=max(s.courant for s in done),
     )  # fmt: skip
-
-
-def _between(a: Pose, b: Pose, share: float) -> Pose:
-    turn_from = Rotation.from_quat(a.quaternion)
-    vector = (Rotation.from_quat(b.quaternion) * turn_from.inv()).as_rotvec()
-    turned = Rotation.from_rotvec(share * vector) * turn_from
-    return Pose(a.position + share * (b.position - a.position), turned.as_quat())

@@ -1,7 +1,7 @@
 """Where driven frames go, and how fast: ramps from rest to rest, and steps that flow into one another.
 
 What falsifies a path-dependent state is the inertia and damping of a motion: they write plastic strain into the body.
-What the start writes, the rest of the way mostly undoes; what the stop writes stays. Hence every ramp starts and ends
+What the start writes, the rest of the path mostly undoes; what the stop writes stays. Hence every ramp starts and ends
 with zero velocity and zero acceleration, sets off in the time that the gel's wave needs, and slows down over all the
 rest (docs/decisions/0002-quasi-static-controller.md).
 """
@@ -20,13 +20,13 @@ from tacsim.interface import Pose
 from tacsim.physics.failure.health import LaunchSpan
 
 MM = 1e3
-PEAK = 1.875  # peak slope of the ramp over its mean
-RAMP = 2.0  # shortest motion, in times of the pressure wave through the gel
-SHORT = 0.5  # ways shorter than so many gel thicknesses go slower than they may, if what is pressed yields
-FLOW = 1.25  # shortest step that flows, in wave times; longer by as much as its speed changes
-LOOK = 1.0  # time of the hold between two looks at the forces, in the same times
+PEAK_SLOPE = 1.875  # of the ramp, over its mean
+# Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, which takes
+# longer by as much as its speed changes; time of the hold between two readings of the forces
+SHORTEST_RAMP, SHORTEST_FLOW, READING_INTERVAL = 2.0, 1.25, 1.0
+SHORT_PATH = 0.5  # gel thicknesses: on shorter paths, frames go slower than they may, if what is pressed yields
 ROUNDING = 1e-6  # of a number of substeps
-MOST = 1_000_000  # substeps of one motion: hours, and no motion that anybody means
+MOST_SUBSTEPS = 1_000_000  # of one motion: hours, and no motion that anybody means
 
 
 def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
@@ -35,20 +35,20 @@ def ramp(t: NDArray[np.float64], rise: float = 0.5) -> NDArray[np.float64]:
     Each side is half of the quintic of minimum jerk (Flash & Hogan 1985), stretched in time; rise = 0.5 is that itself.
     """
 
-    def way(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def half(x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Integral of the velocity x^2 (2 - x)^2."""
         return x**3 * (4.0 / 3.0 - x + x * x / 5.0)
 
     up, down = np.minimum(t / rise, 1.0), np.minimum((1.0 - t) / (1.0 - rise), 1.0)
-    return np.where(t < rise, PEAK * rise * way(up), 1.0 - PEAK * (1.0 - rise) * way(down))
+    return np.where(t < rise, PEAK_SLOPE * rise * half(up), 1.0 - PEAK_SLOPE * (1.0 - rise) * half(down))
 
 
 @dataclass(frozen=True)
 class Path:
-    """Driven frames on their way from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
+    """Driven frames move from `start` to `end` in `substeps` nominal substeps of `dt` [mm, wave speed 1].
 
-    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. look: substeps of the hold
-    at its end between two looks at the forces. rise: share of the time in which the velocity rises, of `ramp`.
+    Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. interval: substeps of the
+    hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
 
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm]: instead of a ramp
     from rest to rest the path is then the cubic that has them.
@@ -59,7 +59,7 @@ class Path:
     substeps: int
     dt: float
     refine: int = 1
-    look: int = 20
+    interval: int = 20
     rise: float = 0.5
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
@@ -76,19 +76,19 @@ class Path:
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
         out = np.empty((len(knots) - 1, len(self.start), 6, 3))
         for index, a in enumerate(self.start):
-            way = self._way(index, knots)
+            moved = self._displacements(index, knots)
             turned, spin = Rotation.from_quat(a.quaternion), np.zeros(3)
-            if way[:, 3:].any():
-                turned = Rotation.from_rotvec(way[:, 3:]) * turned
+            if moved[:, 3:].any():
+                turned = Rotation.from_rotvec(moved[:, 3:]) * turned
                 turned, spin = turned[1:], (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
             out[:, index, :3] = turned.as_matrix()
-            out[:, index, 3] = a.position * MM + way[1:, :3]
-            out[:, index, 4] = np.diff(way[:, :3], axis=0) / self.step
+            out[:, index, 3] = a.position * MM + moved[1:, :3]
+            out[:, index, 4] = np.diff(moved[:, :3], axis=0) / self.step
             out[:, index, 5] = spin
         return np.ascontiguousarray(out, np.float32)
 
-    def _way(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 6) way of a frame from its start [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
+    def _displacements(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 6) of a frame from its start: [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
         t = np.clip(knots, 0.0, 1.0)[:, None]
         whole = displacement_between(self.start[index], self.end[index])
         if self.rates is None:
@@ -99,100 +99,93 @@ class Path:
         return cubic
 
     def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
-        """Where the frames called `names` are on substeps first..last."""
-        part = (
-            f"substeps {first} to {last} of {self.substeps} of the motion"
-            if self.substeps
-            else "the hold after the motion"
-        )
+        """Substeps first..last in words, and where the frames called `names` are at their end."""
+        words = f"in substeps {first} to {last} of {self.substeps} of the motion"
         at, poses = np.array([last / max(self.substeps, 1)]), {}
         for index, (name, a) in enumerate(zip(names, self.start, strict=True)):
-            way, quaternion = self._way(index, at)[0], a.quaternion
-            if way[3:].any():
-                quaternion = (Rotation.from_rotvec(way[3:]) * Rotation.from_quat(quaternion)).as_quat()
-            poses[name] = Pose(a.position + way[:3] / MM, quaternion)
-        return LaunchSpan(f"in {part}", poses)
+            moved, quaternion = self._displacements(index, at)[0], a.quaternion
+            if moved[3:].any():
+                quaternion = (Rotation.from_rotvec(moved[3:]) * Rotation.from_quat(quaternion)).as_quat()
+            poses[name] = Pose(a.position + moved[:3] / MM, quaternion)
+        return LaunchSpan(words if self.substeps else "in the hold after the motion", poses)
 
 
 def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
-    """(6,) from a to b: position [mm], rotation vector [rad], world axes."""
-    way = np.zeros(6)
-    way[:3] = (b.position - a.position) * MM
+    """(6,) from a to b: [mm], rotation vector [rad], world axes."""
+    displacement = np.zeros(6)
+    displacement[:3] = (b.position - a.position) * MM
     if not np.array_equal(a.quaternion, b.quaternion):  # most motions turn nothing, and that is seen at once
-        way[3:] = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).as_rotvec()
-    return way
+        displacement[3:] = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).as_rotvec()
+    return displacement
 
 
-def longest(ways: NDArray[np.float64], lever: float) -> float:
-    """Of ways or rates (frames, 6), linear and angular, that of the fastest point; `lever` [mm]: to the gel's rim."""
-    linear, angular = (np.linalg.norm(part, axis=1) for part in np.split(ways, 2, axis=1))
+def of_fastest_point(vectors: NDArray[np.float64], lever: float) -> float:
+    """Displacements or rates (frames, 6), linear and angular, to that of the fastest point; `lever` [mm]: from a
+    frame's origin to the gel's rim."""
+    linear, angular = (np.linalg.norm(part, axis=1) for part in np.split(vectors, 2, axis=1))
     return float((linear + lever * angular).max())
 
 
 def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
-    """The way of the fastest point [mm]; `lever` [mm] turns rotation into a way at the gel's rim."""
-    return longest(np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
+    """Of the fastest point [mm]; lever: see `of_fastest_point`."""
+    return of_fastest_point(np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
 
 
 def plan(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
     yields: bool = False,
 ) -> Path:  # fmt: skip
-    """A path whose fastest point moves at peak Mach `mach`; it lasts no less than RAMP gel thicknesses [mm], since a
-    shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
+    """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
+    since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
 
-    What the stop writes into a body that `yields` grows with how hard it brakes, so short ways go slower: with the root
-    of their length, which is the same braking for all.
+    What the stop writes into a body that `yields` grows with how hard it brakes, so short paths go slower: with the
+    root of their length, which is the same braking for all.
 
-    Raises ValueError for a way that takes more than MOST substeps.
+    Raises ValueError for a path that takes more than MOST_SUBSTEPS.
     """
-    look = math.ceil(LOOK * thickness / dt)
+    interval = math.ceil(READING_INTERVAL * thickness / dt)
     length = path_length(start, end, lever)
     if length == 0:
-        return Path(start, end, 0, dt, look=look)
+        return Path(start, end, 0, dt, interval=interval)
     if yields:
-        mach *= min(1.0, math.sqrt(length / (SHORT * thickness)))
-    lasting = max(PEAK * length / mach, RAMP * thickness)
-    return Path(start, end, _substeps(lasting / dt, length, mach), dt, look=look, rise=RAMP * thickness / 2 / lasting)
+        mach *= min(1.0, math.sqrt(length / (SHORT_PATH * thickness)))
+    lasting = max(PEAK_SLOPE * length / mach, SHORTEST_RAMP * thickness)
+    rise = SHORTEST_RAMP * thickness / 2 / lasting
+    return Path(start, end, _substeps(lasting / dt, length, mach), dt, interval=interval, rise=rise)
 
 
 def plan_flow(
     start: Sequence[Pose], end: Sequence[Pose], rates: NDArray[np.float64], mach: float, dt: float, lever: float,
     thickness: float,
 ) -> Path:  # fmt: skip
-    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at the mean speed of
-    the step as if it were the same all the way; at most Mach `mach`. Where speeds change it lasts longer, up to twice
-    as long from rest. Without a way and at rest it has no substeps. Raises ValueError as `plan` does."""
-    ways = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
-    look = math.ceil(LOOK * thickness / dt)
-    if not (ways.any() or rates.any()):
-        return Path(start, end, 0, dt, look=look)
-    length = longest(ways, lever)
-    lasting = dt * _substeps(max(length / mach, FLOW * thickness) / dt - ROUNDING, length, mach)
-    onward = ways / lasting
-    lasting *= 1.0 + longest(onward - rates, lever) / mach
+    """The path of a step that flows: from `start`, left at `rates` (frames, 6), to `end`, passed at the mean velocity
+    of the step; at most Mach `mach`. Where velocities change it lasts longer, up to twice as long from rest. With no
+    displacement and at rest it has no substeps. Raises ValueError as `plan` does."""
+    displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
+    interval = math.ceil(READING_INTERVAL * thickness / dt)
+    if not (displacements.any() or rates.any()):
+        return Path(start, end, 0, dt, interval=interval)
+    length = of_fastest_point(displacements, lever)
+    lasting = dt * _substeps(max(length / mach, SHORTEST_FLOW * thickness) / dt - ROUNDING, length, mach)
+    mean = displacements / lasting
+    lasting *= 1.0 + of_fastest_point(mean - rates, lever) / mach
     substeps = _substeps(lasting / dt - ROUNDING, length, mach)
-    return Path(start, end, substeps, dt, look=look, rates=(rates, onward))
+    return Path(start, end, substeps, dt, interval=interval, rates=(rates, mean))
 
 
 def _substeps(count: float, length: float, mach: float) -> int:
-    """The whole number for `count`. Raises ValueError for a way of `length` [mm] that takes more than MOST of them."""
-    if not count <= MOST:
+    """`count` rounded up. Raises ValueError for a path of `length` [mm] that takes more than MOST_SUBSTEPS."""
+    if not count <= MOST_SUBSTEPS:
         raise ValueError(
-            f"a way of {length / MM:.3g} m at Mach {mach:.3g} would take {count:.2g} substeps (limit {MOST:,}); are "
-            f"the targets in metres? if so, go there in several motions, or faster"
+            f"a path of {length / MM:.3g} m at Mach {mach:.3g} would take {count:.2g} substeps (limit "
+            f"{MOST_SUBSTEPS:,}); are the targets in metres? if so, go there in several motions, or faster"
         )
     return math.ceil(count)
 
 
 def resolve_targets(poses: Mapping[str, Pose], targets: Mapping[str, Pose]) -> dict[str, Pose]:
-    """Where every driven frame ends. Raises KeyError for a frame that is not driven, TypeError for what is no pose."""
-    if not isinstance(targets, Mapping):
-        raise TypeError(f"targets are poses by the names of frames ({', '.join(poses)}), found {targets!r}")
+    """Where every driven frame ends. Raises KeyError for a frame that is not driven."""
     unknown = [str(name) for name in targets if name not in poses]
     if unknown:
         raise KeyError(f"no driven frame {', '.join(unknown)}; this world drives {', '.join(poses)}")
-    for name, target in targets.items():
-        if not isinstance(target, Pose):
-            raise TypeError(f"target of '{name}' must be a Pose, found {target!r}; leave '{name}' out and it stays")
     return {**poses, **targets}

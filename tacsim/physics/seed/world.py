@@ -37,7 +37,7 @@ REACH = 1.5  # [cells] gap at which contact through the grid begins
 GEL_DAMPING = 1.0  # zeta in alpha = zeta c / thickness
 BODY_DAMPING = 0.8  # likewise, rate against the driven motion, along z: near critical for the bounce between the gels
 SWAY_DAMPING = 0.12  # likewise across z, where the gels are softer
-LOOK = 20  # substeps of the hold between two looks at the forces
+READING_INTERVAL = 20  # substeps of the hold between two readings of the forces
 GENTLE = 60  # substeps of the shortest motion: a start in fewer is a blow, which leaves false plastic strain
 SIDE = 1.0  # the grid reaches this many gel widths beyond the gels' rim; a particle further out is set aside
 FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which the number of layers is kept
@@ -215,7 +215,7 @@ class SeedWorld(BaseWorld):
         """The path between two poses of all driven frames, at the scene's speed."""
         lever = self._lattice.spacing * max(self._lattice.count[:2]) / np.sqrt(2)
         path = plan(start, end, self._mach, self._dt, lever, self.scene.gel.size[2] * MM)
-        return replace(path, substeps=max(path.substeps, GENTLE) if path.substeps else 0, look=LOOK)
+        return replace(path, substeps=max(path.substeps, GENTLE) if path.substeps else 0, interval=READING_INTERVAL)
 
     def _upright(self, name: str, pose: Pose) -> Pose:
         """`pose` without a tilt of up to TILT, which the scheme can't follow."""

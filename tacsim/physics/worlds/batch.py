@@ -33,7 +33,7 @@ class Batch(NotCopyable):
     _instead = "Batch(scenes) and restore each world's snapshot()"
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for scenes that cannot share a launch, and says which; TypeError for what is no scene."""
+        """Raises ValueError for scenes that cannot share a launch, and says which."""
         _require_one_kind(scenes)
         self._state: HybridState | PressState
         self.worlds: tuple[HybridWorld | PressWorld, ...]
@@ -114,9 +114,6 @@ class Batch(NotCopyable):
 def _require_one_kind(scenes: Sequence[Scene]) -> None:
     if not scenes:
         raise ValueError("a batch needs at least one scene")
-    for index, scene in enumerate(scenes):
-        if not isinstance(scene, Scene):
-            raise TypeError(f"environment {index} must be a Scene, found {scene!r}")
     seeds = [index for index, scene in enumerate(scenes) if scene.physics == "seed"]
     if seeds:
         raise ValueError(

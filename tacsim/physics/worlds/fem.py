@@ -84,7 +84,7 @@ class FemWorld(BaseWorld):
 
     def _scalars(self) -> dict[str, NDArray[Any]]:
         """What a snapshot holds besides: of how the last motion has left this world."""
-        return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.true))}
+        return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.real_time))}
 
     @abstractmethod
     def _stop(self) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene, Sphere
 from tacsim.physics.motion.controller import ForceReading, run
-from tacsim.physics.motion.load import LEAST, LoadNotReached, keep_loads
+from tacsim.physics.motion.load import SMALLEST_LOAD, LoadNotReached, keep_loads
 from tacsim.physics.motion.path import Path, plan
 from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds.press import PressWorld
@@ -38,7 +38,8 @@ def test_a_load_is_found_from_without_contact_and_given_up_again() -> None:
     pressed = world.pose("lower").position
     assert pressed[2] > 0.2e-3 and np.abs(pressed[:2]).max() == 0  # came up to the indenter, and only that
     world.move({}, loads={"lower": 0.0})
-    assert load(world, "lower") == pytest.approx(0.0, abs=1e-2 * LEAST * 0.145 * 4.0**2)  # of what counts as none
+    tolerance = 1e-2 * SMALLEST_LOAD * 0.145 * 4.0**2  # of what counts as none
+    assert load(world, "lower") == pytest.approx(0.0, abs=tolerance)
     assert world.pose("lower").position[2] < pressed[2]
 
 
@@ -92,7 +93,7 @@ def test_the_sensor_that_went_too_far_is_named() -> None:
         run(motion, lambda *launch: rest)
 
 
-def test_a_way_that_would_take_for_ever_is_refused_with_a_load_too() -> None:
+def test_a_path_that_would_take_for_ever_is_refused_with_a_load_too() -> None:
     world = press()
     before = world.snapshot()
     with pytest.raises(ValueError, match="are the targets in metres"):

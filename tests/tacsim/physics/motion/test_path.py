@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
-from tacsim.physics.motion.path import MOST, PEAK, plan, plan_flow, ramp
+from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, plan, plan_flow, ramp
 
 
 @pytest.mark.parametrize("rise", [0.5, 0.1])
@@ -19,7 +19,7 @@ def test_ramp_starts_and_ends_at_rest(rise: float) -> None:
     assert speed[[0, -1]] == pytest.approx(0, abs=1e-5)
     assert np.gradient(speed, t)[[0, -1]] == pytest.approx(0, abs=0.05)
     assert np.abs(np.gradient(speed, t)).max() > 3  # of which that is nothing
-    assert speed.max() == pytest.approx(PEAK, rel=1e-4) and t[speed.argmax()] == pytest.approx(rise, abs=1e-4)
+    assert speed.max() == pytest.approx(PEAK_SLOPE, rel=1e-4) and t[speed.argmax()] == pytest.approx(rise, abs=1e-4)
     assert (np.diff(s) >= -1e-15).all()
 
 
@@ -68,7 +68,7 @@ def test_no_motion_needs_no_substeps() -> None:
 
 
 def test_the_shortest_motion_lets_the_gel_follow() -> None:
-    """It takes twice as long as the gel's wave needs through it, however short its way."""
+    """It takes twice as long as the gel's wave needs through it, however short its path."""
     short = plan([Pose()], [Pose(np.array([0, 0, 1e-6]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
     assert short.substeps == 20
     far = plan([Pose()], [Pose(np.array([0, 0, 1e-3]))], mach=0.05, dt=0.4, lever=10.0, thickness=4.0)
@@ -76,7 +76,7 @@ def test_the_shortest_motion_lets_the_gel_follow() -> None:
     assert short.rise == 0.5 and far.rise * far.substeps * far.dt == pytest.approx(4.0, rel=0.01)
 
 
-def test_a_way_that_would_take_for_ever_is_refused() -> None:
+def test_a_path_that_would_take_for_ever_is_refused() -> None:
     """Millimetres given as metres; but not what is slow and meant: 50 mm at Mach 0.001, in fine steps."""
     far = [Pose(np.array([0, 0, 500.0]))]
     words = r"500 m at Mach 0\.03 would take 7\.8e\+07 substeps \(limit 1,000,000\); are the targets in metres\?"
@@ -85,4 +85,4 @@ def test_a_way_that_would_take_for_ever_is_refused() -> None:
     with pytest.raises(ValueError, match=r"500 m at Mach 0\.01 would take 1\.2e\+08 substeps"):
         plan_flow([Pose()], far, np.zeros((1, 6)), mach=0.01, dt=0.4, lever=10.0, thickness=4.0)
     slow = plan([Pose()], [Pose(np.array([0, 0, 50e-3]))], mach=0.001, dt=0.125, lever=10.0, thickness=4.0)
-    assert 0.7 * MOST < slow.substeps < MOST
+    assert 0.7 * MOST_SUBSTEPS < slow.substeps < MOST_SUBSTEPS

@@ -348,17 +348,12 @@ def test_scenes_that_cannot_share_a_launch_are_named() -> None:
         Batch([ball, ball.model_copy(update={"gel": Gel(size=(10e-3, 10e-3, 4e-3))})])
     with pytest.raises(ValueError, match="at least one scene"):
         Batch([])
-    with pytest.raises(TypeError, match="environment 1 must be a Scene, found 2"):
-        Batch([cube, 2])  # type: ignore[list-item]
 
 
 def test_wrong_targets_are_refused_before_anything_moves(fresh: Batch) -> None:
     before = [state(world) for world in fresh.worlds]
     with pytest.raises(KeyError, match="no driven frame middle") as caught:
         fresh.move([closed(fresh.worlds[0], 0.4e-3), {"middle": Pose()}, None])
-    assert caught.value.__notes__ == ["in the motion of environment 1"]
-    with pytest.raises(TypeError, match="target of 'upper' must be a Pose") as caught:
-        fresh.move([STAY, {"upper": [0, 0, 0]}, None])  # type: ignore[dict-item]
     assert caught.value.__notes__ == ["in the motion of environment 1"]
     with pytest.raises(ValueError, match="2 targets for 3 environments"):
         fresh.move([None, None])

@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.cases.press import renew as renew
 from benchmarks.cases.real.labels import BadData
 from benchmarks.cases.registry import chosen
 from benchmarks.harness.machine import backend

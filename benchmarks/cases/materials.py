@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cases.squeeze import close, normal_forces
-from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.measure import Measurement, Timing, step_cost, timed
 from benchmarks.harness.runner import Case
+from benchmarks.truth.clay import CLAY, COURANT, uniaxial_stress
 from tacsim.interface import FloatArray
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Scene
 from tacsim.physics.move import MoveStats
 from tacsim.physics.oracle import laws
 
-CLAY = BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=30e3)
 RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
-COURANT = 0.4
 Keep = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
 HALF_PERIODS = 4  # of a standing wave that are timed
 
@@ -35,11 +34,6 @@ def yield_scene(side: float, spacing: float, gel_element: float) -> Scene:
             "element_size": gel_element,
         }
     )
-
-
-def uniaxial_stress(force: float, volume: float, height: float) -> float:
-    """Mean Kirchhoff stress of a prism [Pa]: force [N] over its section, which is its volume [m^3] over its height."""
-    return force * height / volume
 
 
 def yield_plateau(side: float, spacing: float, repeat: int) -> list[Measurement]:
@@ -136,12 +130,6 @@ def gel_step(repeat: int) -> list[Measurement]:
             step_cost(timing, stats.substeps, elements, "element"), "" if stats.settled else "not settled",
         )
     ]  # fmt: skip
-
-
-def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str, float]:
-    """Time of a substep [ns] over the number of particles or elements; all else that a substep does is in it."""
-    each = 1e9 / (substeps * count)
-    return {f"wall_per_{what}_substep_ns": timing.median * each, f"cpu_per_{what}_substep_ns": timing.processor * each}
 
 
 def oedometer(element: float, repeat: int) -> list[Measurement]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +13,19 @@ from numpy.typing import NDArray
 
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
-from benchmarks.truth.limit import GRID_PITCH, load_limit, rms, surface_profile
+from benchmarks.truth.limit import (
+    DEPTH,
+    ELEMENTS,
+    FOLDER,
+    GRID_PITCH,
+    LIMIT,
+    RADIUS,
+    Limit,
+    extrapolate,
+    load_limit,
+    rms,
+    surface_profile,
+)
 from tacsim.geometry.shapes import extent
 from tacsim.interface import Pose
 from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
@@ -23,9 +37,6 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-RADIUS = 4e-3  # of the ball [m]
-DEPTH = 1e-3  # of the ball's tip below the undeformed surface [m]
-LIMIT = "limit of h = 0.25 and 0.125 mm"
 LAYER = "FFT elastic layer"
 FORCE_DEPTHS = (0.1e-3, 0.3e-3)
 FORCE_RATIOS = (0.45, 0.49)  # Poisson
@@ -161,6 +172,33 @@ def sliding_force(element: float, repeat: int) -> list[Measurement]:
         Measurement(timing, _percent(ratios[-1], friction), "%", "Coulomb's law", "coefficient 0.3", substeps, figures,
                     note)
     ]  # fmt: skip
+
+
+def renew(say: Callable[[str], None], folder: Path = FOLDER) -> Limit:
+    """Computes the limit anew and writes it to `folder`: three meshes, the finest takes many minutes."""
+    profiles, forces, substeps = [], [], []
+    for element in ELEMENTS:
+        say(f"sphere_press: h = {element * 1e3:g} mm")
+        world, stats = press(press_scene(Sphere(radius=RADIUS), element, tolerance=1e-4), DEPTH)
+        if not stats.settled:
+            raise RuntimeError(f"the press at h = {element} m did not settle: residual {stats.residual:.2g}")
+        profiles.append(surface_profile(world.surface("lower")))
+        forces.append(-float(world.wrench("lower")[2]))
+        substeps.append(stats.substeps)
+    profile, order = extrapolate(*profiles)
+    config = {
+        "what": "u_z [m] of the gel's top surface on a grid of 0.25 mm: ball R 4 mm pressed 1 mm into the default gel "
+        "(20 x 20 x 4 mm, E 0.145 MPa, nu 0.45), friction 0.6; Richardson limit of the two finest meshes",
+        "element_mm": [element * 1e3 for element in ELEMENTS],
+        "order": round(order, 3),
+        "rms_to_limit_um": [round(rms(p - profile) * 1e6, 3) for p in profiles],
+        "force_n": [round(force, 6) for force in forces],
+        "substeps": substeps,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "sphere_press.npy", profile.astype(np.float32), allow_pickle=False)
+    (folder / "sphere_press.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    return Limit(profile, config)
 
 
 def layer_press(repeat: int) -> list[Measurement]:

@@ -71,6 +71,12 @@ def _worth_another(samples: Sequence[float]) -> bool:
     return sum(samples) < BUDGET or (len(samples) < LEAST and max(samples) < DEAR)
 
 
+def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str, float]:
+    """Time of a substep [ns] over the number of particles or elements; all else that a substep does is in it."""
+    each = 1e9 / (substeps * count)
+    return {f"wall_per_{what}_substep_ns": timing.median * each, f"cpu_per_{what}_substep_ns": timing.processor * each}
+
+
 def forget_peak_memory() -> None:
     """Lets `peak_memory` count from what this process holds now. Only Linux can; elsewhere it counts on."""
     references = Path("/proc/self/clear_refs")

@@ -7,7 +7,6 @@ anew. It belongs to the problem, not to a version of the code.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,9 @@ from tacsim.optics.spline import displacement_and_jacobian
 
 Float64 = NDArray[np.float64]
 
+RADIUS = 4e-3  # of the ball [m]
+DEPTH = 1e-3  # of the ball's tip below the undeformed surface [m]
+LIMIT = "limit of h = 0.25 and 0.125 mm"
 FOLDER = Path(__file__).parents[1] / "references"
 GRID_PITCH = 0.25e-3  # of the common grid on which surfaces are compared [m]
 GRID_HALF = 10e-3  # it covers the gel [m]
@@ -64,33 +66,3 @@ def extrapolate(coarse: Float64, middle: Float64, fine: Float64) -> tuple[Float6
         raise ValueError(f"the differences of the three meshes shrink by {ratio:.2f} only; nothing to extrapolate")
     order = float(np.log2(ratio))
     return fine + (fine - middle) / (ratio - 1.0), order
-
-
-def renew(say: Callable[[str], None], folder: Path = FOLDER) -> Limit:
-    """Computes the limit anew and writes it to `folder`: three meshes, the finest takes many minutes."""
-    from benchmarks.cases.press import DEPTH, RADIUS, press, press_scene
-    from tacsim.models.scene import Sphere
-
-    profiles, forces, substeps = [], [], []
-    for element in ELEMENTS:
-        say(f"sphere_press: h = {element * 1e3:g} mm")
-        world, stats = press(press_scene(Sphere(radius=RADIUS), element, tolerance=1e-4), DEPTH)
-        if not stats.settled:
-            raise RuntimeError(f"the press at h = {element} m did not settle: residual {stats.residual:.2g}")
-        profiles.append(surface_profile(world.surface("lower")))
-        forces.append(-float(world.wrench("lower")[2]))
-        substeps.append(stats.substeps)
-    profile, order = extrapolate(*profiles)
-    config = {
-        "what": "u_z [m] of the gel's top surface on a grid of 0.25 mm: ball R 4 mm pressed 1 mm into the default gel "
-        "(20 x 20 x 4 mm, E 0.145 MPa, nu 0.45), friction 0.6; Richardson limit of the two finest meshes",
-        "element_mm": [element * 1e3 for element in ELEMENTS],
-        "order": round(order, 3),
-        "rms_to_limit_um": [round(rms(p - profile) * 1e6, 3) for p in profiles],
-        "force_n": [round(force, 6) for force in forces],
-        "substeps": substeps,
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "sphere_press.npy", profile.astype(np.float32), allow_pickle=False)
-    (folder / "sphere_press.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
-    return Limit(profile, config)

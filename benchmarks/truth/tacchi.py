@@ -18,9 +18,8 @@ import math
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from benchmarks.cases.press import DEPTH, LIMIT, RADIUS
 from benchmarks.harness.measure import Measurement, timed
-from benchmarks.truth.limit import GRID_HALF, load_limit, rms
+from benchmarks.truth.limit import DEPTH, GRID_HALF, LIMIT, RADIUS, load_limit, rms
 from benchmarks.truth.textbook import GridScalars, GridVectors, Matrices, Vectors, clear, mat3, vec3
 from tacsim.compute.runtime import start, ti
 

@@ -6,8 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.cases.materials import CLAY, COURANT, step_cost, uniaxial_stress
-from benchmarks.harness.measure import Measurement, timed
+from benchmarks.harness.measure import Measurement, step_cost, timed
+from benchmarks.truth.clay import CLAY, COURANT, uniaxial_stress
 from tacsim.compute.runtime import start, ti
 
 f32 = ti.f32

@@ -92,10 +92,8 @@ def bench(
         if docs is not None and group is not Groups.robot:
             bench.require_cpu_for_a_page()
         if renew:
-            from benchmarks.truth.limit import renew as compute
-
             with busy("computing the limit of fine meshes"):
-                compute(notes.print)
+                bench.renew(notes.print)
         reports = [bench.measure(group.value, repeat, baselines=baselines, long=long, data=data)]
     bench.show(reports)
     bench.write(reports, json_, docs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,11 @@ films:
 """
 
 
-@pytest.fixture
-def film(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """4 frames at rest, then 8 of a drag to the right that takes a column out of the picture."""
-    frames = tmp_path / "deep" / "dots"
+    root = tmp_path_factory.mktemp("films")
+    frames = root / "deep" / "dots"
     frames.mkdir(parents=True)
     rest = lattice_points(6, 8, 24.0) + (170.0, 80.0)  # the last column 11 px from the border
     rng = np.random.default_rng(0)
@@ -31,8 +33,14 @@ def film(tmp_path: Path) -> Path:
         far = 2.0 * max(0, k - 3)
         image = draw(rest + (far, 0.1 * far) + rng.normal(0, 0.02, rest.shape), 5.0, shape=(160, 266), noise=1.0)
         Image.fromarray(image).save(frames / f"{k}.png")
-    (tmp_path / OWN).write_text(LABELS, encoding="utf-8")
-    return tmp_path
+    (root / OWN).write_text(LABELS, encoding="utf-8")
+    return root
+
+
+@pytest.fixture
+def film(drawn: Path, tmp_path: Path) -> Path:
+    """A copy that a test may spoil."""
+    return shutil.copytree(drawn, tmp_path / "film")
 
 
 def test_dots_are_followed_and_those_that_leave_are_told(film: Path) -> None:
@@ -65,7 +73,7 @@ def test_a_film_without_dots_or_frames_is_named(film: Path) -> None:
         marker_film(labels, path, 1)
 
 
-def test_labels_that_name_what_is_not_there_say_so(film: Path, tmp_path: Path) -> None:
+def test_labels_that_name_what_is_not_there_say_so(film: Path) -> None:
     (film / OWN).write_text(LABELS.replace("dots]", "spots]"), encoding="utf-8")
     with pytest.raises(BadData, match=r"names 'made up', but .* has none of none\.avi, spots"):
         read_films(film)

@@ -132,6 +132,7 @@ def test_a_press_of_known_depth_is_simulated_from_it_alone(folder: Path) -> None
     assert height.figures["peak_ratio"] == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.deep
 def test_scale_and_place_of_a_punch_are_found(folder: Path) -> None:
     (row,) = punches.punch(folder, "block", 1)
     assert row.figures["scale"] == pytest.approx(SCALE, abs=0.021)
@@ -179,6 +180,7 @@ def test_without_light_everything_that_needs_it_says_so(folder: Path, tmp_path: 
         depths.light_of(tmp_path, read_labels(tmp_path))
 
 
+@pytest.mark.deep
 def test_costs_are_measured_beside_their_error() -> None:
     for row in (*observe.calibrated_render(320, 3), *observe.normaliser(3)):
         assert row.timing.median > 0 and len(row.timing.samples) >= 3

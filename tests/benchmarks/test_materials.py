@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from benchmarks.cases import materials
-from benchmarks.cases.materials import CLAY
+from benchmarks.truth.clay import CLAY
 
 
 def orders(errors: list[float]) -> list[float]:
@@ -28,6 +28,7 @@ def test_a_squeezed_cube_yields_at_its_yield_stress_the_nearer_the_finer() -> No
     assert rows[-1].figures["mean_j"] == pytest.approx(math.exp(-CLAY.yield_stress / (3 * bulk)), abs=2e-4)
 
 
+@pytest.mark.deep
 def test_sheared_points_bear_what_they_yield_at() -> None:
     (row,) = materials.simple_shear(1)
     assert row.figures["against_float64_percent"] < 1e-3
@@ -35,6 +36,7 @@ def test_sheared_points_bear_what_they_yield_at() -> None:
     assert row.figures["float64_against_closed_form_percent"] == pytest.approx(row.error, abs=1e-3)
 
 
+@pytest.mark.deep
 def test_waves_run_at_the_speed_of_the_continuum_to_second_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(materials, "HALF_PERIODS", 2)
     for wave, resolutions in ((materials.body_wave, (0.5e-3, 0.25e-3)), (materials.gel_wave, (1e-3, 0.5e-3))):

@@ -47,22 +47,16 @@ def test_median_and_spread() -> None:
     assert Timing((1.0, 9.0), 1.0).spread is None
 
 
-def test_peak_memory_sees_a_large_array_that_is_gone() -> None:
-    before = peak_memory()
-    block = bytearray(int(before * 1e6))
-    block[::4096] = b"x" * len(block[::4096])
-    del block
-    assert peak_memory() > 1.5 * before
-
-
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux forgets a peak")
-def test_a_forgotten_peak_does_not_count_for_the_next_case() -> None:
+def test_peak_memory_sees_a_large_array_that_is_gone_until_it_is_forgotten() -> None:
+    forget_peak_memory()
     before = peak_memory()
-    block = bytearray(int(before * 1e6))
+    block = bytearray(100_000_000)
     block[::4096] = b"x" * len(block[::4096])
     del block
+    assert peak_memory() > before + 50
     forget_peak_memory()
-    assert peak_memory() < 1.3 * before
+    assert peak_memory() < before + 50
 
 
 # Importable by name, as a spawned process needs it: json.loads(3) raises, os._exit(3) dies, time.sleep(30) hangs.
@@ -93,6 +87,7 @@ def test_a_report_says_how_long_each_group_took() -> None:
     assert "group_seconds" not in json_schema()["$defs"]["Metadata"]["required"]  # older reports have none
 
 
+@pytest.mark.deep
 def test_short_cases_of_a_group_share_a_process_wherever_they_stand(tmp_path: Path) -> None:
     def told(name: str, group: Group = "press", **of: bool) -> Case:
         return Case(group, name, "tacsim", "", partial(tell_process, tmp_path / name), **of)
@@ -157,7 +152,7 @@ def test_cases_are_distinct_described_and_importable() -> None:
 
 def test_without_baselines_only_short_cases_of_ours() -> None:
     for group in GROUPS:
-        if group == "real":  # has no cases without frames
+        if group in ("real", "robot"):  # no cases without frames; measured by tests
             continue
         short = chosen([group], baselines=False)
         every = chosen([group], baselines=True, long=True)

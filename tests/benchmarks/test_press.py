@@ -25,6 +25,7 @@ def test_a_balls_dent_is_that_of_fine_meshes() -> None:
     assert row.figures["overlap_um"] < 5
 
 
+@pytest.mark.deep
 def test_a_press_ends_where_a_slow_one_does() -> None:
     settled, *speeds = press.quasi_static(1)
     assert settled.error < 1.2 and settled.figures["force_percent"] < 0.5
@@ -36,6 +37,7 @@ def test_a_press_ends_where_a_slow_one_does() -> None:
         assert (row.substeps > settled.substeps) == (mach < press.USUAL)
 
 
+@pytest.mark.deep
 def test_a_shallow_balls_force_goes_to_that_of_an_elastic_layer(monkeypatch: pytest.MonkeyPatch) -> None:
     """With h^2, within a percent of the layer's."""
     monkeypatch.setattr(press, "FORCE_DEPTHS", (0.3e-3,))
@@ -48,6 +50,7 @@ def test_a_shallow_balls_force_goes_to_that_of_an_elastic_layer(monkeypatch: pyt
     assert limit == pytest.approx(truth, rel=0.015)
 
 
+@pytest.mark.deep
 def test_a_flat_punchs_force_goes_to_that_of_an_elastic_layer() -> None:
     """With h, since the mesh widens the punch by a share of an element; within a percent of the layer's."""
     ((coarse,), (fine,)) = (press.flat_punch(h, 1) for h in (1e-3, 0.5e-3))

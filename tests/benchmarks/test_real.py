@@ -140,6 +140,7 @@ def test_wrong_words_on_the_command_line(folder_of_frames: Folder, tmp_path: Pat
         assert not (tmp_path / "none.json").exists()
 
 
+@pytest.mark.deep
 def test_the_report_of_a_run_has_the_rows(folder_of_frames: Folder, tmp_path: Path) -> None:
     result = tacsim("bench", "real", "--data", folder_of_frames[0], "--json", tmp_path / "real.json")
     assert result.exit_code == 0, result.output

@@ -31,6 +31,7 @@ def test_a_slab_row_tells_what_the_body_itself_went_through() -> None:
     assert row.figures["slab_n"] == pytest.approx(deep.slab_force(30e3, 1e-6, height * 1e-3))
 
 
+@pytest.mark.deep
 def test_a_squeeze_is_judged_by_its_own_limit_and_by_one_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
     limits = {"draft": 4.3, "standard": 4.0}
     monkeypatch.setattr(squeeze, "slow_force", lambda preset, physics="hybrid": limits[preset])
@@ -48,6 +49,7 @@ def test_a_second_world_is_the_first_once_more() -> None:
     assert row.figures["second_ms"] > 0 and row.figures["first_ms"] > 0
 
 
+@pytest.mark.deep
 def test_a_batch_goes_the_way_of_a_world_alone() -> None:
     (row,) = scenes.batch(2, 1)
     assert row.error == 0.0 and row.figures["force_n"] > 0.1
@@ -71,6 +73,7 @@ def test_an_indenter_costs_and_presses(shape: object) -> None:
     assert row.error <= 1.0  # settled to 1 %
 
 
+@pytest.mark.deep
 def test_a_sheared_body_rests_where_it_is() -> None:
     world = touching(squeeze_scene("draft"))
     close(world, 0.3e-3)
@@ -84,6 +87,7 @@ def test_a_sheared_body_rests_where_it_is() -> None:
     assert 0 < abs(after.position - before.position).max() < 5e-6
 
 
+@pytest.mark.deep
 def test_the_plate_slides_until_friction_is_built_up() -> None:
     (row,) = press.sliding_force(1e-3, 1)
     assert row.figures["way_mm"] >= 2

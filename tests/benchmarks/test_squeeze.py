@@ -28,6 +28,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(squeeze, "STEPS", 4)
 
 
+@pytest.mark.deep
 def test_a_squeeze_ends_where_a_slow_one_does() -> None:
     driven, settled, balance, overlap, gap = squeeze.squeeze("draft", "hybrid", 1)
     assert driven.substeps is not None and settled.substeps is not None and driven.substeps < settled.substeps
@@ -39,6 +40,7 @@ def test_a_squeeze_ends_where_a_slow_one_does() -> None:
     assert 0 < overlap.error < 0.02 and 0 <= gap.error < 0.02  # mm
 
 
+@pytest.mark.deep
 def test_a_control_step_ends_near_where_a_slow_one_does() -> None:
     settled, flowing = squeeze.control_step("draft", "hybrid", 1)
     assert settled.note == "" and settled.error < 1.0  # % of force, rms

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.cases import materials, press
-from benchmarks.cases.materials import half_period, momenta, uniaxial_stress
+from benchmarks.cases.materials import half_period, momenta
 from benchmarks.truth import limit, tacchi, textbook
+from benchmarks.truth.clay import uniaxial_stress
 from tacsim.models.scene import GelSurface, Settling, Sphere
 
 
@@ -88,6 +89,7 @@ def test_a_free_body_keeps_its_momentum() -> None:
     assert row.substeps == 5000
 
 
+@pytest.mark.deep
 def test_the_textbook_cube_yields_where_its_coarse_plates_let_it() -> None:
     """Plates of grid nodes see too small a section (dx 0.5 mm on 2 mm): the stress is low, but it is a yield stress."""
     cube, force, _ = textbook.compress(2.0, 0.25)

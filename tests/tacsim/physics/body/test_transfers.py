@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.cases.materials import COURANT
 from benchmarks.truth.blocks import BodyBlock
+from benchmarks.truth.clay import COURANT
 from tacsim.geometry.sampling import body_points
 from tacsim.models.scene import Body, BodyMaterial, Box
 from tacsim.physics.body.material import ELASTIC

@@ -1,0 +1,13 @@
+"""The cube of clay that every method shortens: its material, its time step, and the stress that it must yield at."""
+
+from __future__ import annotations
+
+from tacsim.models.scene import BodyMaterial
+
+CLAY = BodyMaterial(youngs_modulus=0.5e6, poisson_ratio=0.45, yield_stress=30e3)
+COURANT = 0.4
+
+
+def uniaxial_stress(force: float, volume: float, height: float) -> float:
+    """Mean Kirchhoff stress of a prism [Pa]: force [N] over its section, which is its volume [m^3] over its height."""
+    return force * height / volume

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 
-from robot.arm.time_alignment import ArmHistory
+from robot.arm.time_alignment import state_at
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.errors import DeviceError
@@ -40,12 +40,9 @@ class CommandedArm:
         while driver.state().time < at and time.monotonic() < deadline:  # its package is still on the way
             time.sleep(1e-3)
         packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
-        history = ArmHistory(driver.name, max_gap=driver.config.link_timeout)  # a longer gap is a lost link
-        for state in driver.history(packages):
-            history.append(state)
-        aligned = history.at(at)
-        self.alignment = aligned.error
-        return aligned.state
+        max_gap = driver.config.link_timeout  # a longer gap is a lost link
+        state, self.alignment = state_at(at, driver.history(packages), driver.name, max_gap)
+        return state
 
     def command(self, target: Pose | None) -> Pose | None:
         """In a dry run nothing is sent, and None says so."""

@@ -1,7 +1,7 @@
-"""Guards of actions, the same for simulated and real arms: pure functions that refuse or shorten, never silently.
+"""Guards of actions, the same for simulated and real arms, as pure functions.
 
-What is no pose at all (a wrong shape, a number that is not finite) is refused. What is a pose but lies too far is
-shortened on the straight way there, and the caller tells what was really sent.
+A target that is no pose (a wrong shape, a number that is not finite) is refused. One that lies too far is shortened
+along the straight path to it, and the caller reports what was really sent.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tacsim.interface import Action, FloatArray, Pose
 
-FARTHEST = 1e3  # a pose beyond is no target of anything that carries a sensor [m]
-ROUNDING = 1e-9  # of positions: so far outside still is inside [m]
+FARTHEST = 1e3  # from the origin: no sensor is sent beyond [m]
+ROUNDING = 1e-9  # of positions: this far outside still counts as inside [m]
 
 
 class ActionError(ValueError):
@@ -34,7 +34,7 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
     Raises ActionError.
     """
     if not isinstance(action, Action):
-        raise ActionError(f"rig '{rig}' takes a tacsim.interface.Action, got {type(action).__name__}")
+        raise ActionError(f"rig '{rig}' takes a tacsim.Action, got {type(action).__name__}")
     if not isinstance(action.tool, Mapping):
         raise ActionError(
             "Action.tool must be a mapping from arm names to poses, such as {'upper': pose}, "
@@ -45,7 +45,7 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
             names = ", ".join(sorted(movable)) or "(none)"
             raise ActionError(f"action for '{name}', but rig '{rig}' moves only: {names}")
         if target is not None and not isinstance(target, Pose):
-            raise ActionError(f"action for '{name}' must be a tacsim.interface.Pose or None (holds), got {target!r}")
+            raise ActionError(f"action for '{name}' must be a tacsim.Pose or None (holds), got {target!r}")
         if target is not None and np.abs(target.position).max() > FARTHEST:
             raise ActionError(
                 f"target of arm '{name}' is at {target.position.tolist()} m, more than {FARTHEST:g} m from the origin; "
@@ -54,45 +54,26 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
     return action
 
 
-def check_workspace(target: Pose, lower: ArrayLike, upper: ArrayLike, arm: str) -> Pose:
-    """`target`, if its origin lies within the box from `lower` (3,) to `upper` (3,) [m], the faces included.
-
-    Raises ActionError that names the axis; ValueError for a box that has no inside.
-    """
-    least, most = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
-    if least.shape != (3,) or most.shape != (3,) or not (least < most).all():
-        raise ValueError(
-            f"workspace of arm '{arm}' must run from a lower to an upper corner [m], got {lower!r} to {upper!r}"
-        )
-    for axis, value, low, high in zip("xyz", target.position, least, most, strict=True):
-        if not low <= value <= high:
-            raise ActionError(
-                f"target of arm '{arm}' is outside its workspace: {axis} = {value:.6g} m, allowed {low:.6g} to "
-                f"{high:.6g} m; ask for a pose inside, or widen the workspace after checking that nothing stands there"
-            )
-    return target
-
-
-def limit_step(target: Pose, now: Pose, longest: float, widest: float) -> Pose:
-    """`target` itself if it is within `longest` [m] and `widest` [rad] of `now`; otherwise the farthest pose on the
-    straight way there (translation and rotation in step) that is. The caller tells what was really sent.
+def limit_step(target: Pose, now: Pose, max_step: float, max_turn: float) -> Pose:
+    """`target` itself if it is within `max_step` [m] and `max_turn` [rad] of `now`; otherwise the farthest such pose on
+    the straight path to it, translation and rotation in proportion.
 
     Raises ValueError for limits that are not positive.
     """
     from tacsim import pose as se3  # SciPy takes half a second to load; the process that drives an arm needs none of it
 
-    if not longest > 0 or not widest > 0:
-        raise ValueError(f"shorten: limits must be positive, got {longest} m and {widest} rad")
+    if not max_step > 0 or not max_turn > 0:
+        raise ValueError(f"limit_step: limits must be positive, got {max_step} m and {max_turn} rad")
     metres, radians = se3.distance(now, target)
-    excess = max(metres / longest, radians / widest)
-    if excess <= 1.0 + 1e-9:  # rounding of a motion at the limit is none
+    excess = max(metres / max_step, radians / max_turn)
+    if excess <= 1.0 + 1e-9:  # rounding
         return target
     return se3.interpolate(now, target, 1.0 / excess)
 
 
 def finite_targets(targets: ArrayLike) -> NDArray[np.bool_]:
-    """Which of `targets` (..., 7), position [m] and quaternion x y z w, are poses: finite, the position within
-    FARTHEST, the quaternion of unit length within 1e-3. (...,) bool; what has another shape is all False."""
+    """(...,) which of `targets` (..., 7), position [m] and quaternion x y z w, are poses: finite, the position within
+    FARTHEST, the quaternion of unit length within 1e-3. All False for any other shape."""
     try:
         given = np.asarray(targets, dtype=np.float64)
     except (TypeError, ValueError):
@@ -102,8 +83,8 @@ def finite_targets(targets: ArrayLike) -> NDArray[np.bool_]:
     with np.errstate(over="ignore", invalid="ignore"):
         near = (np.abs(given[..., :3]) <= FARTHEST).all(-1)
         unit = np.abs(np.sqrt((given[..., 3:] ** 2).sum(-1)) - 1.0) <= 1e-3
-    sound: NDArray[np.bool_] = near & unit & np.isfinite(given).all(-1)
-    return sound
+    valid: NDArray[np.bool_] = near & unit & np.isfinite(given).all(-1)
+    return valid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,13 +96,12 @@ class Region:
     names: tuple[str, ...]  # of the faces, for messages
 
     def excess(self, points: ArrayLike) -> FloatArray:
-        """(..., 3) points -> (...,) how far outside the farthest face each lies [m]; negative inside."""
-        given = np.asarray(points, dtype=np.float64)
-        deepest: FloatArray = (given @ self.normals.T - self.offsets).max(-1)
-        return deepest
+        """(...,) how far each of `points` (..., 3) lies outside the region [m]; negative inside."""
+        beyond: FloatArray = (np.asarray(points, dtype=np.float64) @ self.normals.T - self.offsets).max(-1)
+        return beyond
 
     def broken(self, point: ArrayLike) -> str:
-        """The face that `point` (3,) breaks most, in words; empty inside."""
+        """The face that `point` (3,) lies farthest beyond, in words; empty inside."""
         beyond = self.normals @ np.asarray(point, dtype=np.float64) - self.offsets
         worst = int(beyond.argmax())
         return "" if beyond[worst] <= ROUNDING else f"{1e3 * beyond[worst]:.3g} mm beyond {self.names[worst]}"
@@ -150,31 +130,24 @@ def region(lower: ArrayLike, upper: ArrayLike, planes: Iterable[tuple[ArrayLike,
     return Region(np.array(normals), np.array(offsets), tuple(names))
 
 
-def fraction_inside(start: ArrayLike, end: ArrayLike, inside: Region) -> float:
-    """How much of the straight way from `start` to `end` (3,) [m] lies in the region, as a fraction from the start.
-
-    From outside, a way that ends inside is free (it only gets better), and any other is closed.
-    """
-    return float(fractions_inside(start, end, inside))
-
-
-def fractions_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> FloatArray:
-    """:func:`fraction_inside` of many ways at once: (..., 3) and (..., 3) -> (...,)."""
+def fraction_inside(starts: ArrayLike, ends: ArrayLike, inside: Region) -> FloatArray:
+    """(...,) how much of each straight path from `starts` to `ends`, (..., 3) [m], lies in the region, as a fraction
+    from the start. A path from outside counts in full if it ends inside, and not at all otherwise."""
     here = np.asarray(starts, dtype=np.float64) @ inside.normals.T - inside.offsets
     there = np.asarray(ends, dtype=np.float64) @ inside.normals.T - inside.offsets
-    shares: FloatArray = np.maximum(-here, 0.0) / (there - here).clip(min=ROUNDING)
-    least: FloatArray = np.where(there > ROUNDING, shares, 1.0).min(-1)
+    fractions: FloatArray = np.maximum(-here, 0.0) / (there - here).clip(min=ROUNDING)
+    least: FloatArray = np.where(there > ROUNDING, fractions, 1.0).min(-1)
     return least
 
 
 def fraction_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance: float) -> float:
-    """How much of the straight way from `start` to `end` (3,) [m] stays `distance` [m] from `centre` (3,), as a
-    fraction from the start. From inside the sphere, a way that leads away from the centre is free."""
-    first, way = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64) - np.asarray(start)
+    """How much of the straight path from `start` to `end` (3,) [m] keeps `distance` [m] from `centre` (3,), as a
+    fraction from the start. A path from inside the sphere counts in full if it leads away from the centre."""
+    first, path = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64) - np.asarray(start)
     from_centre = first - np.asarray(centre, dtype=np.float64)
-    length2, along, gap = float(way @ way), float(way @ from_centre), float(from_centre @ from_centre) - distance**2
+    length2, along, gap = float(path @ path), float(path @ from_centre), float(from_centre @ from_centre) - distance**2
     if along >= 0.0 or length2 == 0.0:
-        return 1.0  # away from it, or on a tangent
+        return 1.0  # away from the centre, or no motion
     if gap <= 0.0:
         return 0.0
     root = along * along - length2 * gap
@@ -182,29 +155,23 @@ def fraction_clear(start: ArrayLike, end: ArrayLike, centre: ArrayLike, distance
 
 
 def clip_to_region(
-    target: Pose, now: Pose, inside: Region | None, apart: Iterable[tuple[ArrayLike, float]] = ()
+    target: Pose, now: Pose, inside: Region | None, spheres: Iterable[tuple[ArrayLike, float]] = ()
 ) -> tuple[Pose, float]:
-    """`target` itself if the whole straight way from `now` lies `inside` (None: anywhere) and keeps clear of the
-    spheres `apart` (centre (3,), distance [m]); otherwise the farthest pose on it that does. Also the fraction of the
-    way that is left."""
-    share = 1.0 if inside is None else fraction_inside(now.position, target.position, inside)
-    for centre, distance in apart:
-        share = min(share, fraction_clear(now.position, target.position, centre, distance))
-    if share >= 1.0:
+    """`target` itself if the straight path from `now` stays `inside` (None: anywhere) and outside the `spheres`
+    (centre (3,), radius [m]); otherwise the farthest pose on it up to which it does. Also that fraction of the path."""
+    fraction = 1.0 if inside is None else float(fraction_inside(now.position, target.position, inside))
+    for centre, radius in spheres:
+        fraction = min(fraction, fraction_clear(now.position, target.position, centre, radius))
+    if fraction >= 1.0:
         return target, 1.0
     from tacsim import pose as se3
 
-    return se3.interpolate(now, target, share), share
-
-
-def stopping_distance(speed: float, deceleration: float) -> float:
-    """v^2 / 2a [m], how far something goes on from `speed` [m/s] that brakes with `deceleration` [m/s^2]."""
-    return speed * speed / (2.0 * deceleration)
+    return se3.interpolate(now, target, fraction), fraction
 
 
 def braking_end(position: ArrayLike, velocity: ArrayLike, deceleration: float) -> FloatArray:
-    """(3,) where something at `position` [m] comes to rest that brakes straight from `velocity` (3,) [m/s]. A box that
-    holds this point is the box shrunk by the stopping distance, on the side one moves to."""
+    """(3,) where something at `position` [m] comes to rest [m] if it brakes straight from `velocity` (3,) [m/s] with
+    `deceleration` [m/s^2]: v^2 / 2a further."""
     moving = np.asarray(velocity, dtype=np.float64)
     speed = float(np.sqrt(moving @ moving))
     rest: FloatArray = np.asarray(position, dtype=np.float64) + moving * (speed / (2.0 * deceleration))
@@ -212,26 +179,27 @@ def braking_end(position: ArrayLike, velocity: ArrayLike, deceleration: float) -
 
 
 def exceeds_wrench(wrench: ArrayLike, force: float, torque: float) -> bool:
-    """True if `wrench` (6,) is heavier than `force` [N] or `torque` [N m], or is not a number: then nothing guards."""
+    """True if `wrench` (6,) exceeds `force` [N] or `torque` [N m], or is not a number: what cannot be measured cannot
+    be guarded."""
     load = np.asarray(wrench, dtype=np.float64).tolist()
     return not (math.hypot(*load[:3]) <= force and math.hypot(*load[3:]) <= torque)
 
 
 def exceeds(value: float, limit: float | None) -> bool:
-    """True if `value` is more than `limit`, or is not a number: then nothing guards. A limit of None is not watched."""
+    """True if `value` exceeds `limit`, or is not a number. Without a limit (None): False."""
     return limit is not None and not value <= limit
 
 
 def joint_step_excess(before: ArrayLike, after: ArrayLike, speed: float, period: float) -> float:
     """How much faster than `speed` [rad/s] the fastest joint goes from `before` to `after` (n,) [rad] within `period`
-    [s]: 1 is at the limit; infinite when a number is none."""
+    [s]: 1 is at the limit; infinite for a number that is not finite."""
     step = np.abs(np.asarray(after, dtype=np.float64) - np.asarray(before, dtype=np.float64))
-    share = float(step.max()) / (speed * period)
-    return share if np.isfinite(share) else float("inf")
+    ratio = float(step.max()) / (speed * period)
+    return ratio if np.isfinite(ratio) else math.inf
 
 
 def segment_distance(a0: ArrayLike, a1: ArrayLike, b0: ArrayLike, b1: ArrayLike) -> float:
-    """The least distance of two straight pieces, from `a0` to `a1` and from `b0` to `b1` (3,) [m].
+    """The least distance [m] between the segments from `a0` to `a1` and from `b0` to `b1` (3,) [m].
 
     Ericson, Real-Time Collision Detection (2005), 5.1.9.
     """

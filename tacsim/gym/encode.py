@@ -118,18 +118,3 @@ def action_from(
     for axis, value in zip(axes, values, strict=True):
         positions[axis.arm] += value * max_step * np.array(axis.direction)
     return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
-
-
-def vector_from(
-    action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
-) -> NDArray[np.float32]:
-    """Inverse of `action_from`: the free part of an action as a vector; an arm that holds gives zeros.
-
-    Motion outside the free axes is not in the vector; components of larger steps lie outside [-1, 1].
-    """
-    values = np.zeros(len(axes), dtype=np.float32)
-    for i, axis in enumerate(axes):
-        target = action.tool.get(axis.arm)
-        if target is not None:
-            values[i] = (target.position - poses[axis.arm].position) @ np.array(axis.direction) / max_step
-    return values

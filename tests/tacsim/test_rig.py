@@ -161,7 +161,7 @@ def test_an_arm_without_target_is_told_to_hold() -> None:
     [
         ({"foot": FORWARD}, "action for 'foot', but rig 'bench' moves only: hand"),
         ({"finger": FORWARD}, "moves only: hand"),  # carried by the hand: address that
-        ({"hand": np.zeros(3)}, "must be a tacsim.interface.Pose or None"),
+        ({"hand": np.zeros(3)}, "must be a tacsim.Pose or None"),
     ],
 )
 def test_an_action_it_cannot_take_moves_nothing(tool: Any, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Every bash and python block of README.md and docs/*.md runs.
+"""Every bash and python block of README.md and docs/*.md runs; `make test` runs the first Python block of each page.
 
 The blocks of one page run in order in one temporary folder, so a later block can use what an earlier one made.
 A block is left out only by a comment right above it: ``<!-- not run: reason -->``.
@@ -84,17 +84,28 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {page.name: tmp_path_factory.mktemp(page.stem) for page in PAGES}
 
 
-@pytest.mark.timeout(LIMIT + 30)
-@pytest.mark.parametrize(
-    "block",
-    [block for block in all_blocks() if block.language in RUN and block.skipped is None],
-    ids=lambda block: f"{block.page}:{block.line}",
-)
-def test_block_runs(block: Block, folders: dict[str, Path]) -> None:
-    status, output = run(block, folders[block.page])
+BLOCKS = [block for block in all_blocks() if block.language in RUN and block.skipped is None]
+FIRST = {block.page: block for block in reversed(BLOCKS) if block.language == "python"}
+
+
+def require_success(block: Block, folder: Path) -> None:
+    status, output = run(block, folder)
     assert status == 0, (
         f"{block.page}:{block.line} ends with {status}:\n{block.code}\n--- its output:\n{output[-4000:]}"
     )
+
+
+@pytest.mark.timeout(LIMIT + 30)
+@pytest.mark.parametrize("page", sorted(FIRST))
+def test_the_first_python_block_of_a_page_runs(page: str, tmp_path: Path) -> None:
+    require_success(FIRST[page], tmp_path)
+
+
+@pytest.mark.deep
+@pytest.mark.timeout(LIMIT + 30)
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: f"{block.page}:{block.line}")
+def test_block_runs(block: Block, folders: dict[str, Path]) -> None:
+    require_success(block, folders[block.page])
 
 
 def test_readme_has_blocks_that_run() -> None:

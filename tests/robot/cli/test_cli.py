@@ -192,6 +192,7 @@ def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tm
     assert result.exit_code == 2 and said in result.stderr
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(
     ("variable", "value", "said"),
     [
@@ -289,6 +290,7 @@ def test_a_full_disk_is_named(tmp_path: Path) -> None:
     assert explain(caught.value) == (f"{tmp_path}: No space left on device", 1)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
     words = ("run", "--steps", "100000", "--task", "reposition", "--out", "r", *TINY)
@@ -309,6 +311,19 @@ def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.S
     assert (tmp_path / "r" / "report.html").exists()
     assert "report.html" in output
     assert "Traceback" not in errors
+
+
+def test_a_signal_in_this_process_ends_the_episode_and_saves_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "import os, signal\nfrom tacsim.interface import Action\n"
+    text += "def act(observation):\n    os.kill(os.getpid(), signal.SIGTERM)\n    return Action({})\n"
+    (tmp_path / "ending.py").write_text(text)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    result = tacsim("run", "--policy", "ending:act", "--steps", "9", "--out", "r", *TINY)
+    assert result.exit_code == 143, result.output
+    assert "stopped by a signal before the last step; what was done is saved" in result.stderr
+    assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 2
 
 
 def _environment() -> dict[str, str]:
@@ -358,11 +373,13 @@ def test_what_the_reproduction_tells() -> None:
     assert image_difference({"a": bright, "b": dark}, {"a": dark, "b": dark}) == 120.0  # no wrap-around of uint8
 
 
+@pytest.mark.deep
 def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
     with pytest.raises(TrialFailed, match=r"squeeze by physics 'magic' failed: KeyError"):
         run_trials([("squeeze", "magic")])
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for the processes in /proc")
 def test_a_signal_ends_the_reproduction_and_its_processes(tmp_path: Path) -> None:
     process = subprocess.Popen(

@@ -102,6 +102,10 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     assert code == 2 and "either --pixel-pitch or --view" in err
     (frames / "background.png").write_bytes(encode_png(pictures["background"]))
     code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "no")
+    assert code == 2 and "all must be of one camera and one setting" in err
+    for name, metric in pictures.items():
+        (frames / f"{name}.png").write_bytes(encode_png(metric))
+    code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "no")
     assert code == 2 and "the view was calibrated on 320 x 240 px" in err
 
 

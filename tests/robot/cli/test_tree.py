@@ -1,0 +1,59 @@
+"""The commands, arguments and options of 0.1.0 are all there still, with the same names, defaults and kinds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from robot.cli import app
+
+ATTRIBUTES = ("required", "multiple", "nargs", "metavar", "min", "max")
+FIXTURE = Path(__file__).resolve().parents[2] / "fixtures" / "cli_0_1_0.json"
+
+
+def tree(command: Any) -> dict[str, Any]:
+    """Commands and parameters below `command`, as JSON can hold them."""
+    options = {
+        (parameter.opts or [parameter.name])[0]: {
+            "opts": [*parameter.opts, *parameter.secondary_opts],
+            "default": str(parameter.default),
+            **{
+                key: getattr(parameter, key, None) for key in ("required", "multiple", "nargs", "metavar", "min", "max")
+            },
+        }
+        for parameter in command.params
+    }
+    commands = {name: tree(each) for name, each in sorted(getattr(command, "commands", {}).items())}
+    return {"parameters": options, "commands": commands}
+
+
+@pytest.mark.deep
+def test_every_command_and_option_of_the_first_release_is_there() -> None:
+    """Made anew by running this file with the code to compare with on PYTHONPATH."""
+    before = json.loads(FIXTURE.read_text(encoding="utf-8"))
+    now = json.loads(json.dumps(tree(typer.main.get_command(app))))
+    missing: list[str] = []
+
+    def compare(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
+        missing.extend(
+            f"{name}: {key}: {told} -> {new['parameters'].get(key)}"
+            for key, told in old["parameters"].items()
+            if new["parameters"].get(key) != told
+        )
+        for key, each in old["commands"].items():
+            if key in new["commands"]:
+                compare(each, new["commands"][key], f"{name} {key}")
+            else:
+                missing.append(f"{name} {key}: the command is gone")
+
+    compare(before, now, "tacsim")
+    assert missing == []
+
+
+if __name__ == "__main__":
+    FIXTURE.parent.mkdir(exist_ok=True)
+    FIXTURE.write_text(json.dumps(tree(typer.main.get_command(app)), sort_keys=True) + "\n", encoding="utf-8")

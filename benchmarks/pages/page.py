@@ -139,7 +139,7 @@ def slowest_group(report: Report) -> list[str]:
     if seconds:
         name += f" ({', '.join(f'{group} {value:.0f} s' for group, value in seconds.items())})"
     slowest = max(seconds.values(), default=None)
-    return targets.lines([], [targets.Target(name, "s", 40, None, lambda rows: slowest)])[0]
+    return targets.Target(name=name, unit="s", must=40).cells(slowest)
 
 
 def _on_device(title: str, reports: Sequence[Report], cpu: Report) -> list[str]:

@@ -229,7 +229,7 @@ def test_each_target_of_the_real_group_finds_its_rows() -> None:
     ]
     first = next(k for k, one in enumerate(TARGETS) if one.name.startswith("ball presses left out"))
     last = next(k for k, one in enumerate(TARGETS) if one.name.startswith("observation with height"))
-    found = {one.name: one.judge(rows)[0] for one in TARGETS[first : last + 1]}
+    found = {one.name: one.find(rows) for one in TARGETS[first : last + 1]}
     assert {name for name, value in found.items() if value is None} == {
         "a ball touched 24 times, against the Cramér-Rao bound"
     }

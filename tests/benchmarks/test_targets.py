@@ -10,7 +10,7 @@ import pytest
 from benchmarks.cases.real import observe, touching
 from benchmarks.cases.registry import CASES
 from benchmarks.harness.schema import Report, Row
-from benchmarks.pages.targets import TARGETS, Target, from_depth, lines, pick, ratio
+from benchmarks.pages.targets import TARGETS, Selection, Target, Verdict, lines
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,45 +29,52 @@ def target(name: str) -> Target:
     return found
 
 
+def judged(name: str, rows: list[Row]) -> tuple[float | None, Verdict]:
+    value = target(name).find(rows)
+    return value, target(name).judge(value)
+
+
 def test_met_missed_and_in_between() -> None:
     seconds = target("press of a ball R 4 mm, 1 mm deep, h 0.5 mm")
     assert (seconds.must, seconds.aim) == (0.3, 0.05)
+    name = seconds.name
     for value, verdict in ((0.31, "missed"), (0.3, "met"), (0.06, "met"), (0.05, "aim met")):
-        assert seconds.judge([row(seconds=value)]) == (value, verdict)
-    assert seconds.judge([]) == (None, "not measured")
-    assert seconds.judge([row(resolution="h 1 mm")])[1] == "not measured"
-    assert seconds.judge([row(method="layer")])[1] == "not measured"
+        assert judged(name, [row(seconds=value)]) == (value, verdict)
+    assert judged(name, []) == (None, "not measured")
+    assert judged(name, [row(resolution="h 1 mm")])[1] == "not measured"
+    assert judged(name, [row(method="layer")])[1] == "not measured"
 
 
 def test_a_ratio_is_of_one_run_and_larger_is_better() -> None:
-    faster = target("... faster than at Tacchi's settings")
+    faster = "... faster than at Tacchi's settings"
     ours, theirs = row(seconds=0.1), row(method="tacchi-settings", resolution="dx 0.129 mm", seconds=20.0)
-    assert faster.judge([ours, theirs]) == (pytest.approx(200.0), "met")
-    assert faster.judge([ours, row(method="tacchi-settings", seconds=9.0)])[1] == "missed"
-    assert faster.judge([ours, row(method="tacchi-settings", seconds=51.0)])[1] == "aim met"
-    assert faster.judge([ours])[1] == faster.judge([theirs])[1] == "not measured"
-    assert ratio(pick("seconds", "a"), pick("seconds", "a"))([row(case="a", seconds=0.0)]) is None
+    assert judged(faster, [ours, theirs]) == (pytest.approx(200.0), "met")
+    assert judged(faster, [ours, row(method="tacchi-settings", seconds=9.0)])[1] == "missed"
+    assert judged(faster, [ours, row(method="tacchi-settings", seconds=51.0)])[1] == "aim met"
+    assert judged(faster, [ours])[1] == judged(faster, [theirs])[1] == "not measured"
+    seconds = Selection(what="seconds", case="a")
+    assert Target(name="b", value=seconds, over=seconds).find([row(case="a", seconds=0.0)]) is None
 
 
 def test_the_worst_row_counts() -> None:
     rows = [row(case="squeeze", variant="settled to 1 %", error=e, resolution=r) for e, r in ((0.2, "a"), (1.4, "b"))]
-    assert target("... force against the slow limit").judge(rows) == (1.4, "missed")
-    assert target("... force against the slow limit").judge(rows[:1]) == (0.2, "aim met")
+    assert judged("... force against the slow limit", rows) == (1.4, "missed")
+    assert judged("... force against the slow limit", rows[:1]) == (0.2, "aim met")
 
 
 def test_figures_of_a_row_and_units() -> None:
     step = row(case="plasticine_alone", figures={"wall_per_particle_substep_ns": 76.0})
-    assert target("plasticine step, 64,000 particles, wall: plasticine alone").judge([step]) == (76.0, "missed")
+    assert judged("plasticine step, 64,000 particles, wall: plasticine alone", [step]) == (76.0, "missed")
     control = row(case="control_step", variant="0.1 mm, flowing, and two images", seconds=0.02)
-    assert target("control step, draft, two images: flowing").judge([control]) == (pytest.approx(20.0), "met")
-    assert target("control step, draft, two images: each one settled").judge([control])[1] == "not measured"
+    assert judged("control step, draft, two images: flowing", [control]) == (pytest.approx(20.0), "met")
+    assert judged("control step, draft, two images: each one settled", [control])[1] == "not measured"
 
 
 def test_only_an_aim() -> None:
-    force = target("gel force, ball against FFT layer, h 0.5 mm")
-    assert force.must is None
-    assert force.judge([row(case="sphere_force", error=1.5)])[1] == "aim missed"
-    assert force.judge([row(case="sphere_force", error=0.5)])[1] == "aim met"
+    force = "gel force, ball against FFT layer, h 0.5 mm"
+    assert target(force).must is None
+    assert judged(force, [row(case="sphere_force", error=1.5)])[1] == "aim missed"
+    assert judged(force, [row(case="sphere_force", error=0.5)])[1] == "aim met"
 
 
 def test_shallow_real_presses_do_not_count() -> None:
@@ -76,12 +83,13 @@ def test_shallow_real_presses_do_not_count() -> None:
                    figures={"depth_mm": depth})  # fmt: skip
 
     rows = [real(0.25, 5.0, "image"), real(0.5, 1.0, "image"), real(1.0, 1.5, "image"), real(1.0, 3.0, "pressure")]
-    assert from_depth(0.5, "error", ": image")(rows) == 1.5
-    assert target("contact radius, our image against real ones").judge(rows)[1] == "met"
-    assert target("contact radius, our contact against labels").judge(rows)[1] == "missed"
-    assert from_depth(0.5, "error", ": image")(rows[:1]) is None
+    image = Selection(what="error", case="contact_radius", ending=": image", from_depth_mm=0.5)
+    assert image(rows) == 1.5
+    assert judged("contact radius, our image against real ones", rows)[1] == "met"
+    assert judged("contact radius, our contact against labels", rows)[1] == "missed"
+    assert image(rows[:1]) is None
     thin = [each.model_copy(update={"resolution": f"gel {8 + index} mm"}) for index, each in enumerate(rows)]
-    assert from_depth(0.5, "error", ": image", "gel 10 mm")(thin) == 1.5
+    assert image.model_copy(update={"gel": "gel 10 mm"})(thin) == 1.5
 
 
 def test_the_table_says_it_in_words() -> None:
@@ -131,12 +139,12 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
         for group, name, method, resolution in keys
         for variant in variants
     ]
-    assert {each.name for each in TARGETS if each.judge(rows)[1] == "not measured"} == NOT_YET
+    assert {each.name for each in TARGETS if each.find(rows) is None} == NOT_YET
 
 
 def test_figures_of_the_published_report_follow_from_its_rows() -> None:
     report = Report.model_validate_json((ROOT / "benchmarks" / "reference.json").read_bytes())
     by = {(r.case, r.method, r.resolution.partition(",")[0]): r for r in report.results}
     ours, theirs = by["sphere_press", "tacsim", "h 0.5 mm"], by["sphere_press", "tacchi-settings", "dx 0.129 mm"]
-    value, _ = target("... faster than at Tacchi's settings").judge(report.results)
+    value, _ = judged("... faster than at Tacchi's settings", report.results)
     assert value == pytest.approx(theirs.seconds / ours.seconds)

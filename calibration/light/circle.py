@@ -16,17 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.light.dent import MAX_RIM_RATIO
+
 Float64 = NDArray[np.float64]
 
-BLUR = 1.5  # of images and of the dent that is fitted [px]: noise of the camera, and the skin of the gel
-REACH = 2.0  # the fit looks at this many times the size of the bright patch
-LEAST = 4.0  # radius of a circle that can be told from noise [px]
-STEEPEST = 0.98  # contact radius over ball radius, at most: beyond it the slope is no number
-EXPLAINED = 0.7  # share of the difference that a ball's dent must explain
+BLUR = 1.5  # of images and of the fitted dent, against noise [px]
+WINDOW = 2.0  # half side of what the fit looks at [half widths of the bright patch]
+MIN_RADIUS = 4.0  # of a circle that differs from noise [px]
+MIN_EXPLAINED = 0.7  # share of the difference that a ball's dent must explain
 
 
 class NoCircle(ValueError):
-    """The image shows no ball's contact."""
+    """No contact of a ball is visible in an image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ def dent_slope(r: Float64, contact: float, ball: float) -> Float64:
 def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_radius: float) -> Circle:
     """Finds the contact of a ball of known radius [px] in `image` (H, W, 3); `reference` is the same without contact.
 
-    Raises ValueError when the two images differ in size, NoCircle when no ball's contact is seen.
+    Raises ValueError when the two images differ in size, NoCircle when no contact of a ball is seen.
     """
     from scipy.optimize import minimize
 
@@ -62,15 +63,15 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
     difference = _blurred(image.astype(np.float64) - reference)
     difference -= np.median(difference, axis=(0, 1))
     x, y, size = _patch(difference)
-    window = round(REACH * size) + 6
+    window = round(WINDOW * size) + 6
     columns = np.arange(max(round(x) - window, 0), min(round(x) + window + 1, image.shape[1]))
     rows = np.arange(max(round(y) - window, 0), min(round(y) + window + 1, image.shape[0]))
     seen = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
     power = float((seen**2).sum()), float(((seen - seen.mean(axis=1, keepdims=True)) ** 2).sum())
-    largest = STEEPEST * ball_radius
+    largest = MAX_RIM_RATIO * ball_radius
 
     def unexplained(guess: Float64) -> float:
-        if not LEAST / 2 < guess[2] < largest:
+        if not MIN_RADIUS / 2 < guess[2] < largest:
             return 2.0
         return _unexplained(seen, power, columns - guess[0], rows - guess[1], float(guess[2]), ball_radius)
 
@@ -81,10 +82,10 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
         options={"xatol": 0.02, "fatol": 1e-7, "maxiter": 400, "initial_simplex": simplex},
     )  # fmt: skip
     explained = 1.0 - float(found.fun)
-    if explained < EXPLAINED or found.x[2] < LEAST:
+    if explained < MIN_EXPLAINED or found.x[2] < MIN_RADIUS:
         raise NoCircle(
-            f"no ball's contact is seen: a dent explains {max(explained, 0.0):.0%} of the difference to the image "
-            f"without contact, {EXPLAINED:.0%} are needed"
+            f"no contact of a ball is seen: a dent explains {max(explained, 0.0):.0%} of the difference to the image "
+            f"without contact, {MIN_EXPLAINED:.0%} are needed"
         )
     return Circle(float(found.x[0]), float(found.x[1]), float(found.x[2]), explained)
 
@@ -102,7 +103,7 @@ def _patch(difference: Float64) -> tuple[float, float, float]:
 
     strength = np.sqrt((difference**2).sum(axis=2))
     if not strength.max() > 0:
-        raise NoCircle("no ball's contact is seen: the image is the one without contact")
+        raise NoCircle("no contact of a ball is seen: the image is the one without contact")
     _, patches = cv2.connectedComponents((strength > 0.5 * strength.max()).astype(np.uint8))
     weight = np.bincount(patches.ravel(), strength.ravel())
     weight[0] = 0.0  # what lies outside all patches

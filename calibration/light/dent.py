@@ -1,4 +1,4 @@
-"""The dent that a ball presses into a gel: the geometry that a photometric calibration takes for truth.
+"""The dent that a ball presses into a gel: what a photometric calibration takes for the true surface.
 
 Inside the contact circle the gel has the ball's slope; outside it the elastic skirt falls off exponentially:
 
@@ -6,7 +6,7 @@ Inside the contact circle the gel has the ball's slope; outside it the elastic s
     s(r) = fraction * a / sqrt(R^2 - a^2) * exp(-(r - a) / length)   r >= a
 
 Length and fraction of the skirt belong to the sensor and are found with the circles. Without a skirt, flanks that are
-bright outside the contact would be taken for contact: shallow presses would read a tenth of their depth.
+bright outside the contact would be taken for contact, and shallow presses would read a tenth of their depth.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
 
-STEEPEST_RIM = 0.98  # contact radius over ball radius, at most: beyond it the slope is no number
+MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite at 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +51,13 @@ def dent_gradient(
 
     a = circle.radius
     if not 0 < a < ball:
-        raise ValueError(f"a contact circle of {a:.1f} px is none of a ball of {ball:.1f} px")
+        raise ValueError(f"a ball of {ball:.1f} px has no contact circle of {a:.1f} px")
     dx, dy = u - circle.x, v - circle.y
     r = np.hypot(dx, dy)
     rim = skirt.fraction * a / np.sqrt(ball**2 - a**2)
     inside = 1.0 / np.sqrt(np.maximum(ball**2 - r**2, ball**2 - a**2))  # slope over r
     outside = rim * np.exp(-np.maximum(r - a, 0.0) / skirt.length) / np.maximum(r, 1e-9)
-    share = (r < a).astype(np.float64) if blur == 0 else ndtr((a - r) / blur)  # of the inside
+    share = (r < a).astype(np.float64) if blur == 0 else ndtr((a - r) / blur)  # that is inside
     steepness = share * inside + (1.0 - share) * outside
     return np.stack([-steepness * dx, -steepness * dy], axis=-1)
 

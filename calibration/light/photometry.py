@@ -1,6 +1,6 @@
 """Weights of a photometric model from labelled presses, and how well they hold for presses that were left out.
 
-Every press keeps only its normal equations. So any number of presses, orders and left-out presses costs one look at
+Every press keeps only its normal equations, so any number of presses, sizes and left-out presses costs one pass over
 the pixels.
 """
 
@@ -18,17 +18,17 @@ from tacsim.models.photometric import normal_terms, position_terms, term_count
 
 Float64 = NDArray[np.float64]
 
-LARGEST = (5, 2)  # degree in the normal, degree in the place: the most that is tried
-ORDERS = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))  # by number of weights, nearly
+LARGEST = (5, 2)  # degree in the normal, degree in the place
+SIZES = ((1, 0), (3, 0), (5, 0), (1, 1), (3, 1), (5, 1), (1, 2), (3, 2), (5, 2))  # degree in the normal, in the place
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3)  # times the mean of the diagonal of the normal equations
-FEW = 3  # presses up to this number cover too little of the image to know how its light varies
+FEW_PRESSES = 3  # up to this number they cover too little of the image for light that varies over it
 FEW_RIDGE = 1e-3
 CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
-WORTH = 0.98  # a larger model must lower the left-out error to this
+MIN_IMPROVEMENT = 0.98  # factor of the left-out error that a larger model must reach
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class ModelSize:
     """Size of a photometric model."""
 
     degree: int
@@ -41,7 +41,7 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Equations:
+class NormalEquations:
     """Normal equations of one press for the terms of LARGEST. Each channel has its own where pixels are saturated in
     one and not in another."""
 
@@ -50,15 +50,15 @@ class Equations:
     power: float  # sum of the squares of the changes of colour
     count: int  # numbers summed
 
-    def __add__(self, other: Equations) -> Equations:
+    def __add__(self, other: NormalEquations) -> NormalEquations:
         """Of the pixels of both."""
-        return Equations(
+        return NormalEquations(
             self.square + other.square, self.right + other.right, self.power + other.power, self.count + other.count
         )
 
-    def __sub__(self, part: Equations) -> Equations:
+    def __sub__(self, part: NormalEquations) -> NormalEquations:
         """Without the pixels of a part."""
-        return Equations(
+        return NormalEquations(
             self.square - part.square, self.right - part.right, self.power - part.power, self.count - part.count
         )
 
@@ -70,24 +70,24 @@ def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: i
     return np.asarray((place[:, :, None] * normal[:, None, :]).reshape(len(gradient), -1), dtype=np.float64)
 
 
-def equations(
+def normal_equations(
     gradient: Float64, u: Float64, v: Float64, change: Float64, lit: NDArray[np.bool_] | None = None
-) -> Equations:
+) -> NormalEquations:
     """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
     and counts; None: all."""
     if lit is None or lit.all():
-        square, right = _normal_equations(gradient, u, v, change)
-        return Equations(square[None], right, float((change**2).sum()), change.size)
+        square, right = _sums(gradient, u, v, change)
+        return NormalEquations(square[None], right, float((change**2).sum()), change.size)
     counted = change * lit
-    square, right = _normal_equations(gradient, u, v, counted)
+    square, right = _sums(gradient, u, v, counted)
     squares = []
-    for burnt in (~lit).T:
-        lost, _ = _normal_equations(gradient[burnt], u[burnt], v[burnt], counted[burnt])
+    for saturated in (~lit).T:
+        lost, _ = _sums(gradient[saturated], u[saturated], v[saturated], counted[saturated])
         squares.append(square - lost)
-    return Equations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
+    return NormalEquations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
 
 
-def _normal_equations(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
+def _sums(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
     """F^T F and F^T `change` for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is a term
     of the normal times one of the place, and of the products of two columns most are the same powers. What is left are
     87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
@@ -136,10 +136,10 @@ def _pairs() -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return where(_powers(degree), _products()), where(_places(position), _places(2 * position))
 
 
-def solve(pixels: Equations, order: Order) -> Float64:
+def solve(pixels: NormalEquations, size: ModelSize) -> Float64:
     """(terms, 3) ridge weights; `pixels`: the sum of all presses that count."""
-    part = _part(pixels, _terms_of(order))
-    return ridge_solution(part.square, part.right, order.ridge)
+    part = _part(pixels, _terms_of(size))
+    return ridge_solution(part.square, part.right, size.ridge)
 
 
 def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
@@ -153,7 +153,7 @@ def ridge_solution(square: Float64, right: Float64, ridge: float) -> Float64:
     return np.asarray(np.linalg.solve(regular, right.T[..., None])[..., 0].T, dtype=np.float64)
 
 
-def left_out_error(presses: Sequence[Equations], ridge: float) -> float:
+def left_out_error(presses: Sequence[NormalEquations], ridge: float) -> float:
     """Root mean square error of each press predicted from all others [relative change of colour]."""
     every = functools.reduce(operator.add, presses)
     error = 0.0
@@ -167,33 +167,30 @@ def left_out_error(presses: Sequence[Equations], ridge: float) -> float:
     return float(np.sqrt(max(error, 0.0) / every.count))
 
 
-def choose_order(presses: Sequence[Equations]) -> Order:
-    """The size of model that the number of presses carries and left-out presses speak for.
-
-    Up to FEW presses: a cubic that is the same everywhere. With more, the smallest model that no larger one betters by
-    more than a little, each with its best ridge.
-    """
-    if len(presses) <= FEW:
-        return Order(3, 0, FEW_RIDGE)
-    best: tuple[float, Order] | None = None
-    for degree, position in sorted(ORDERS, key=lambda order: term_count(*order)):
-        use = _terms_of(Order(degree, position, RIDGES[0]))
+def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
+    """Up to FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
+    is clearly better at predicting left-out presses, each with its best ridge."""
+    if len(presses) <= FEW_PRESSES:
+        return ModelSize(3, 0, FEW_RIDGE)
+    best: tuple[float, ModelSize] | None = None
+    for degree, position in sorted(SIZES, key=lambda size: term_count(*size)):
+        use = _terms_of(ModelSize(degree, position, RIDGES[0]))
         parts = [_part(press, use) for press in presses]
         error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
-        order = Order(degree, position, ridge)
-        if best is None or error < WORTH * best[0]:
-            best = (error, order)
+        size = ModelSize(degree, position, ridge)
+        if best is None or error < MIN_IMPROVEMENT * best[0]:
+            best = (error, size)
     assert best is not None
     return best[1]
 
 
-def _part(of: Equations, use: list[int]) -> Equations:
+def _part(of: NormalEquations, use: list[int]) -> NormalEquations:
     """The equations of some of the terms."""
-    return Equations(of.square[:, use][:, :, use], of.right[use], of.power, of.count)
+    return NormalEquations(of.square[:, use][:, :, use], of.right[use], of.power, of.count)
 
 
-def _terms_of(order: Order) -> list[int]:
-    """Where the terms of `order` stand among those of LARGEST."""
-    normals, all_normals = term_count(order.degree, 0), term_count(LARGEST[0], 0)
-    places = term_count(1, order.position) // term_count(1, 0)
+def _terms_of(size: ModelSize) -> list[int]:
+    """Where the terms of `size` stand among those of LARGEST."""
+    normals, all_normals = term_count(size.degree, 0), term_count(LARGEST[0], 0)
+    places = term_count(1, size.position) // term_count(1, 0)
     return [place * all_normals + term for place in range(places) for term in range(normals)]

@@ -1,4 +1,4 @@
-"""Presses of a ball, judged one by one while a person is still there to press again."""
+"""Presses of a ball, each judged while a person is still there to press again."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
-from calibration.light.calibrator import find_press, untouched_mean
 from calibration.light.circle import NoCircle
 from calibration.light.dent import ContactCircle
+from calibration.light.press import find_press, untouched_mean
 
 Image = NDArray[np.uint8]
 
-APART = 0.5  # two presses are in one place if their centres are nearer than this share of the larger contact's radius
+MIN_SEPARATION = 0.5  # of two presses' centres [larger contact radius]
 THIRDS = ("left", "middle", "right"), ("top", "middle", "bottom")
 
 
 class PressCollection:
-    """Presses that were taken so far.
+    """The presses so far.
 
     Args:
         reference: (H, W, 3) uint8 RGB, the native picture without contact.
         ball: radius of the ball [px of the metric picture].
         rectify: native picture -> metric one; None: they are the same.
 
-    Raises BadFrames for a picture that nothing can be measured against.
+    Raises BadFrames for a reference that is dark or saturated.
     """
 
     def __init__(self, reference: Image, ball: float, rectify: Callable[[Image], Image] | None = None) -> None:
@@ -39,11 +39,11 @@ class PressCollection:
 
     @property
     def circles(self) -> tuple[ContactCircle, ...]:
-        """Of the presses that were taken, in the metric picture [px]."""
+        """Contacts of the presses so far, in the metric picture [px]."""
         return tuple(self._circles)
 
     def offer(self, image: Image) -> ContactCircle:
-        """Takes a native picture and returns its contact, or raises BadFrames with why it is not taken."""
+        """Takes a native picture and returns its contact; raises BadFrames with why it is refused."""
         try:
             circle = find_press("press", self._rectify(image), self._reference, self._mean, self._ball).circle
         except NoCircle as none:
@@ -52,13 +52,13 @@ class PressCollection:
         if min(circle.x, circle.y, width - 1 - circle.x, height - 1 - circle.y) < circle.radius:
             raise BadFrames("the contact is cut off by the border of the picture; press nearer to the middle")
         for number, other in enumerate(self._circles, start=1):
-            if math.hypot(circle.x - other.x, circle.y - other.y) < APART * max(circle.radius, other.radius):
+            if math.hypot(circle.x - other.x, circle.y - other.y) < MIN_SEPARATION * max(circle.radius, other.radius):
                 raise BadFrames(f"it is in the same place as press {number}; press elsewhere")
         self._circles.append(circle)
         return circle
 
     def next_place(self) -> str:
-        """Where in the picture a press tells most: of its nine parts the one farthest from all presses so far."""
+        """Where to press next: of the nine parts of the picture the one farthest from all presses so far."""
         height, width = self._reference.shape[:2]
         best, place = -1.0, "middle"
         for row in (1, 0, 2):  # the middle first

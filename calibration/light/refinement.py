@@ -2,7 +2,7 @@
 
 The weights of the light are linear given the geometry, so they are eliminated (variable projection, Golub and Pereyra
 1973; Kaufman's approximation): Levenberg-Marquardt steps on three numbers a press and two of the skirt lower the
-difference of colour that no light explains. No light is assumed, and nobody has to click circles exactly.
+difference of colour that no light explains. No light is assumed, and circles need not be exact at first.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.dent import STEEPEST_RIM, ContactCircle, Skirt, dent_gradient
+from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, Skirt, dent_gradient
 from calibration.light.photometry import features
 
 Float64 = NDArray[np.float64]
 
 DEGREE = 3  # of the light during refinement, the same everywhere on the gel
 RIDGE = 1e-4
-BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
-STEPS = 25
-ENOUGH = 1e-4  # relative gain of a step that ends the refinement
-DELTA = 0.05  # step of the finite differences [px]; of the skirt relative to it
-SKIRTS = [(length, fraction) for length in (0.1, 0.25, 0.5, 0.9) for fraction in (0.6, 1.0)]  # first looks, in balls
-LENGTHS = (0.02, 2.0)  # bounds of the skirt's length, in ball radii
-FRACTIONS = (0.1, 1.5)
+RIM_BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
+MAX_STEPS = 25
+MIN_GAIN = 1e-4  # relative gain of a step, below which the refinement ends
+DELTA = 0.05  # step of finite differences [px]; of the skirt, relative
+FIRST_SKIRTS = [(length, fraction) for length in (0.1, 0.25, 0.5, 0.9) for fraction in (0.6, 1.0)]  # [ball radii, -]
+LENGTH_BOUNDS = (0.02, 2.0)  # of the skirt [ball radii]
+FRACTION_BOUNDS = (0.1, 1.5)  # of the skirt [-]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """What the refinement looks at of one press: n pixels round its contact."""
+    """The n pixels of one press that take part."""
 
     u: Float64  # (n,) columns [px]
     v: Float64  # (n,) rows [px]
@@ -39,26 +39,26 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True)
-class Refined:
+class RefinedGeometry:
     """Geometry of all presses."""
 
     circles: tuple[ContactCircle, ...]
     skirt: Skirt
-    unexplained: tuple[float, ...]  # share of the power of each press's change of colour that the light leaves
-    total: float  # the same of all presses together
+    unexplained: tuple[float, ...]  # share of the power of each press's change of colour
 
 
-def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: float) -> Refined:
+def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: float) -> RefinedGeometry:
     """Refines the circles; `ball`: radius [px].
 
     Fixed windows, so that two states compare: they are cut round `start` and stay.
     """
     first = [
-        _Problem(windows, tuple(start), Skirt(length * ball, fraction), ball).solved() for length, fraction in SKIRTS
+        _Problem(windows, tuple(start), Skirt(length * ball, fraction), ball).solved()
+        for length, fraction in FIRST_SKIRTS
     ]
     state = min(first, key=lambda problem: problem.cost)
     damping = 1e-2
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         gradient, curvature = state.normal_equations()
         for _ in range(8):
             step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-12), -gradient)
@@ -70,12 +70,12 @@ def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: floa
             break
         gain = 1.0 - trial.cost / state.cost
         state, damping = trial, damping / 3
-        if gain < ENOUGH:
+        if gain < MIN_GAIN:
             break
     parts = state.part_costs()
     powers = [float((window.change**2).sum()) for window in windows]
     shares = tuple(part / max(power, 1e-300) for part, power in zip(parts, powers, strict=True))
-    return Refined(state.circles, state.skirt, shares, sum(parts) / max(sum(powers), 1e-300))
+    return RefinedGeometry(state.circles, state.skirt, shares)
 
 
 @dataclass(slots=True, eq=False)
@@ -109,10 +109,10 @@ class _Problem:
 
     def normal_equations(self) -> tuple[Float64, Float64]:
         """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then log length and
-        fraction of the skirt. The light's answer to a motion is projected out."""
+        fraction of the skirt. What the light can explain is projected out."""
         count = 3 * len(self.circles) + 2
         gradient, curvature = np.zeros(count), np.zeros((count, count))
-        onto = np.zeros((3, count, len(self._square)))  # by channel: what the light could take over
+        onto = np.zeros((3, count, len(self._square)))  # by channel: what the weights of the light could explain
         longer = replace(self.skirt, length=self.skirt.length * np.exp(DELTA))
         stronger = replace(self.skirt, fraction=self.skirt.fraction + DELTA)
         for i, circle in enumerate(self.circles):
@@ -124,7 +124,7 @@ class _Problem:
                 self._features(i, circle, stronger),
             ]
             signs = (1, 1, -1, 1, 1)
-            # how the residual moves: (5, n, 3)
+            # of the residual: (5, n, 3)
             slopes = np.stack(
                 [-(m - self._terms[i]) @ self._weights * (s / DELTA) for m, s in zip(moved, signs, strict=True)]
             )
@@ -139,19 +139,19 @@ class _Problem:
     def moved(self, step: Float64) -> _Problem:
         circles = tuple(
             ContactCircle(
-                circle.x + dx, circle.y + dy, float(np.clip(circle.radius + dr, 1.0, STEEPEST_RIM * self.ball))
+                circle.x + dx, circle.y + dy, float(np.clip(circle.radius + dr, 1.0, MAX_RIM_RATIO * self.ball))
             )
             for circle, (dx, dy, dr) in zip(self.circles, np.clip(step[:-2].reshape(-1, 3), -4, 4), strict=True)
         )
         length = self.skirt.length * np.exp(np.clip(step[-2], -0.5, 0.5))
         skirt = Skirt(
-            float(np.clip(length, LENGTHS[0] * self.ball, LENGTHS[1] * self.ball)),
-            float(np.clip(self.skirt.fraction + np.clip(step[-1], -0.3, 0.3), *FRACTIONS)),
+            float(np.clip(length, LENGTH_BOUNDS[0] * self.ball, LENGTH_BOUNDS[1] * self.ball)),
+            float(np.clip(self.skirt.fraction + np.clip(step[-1], -0.3, 0.3), *FRACTION_BOUNDS)),
         )
         return _Problem(self.windows, circles, skirt, self.ball)
 
     def _features(self, i: int, circle: ContactCircle, skirt: Skirt) -> Float64:
         window = self.windows[i]
         return features(
-            dent_gradient(window.u, window.v, circle, skirt, self.ball, BLUR), window.u, window.v, DEGREE, 0
+            dent_gradient(window.u, window.v, circle, skirt, self.ball, RIM_BLUR), window.u, window.v, DEGREE, 0
         )

@@ -1,4 +1,4 @@
-"""A picture of how well a calibration predicts the presses that it has not seen."""
+"""A picture of how well each press is predicted by a calibration made without it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from calibration.light.calibrator import LightFit
 
-MOST = 8  # presses that are drawn, the worst first
-REACH = 2.0  # contact radii round the middle
+MAX_PRESSES = 8  # drawn, the worst first
+HALF_SIDE = 2.0  # of what is drawn [contact radii]
 
 
 def draw(fit: LightFit, path: Path) -> None:
@@ -17,13 +17,13 @@ def draw(fit: LightFit, path: Path) -> None:
     error, all in one scale. Raises ValueError for a fit of one press, which is predicted by none; OSError."""
     from matplotlib.figure import Figure
 
-    scores = sorted(fit.scores, key=lambda score: -score.error)[:MOST]
+    scores = sorted(fit.scores, key=lambda score: -score.error)[:MAX_PRESSES]
     if not scores:
         raise ValueError("a calibration from one press leaves none out: there is nothing to draw")
     figure = Figure(figsize=(6.4, 1.9 * len(scores)), layout="constrained")
     axes = figure.subplots(len(scores), 3, squeeze=False)
     for row, score in zip(axes, scores, strict=True):
-        reach = REACH * score.circle.radius
+        reach = HALF_SIDE * score.circle.radius
         rows = slice(max(0, round(score.circle.y - reach)), round(score.circle.y + reach) + 1)
         columns = slice(max(0, round(score.circle.x - reach)), round(score.circle.x + reach) + 1)
         seen, predicted = score.real[rows, columns], score.predicted[rows, columns]

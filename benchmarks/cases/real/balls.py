@@ -139,8 +139,8 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
         **_interval("grey", [score.error for score in scores]),
         "presses": float(len(scores)),
         "left_out": float(len(fit.left_out)),
-        "weights": 3.0 * fit.order.terms,
-        "steepest": fit.steepest,
+        "weights": 3.0 * fit.size.terms,
+        "steepest": fit.forward.steepest,
     }
     picture = Measurement(
         timing, _mean(scores, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; light "

@@ -311,10 +311,10 @@ def _show(fit: LightFit, pitch: float) -> None:
         )  # fmt: skip
         columns = ("frame", "contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]")
         show_table("Each press predicted by all the others", columns, rows, left={0})
-    order = fit.order
+    size = fit.size
     results.print(
-        f"model: degree {order.degree} in the normal, {order.position} in the place; calibrated up to a slope of "
-        f"{fit.steepest:.2f}; skirt {fit.skirt.length * pitch * 1e3:.2f} mm x {fit.skirt.fraction:.2f}"
+        f"model: degree {size.degree} in the normal, {size.position} in the place; calibrated up to a slope of "
+        f"{fit.forward.steepest:.2f}; skirt {fit.skirt.length * pitch * 1e3:.2f} mm x {fit.skirt.fraction:.2f}"
     )
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)

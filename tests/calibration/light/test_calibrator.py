@@ -132,7 +132,7 @@ def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None
 
 def test_one_press_gives_a_plain_model_and_a_warning(sensor: HiddenSensor) -> None:
     fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, 130, 100)]), BALL_PX)
-    assert (fit.order.degree, fit.order.position) == (3, 0)
+    assert (fit.size.degree, fit.size.position) == (3, 0)
     assert fit.scores == ()
     assert any("only one press" in warning for warning in fit.warnings)
     assert angle_in_contact(fit, sensor.press(0.45e-3, 110, 110)) < 2.0

@@ -7,11 +7,11 @@ import pytest
 
 from calibration.light.photometry import (
     LARGEST,
-    Order,
-    choose_order,
-    equations,
+    ModelSize,
+    choose_size,
     features,
     left_out_error,
+    normal_equations,
     ridge_solution,
     solve,
 )
@@ -29,7 +29,7 @@ def test_the_sums_are_those_of_the_terms(chunk: int, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("calibration.light.photometry.CHUNK", chunk)
     gradient, u, v, change = _pixels(0)
     terms = features(gradient, u, v, *LARGEST)
-    found = equations(gradient, u, v, change)
+    found = normal_equations(gradient, u, v, change)
     np.testing.assert_allclose(found.square[0], terms.T @ terms, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.right, terms.T @ change, rtol=1e-9, atol=1e-12)
     assert found.count == change.size and found.power == pytest.approx((change**2).sum())
@@ -39,7 +39,7 @@ def test_a_saturated_channel_leaves_the_others_their_pixels() -> None:
     gradient, u, v, change = _pixels(1)
     lit = np.random.default_rng(2).random(change.shape) > (0.1, 0.4, 0.0)
     terms = features(gradient, u, v, *LARGEST)
-    found = equations(gradient, u, v, change, lit)
+    found = normal_equations(gradient, u, v, change, lit)
     for channel, seen in enumerate(lit.T):
         np.testing.assert_allclose(found.square[channel], terms[seen].T @ terms[seen], rtol=1e-7, atol=1e-10)
         np.testing.assert_allclose(found.right[:, channel], terms[seen].T @ change[seen, channel], rtol=1e-7, atol=1e-9)
@@ -50,20 +50,20 @@ def test_left_out_presses_are_predicted_by_all_others() -> None:
     """The long way: each press's pixels left out of the fit, and predicted pixel by pixel."""
     sets = [_pixels(seed) for seed in range(4)]
     lit = np.random.default_rng(9).random(sets[0][3].shape) > 0.2  # one press has saturated pixels, the others none
-    presses = [equations(*pixels, lit if i == 2 else None) for i, pixels in enumerate(sets)]
-    order, squares, count = Order(*LARGEST, 1e-4), 0.0, 0
+    presses = [normal_equations(*pixels, lit if i == 2 else None) for i, pixels in enumerate(sets)]
+    size, squares, count = ModelSize(*LARGEST, 1e-4), 0.0, 0
     for left_out, pixels in enumerate(sets):
         terms = features(*pixels[:3], *LARGEST)
         others = [press for i, press in enumerate(presses) if i != left_out]
-        weights = ridge_solution(sum(o.square for o in others), sum(o.right for o in others), order.ridge)
+        weights = ridge_solution(sum(o.square for o in others), sum(o.right for o in others), size.ridge)
         error = (terms @ weights - pixels[3]) * (lit if left_out == 2 else 1.0)
         squares, count = squares + float((error**2).sum()), count + (int(lit.sum()) if left_out == 2 else error.size)
         every = presses[0] + presses[1] + presses[2] + presses[3]
-        np.testing.assert_allclose(solve(every - presses[left_out], order), weights, rtol=1e-6, atol=1e-9)
-    assert left_out_error(presses, order.ridge) == pytest.approx(np.sqrt(squares / count), rel=1e-9)
+        np.testing.assert_allclose(solve(every - presses[left_out], size), weights, rtol=1e-6, atol=1e-9)
+    assert left_out_error(presses, size.ridge) == pytest.approx(np.sqrt(squares / count), rel=1e-9)
 
 
-def test_the_order_is_as_large_as_the_presses_speak_for() -> None:
+def test_the_size_is_as_large_as_the_presses_speak_for() -> None:
     """Light that is a cubic of the normal and varies along u, of which 8 presses tell; 2 say a cubic at best."""
     rng = np.random.default_rng(4)
     weights = rng.normal(0, 0.5, (term_count(3, 1), 3))
@@ -71,11 +71,11 @@ def test_the_order_is_as_large_as_the_presses_speak_for() -> None:
     for seed in range(8):
         gradient, u, v, _ = _pixels(seed, 3000)
         change = features(gradient, u, v, 3, 1) @ weights + rng.normal(0, 0.02, (3000, 3))
-        presses.append(equations(gradient, u, v, change))
-    chosen = choose_order(presses)
+        presses.append(normal_equations(gradient, u, v, change))
+    chosen = choose_size(presses)
     assert (chosen.degree, chosen.position) == (3, 1)
     every = presses[0]
     for press in presses[1:]:
         every = every + press
     np.testing.assert_allclose(solve(every, chosen), weights, atol=0.1)
-    assert (choose_order(presses[:2]).degree, choose_order(presses[:2]).position) == (3, 0)
+    assert (choose_size(presses[:2]).degree, choose_size(presses[:2]).position) == (3, 0)

@@ -1,0 +1,112 @@
+"""One press of a ball: its contact circle, about, and how it has changed the colour of the gel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import BadFrames
+from calibration.light.circle import contact_circle
+from calibration.light.dent import MAX_RIM_RATIO, ContactCircle
+from calibration.reference import SATURATED, UnusableReference, make_reference
+from tacsim.models.photometric import place_in_image
+
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+NEAR = 2.3  # contact and skirt reach this far [contact radii]
+FAR = 3.0  # beyond, the gel is untouched [contact radii]
+MIN_UNTOUCHED_SHARE = 0.15  # of the picture, for a drift that varies over it
+MAX_SATURATED_SHARE = 0.4  # of the contact
+SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallPress:
+    """One frame that a calibration is made from."""
+
+    name: str
+    circle: ContactCircle
+    change: Float64  # (H, W, 3) relative change of colour, without drift
+    drift: Float64  # (H, W, 3) drift of the light since the reference [grey levels]
+    lit: NDArray[np.bool_]  # (H, W, 3) not saturated
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (self.lit.shape[0], self.lit.shape[1])
+
+    def distance(self) -> Float64:
+        """(H, W) from the middle of the contact [px]."""
+        v, u = np.mgrid[: self.shape[0], : self.shape[1]]
+        return np.asarray(np.hypot(u - self.circle.x, v - self.circle.y), dtype=np.float64)
+
+
+def untouched_mean(reference: Image) -> Float64:
+    """(3,) mean colour of a picture without contact. Raises BadFrames for one that is dark or saturated."""
+    try:
+        base = make_reference(reference.astype(np.float32), np.ones(reference.shape[:2], dtype=np.bool_))
+    except UnusableReference as error:
+        raise BadFrames(str(error)) from None
+    return base.mean.astype(np.float64)
+
+
+def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> BallPress:
+    """Contact circle of one frame, about, and its change of colour without drift.
+
+    Args:
+        image, reference: (H, W, 3) uint8 RGB with and without contact; `mean` (3,) of the reference.
+        ball: radius of the ball [px].
+
+    Raises NoCircle, BadFrames.
+    """
+    raw = image.astype(np.float64) - reference
+    half = contact_circle(_halved(image), _halved(reference), ball / 2)
+    circle = ContactCircle(2 * half.x + 0.5, 2 * half.y + 0.5, min(2 * half.radius, 0.95 * MAX_RIM_RATIO * ball))
+    height, width = reference.shape[:2]
+    if not (0 <= circle.x < width and 0 <= circle.y < height):
+        raise BadFrames("the middle of the contact lies outside the picture")
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    distance = np.hypot(u - circle.x, v - circle.y)
+    lit = (image < SATURATED) & (reference < SATURATED)
+    drift = _drift(raw, (distance > NEAR * circle.radius) & lit.all(axis=2))
+    contact = distance < circle.radius
+    saturated = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
+    if saturated > MAX_SATURATED_SHARE:
+        raise BadFrames(f"{saturated:.0%} of the contact is saturated: shorten the exposure or press less")
+    change = (raw - drift) / mean
+    strength = np.abs(smooth(change, 3.0)).max(axis=2)
+    inside = strength[distance < 1.5 * circle.radius].max()
+    if strength[distance > FAR * circle.radius].max(initial=0.0) > SECOND_CONTACT * inside:
+        raise BadFrames("there is a second contact in the picture; press one ball at a time")
+    return BallPress(name, circle, change, drift, lit)
+
+
+def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:
+    """(H, W, 3) change between reference and frame where nothing touches: a quadratic in the place, or its median
+    where too little is untouched."""
+    if untouched.mean() < MIN_UNTOUCHED_SHARE:
+        level = np.median(difference[untouched], axis=0) if untouched.any() else np.zeros(3)
+        return np.broadcast_to(level, difference.shape).copy()
+    u, v = np.meshgrid(*place_in_image(difference.shape[1], difference.shape[0]))
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    seen = terms[untouched]
+    weights = np.linalg.solve(seen.T @ seen, seen.T @ difference[untouched])
+    quadratic: Float64 = terms @ weights
+    return quadratic
+
+
+def smooth(image: Float64, deviation: float) -> Float64:
+    """Blurred by a Gaussian of this standard deviation [px]."""
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), deviation), dtype=np.float64)
+
+
+def _halved(image: Image) -> Image:
+    import cv2
+
+    size = (image.shape[1] // 2, image.shape[0] // 2)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

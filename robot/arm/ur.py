@@ -1,8 +1,8 @@
-"""A Universal Robots arm behind the contract. The work is done by a process of its own (robot.arm.worker); this side
-starts it, reads its records, writes commands, and turns what can go wrong into errors that say what to do.
+"""The driver of a Universal Robots arm. A worker process (robot.arm.worker) controls the arm; the driver starts it,
+reads its state records, writes commands, and raises errors that say what to do.
 
-The guards here are for the work, not for people: they are no safety function. Safety planes, speed and force limits
-belong into the safety configuration on the pendant.
+The limits here protect the experiment, not people: they are no safety function. Safety planes, speed and force limits
+belong in the safety configuration on the pendant.
 """
 
 from __future__ import annotations
@@ -23,15 +23,12 @@ from robot.arm.channel import (
     ArmStatus,
     Channel,
     CommandKind,
-    Partner,
-    WorkerConfig,
     command_record,
     tactile_record,
 )
 from robot.arm.dashboard import Dashboard
-from robot.common import MOCK_SERIAL
-from robot.common.kinematics import Kinematics, pose
-from robot.common.loopback import is_loopback
+from robot.arm.worker_config import check_host, worker_config
+from robot.common.kinematics import Kinematics
 from robot.common.process import Child
 from robot.common.tcp import pose_of
 from robot.errors import (
@@ -47,10 +44,10 @@ from tacsim.limits import ActionError, check_action, clip_to_region
 from tacsim.models.hardware import UrArmConfig
 
 CONNECT_TIMEOUT = 10.0  # of the constructor and of recover [s]
-CLOSE_TIMEOUT = 1.2  # for the worker to ramp down and end its program; then it is killed [s]
-POLL = 2e-3  # how often the worker's records are looked at while waiting [s]
-PARTNER_PATIENCE = 0.5  # how long a command waits for the other arm of a keep-out to be seen [s]
-REST_SPEED, REST_TURN = 1e-3, 10e-3  # slower than this is standing still [m/s, rad/s]
+CLOSE_TIMEOUT = 1.2  # for the worker to brake and end its program; then it is killed [s]
+POLL = 2e-3  # between two looks at the worker's records while waiting [s]
+PARTNER_PATIENCE = 0.5  # how long a command waits for the state of the other arm of a keep-out [s]
+REST_SPEED, REST_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,18 +57,18 @@ class Timing:
     median: float  # of the period [s]
     p99: float
     longest: float
-    overruns: int  # periods that were missed, ever
-    cycles: int  # periods, ever
+    overruns: int  # missed periods of this worker
+    cycles: int  # periods of this worker
 
 
 class URArm:
     """One UR arm, real or mock; implements tacsim.interface.Arm. A context manager.
 
     Args:
-        facts: where it is, what it carries, what it may do.
-        name: in messages; no other open arm of this process may have it.
-        keep_out: least distance [m] of the sensors' origins to the arms of these names. The arm stands still until it
-            can see them.
+        config: its address, what it carries, its limits.
+        name: in messages; unique among the open arms of this process.
+        keep_out: minimum distance [m] of its sensor's origin to those of the arms of these names. The arm does not move
+            until their state is known.
         timeout: of connecting [s].
 
     Connecting moves nothing. Raises, within `timeout`: DeviceNotConnectedError, DeviceBusyError (another program
@@ -87,7 +84,7 @@ class URArm:
         keep_out: Mapping[str, float] | None = None,
         timeout: float = CONNECT_TIMEOUT,
     ) -> None:
-        _check_host(config, name)
+        check_host(config, name)
         self.name, self.config, self._timeout = name, config, timeout
         self._region = config.limits.region
         self._kinematics = Kinematics(config.model)
@@ -100,7 +97,7 @@ class URArm:
         except FileExistsError as failure:
             raise DeviceAlreadyConnectedError(f"arm '{name}' is open already; close it first") from failure
         self._channel = Channel(self._segment)
-        self._worker_config = _worker_config(config, name, self._segment.name, keep_out or {})
+        self._worker_config = worker_config(config, name, self._segment.name, keep_out or {})
         self._frames = self._worker_config.frames
         self._others: dict[str, Channel] = {}
         try:
@@ -112,10 +109,10 @@ class URArm:
             self.close()
             raise
 
-    # -- what it says --------------------------------------------------------------------------------------------
+    # -- state ---------------------------------------------------------------------------------------------------
 
     def status(self) -> ArmStatus:
-        """How the arm is now; never raises."""
+        """What the arm is doing now; never raises."""
         if self._closed:
             return ArmStatus.CLOSED
         ended = self._worker is None or not self._worker.running
@@ -129,18 +126,18 @@ class URArm:
         return last
 
     def explain(self) -> str:
-        """The status in words, with the numbers that belong to it."""
+        """The status in words, with its numbers."""
         return self._explain(self.status())
 
     def state(self) -> ArmState:
-        """The newest package. A stopped arm still tells its state.
+        """The newest package, also of a stopped arm.
 
-        Raises StaleObservationError when there is none within `link_timeout`, DeviceNotConnectedError without a worker.
+        Raises StaleObservationError when it is older than `link_timeout`, DeviceNotConnectedError without a worker.
         """
         return self._state(self._record())
 
     def history(self, number: int = HISTORY - 1) -> list[ArmState]:
-        """The last packages, oldest first, at most `number`; two seconds are kept. Also those of a lost link."""
+        """The last packages, oldest first, at most `number` (two seconds are kept); also after a lost link."""
         return [self._state(record) for record in self._packages(number)]
 
     def at_rest(self) -> bool:
@@ -160,14 +157,14 @@ class URArm:
         median, p99, longest = record["period"].tolist()
         return Timing(median, p99, longest, int(record["overruns"]), int(record["cycles"]))
 
-    # -- what it is asked ----------------------------------------------------------------------------------------
+    # -- commands ------------------------------------------------------------------------------------------------
 
     def command(self, target: Pose | None) -> Pose | None:
-        """Asks for `target` (world_from_sensor); None holds. Returns the pose that is really asked of the arm: a target
-        outside the workspace, or too near to another arm, is shortened on the straight way there.
+        """Moves towards `target` (world_from_sensor); None holds. Returns the pose that is sent: a target outside the
+        workspace, or too near to another arm, is clipped on the straight path there.
 
-        Must come again within `action_timeout`, else the arm holds. Raises ActionError for what is no pose or out of
-        the arm's reach, and the error of its status (ProtectiveStop, EmergencyStop, SafetyViolation, LinkLost,
+        Must be repeated within `action_timeout`, else the arm holds. Raises ActionError for what is not a pose or is
+        out of reach, and the error of its status (ProtectiveStop, EmergencyStop, SafetyViolation, LinkLost,
         DeviceNotConnectedError) when it cannot follow; then only `recover` helps.
         """
         with self._lock:
@@ -189,21 +186,21 @@ class URArm:
             return allowed
 
     def stop(self) -> None:
-        """Brakes to rest within the limits; the next command goes on from there. A faulty arm stands already."""
+        """Brakes to rest within the limits; the next command moves on from there. After a fault the arm is at rest."""
         with self._lock:
             if not self._closed:
                 self._send(CommandKind.HOLD)
 
-    def report_tactile(self, shown: GelReading | None) -> None:
-        """What the sensors show by now: beyond limits.depth or limits.shear the arm stops, and it stands once the last
-        picture is older than `observation_timeout`. None: nobody looks by now, and neither is watched."""
+    def report_tactile(self, reading: GelReading | None) -> None:
+        """Reports what the sensors show: beyond limits.depth or limits.shear the arm stops, and it holds while the last
+        picture is older than `observation_timeout`. None suspends both guards until the next report."""
         with self._lock:
             if not self._closed:
-                known = GelReading(math.nan) if shown is None else shown
+                known = GelReading(math.nan) if reading is None else reading
                 self._channel.tactile.write(tactile_record(known.seen, known.depth, known.shear))
 
     def zero_wrench(self) -> None:
-        """Makes the present force the zero. The arm must stand, and touch nothing.
+        """Zeroes the force sensor. The arm must be at rest and touch nothing.
 
         Raises DeviceError if it moves or the controller does not do it, and the error of a lost link or a stop.
         """
@@ -219,10 +216,10 @@ class URArm:
 
     def recover(self) -> None:
         """After a stop, a fault or a lost link: unlocks a protective stop and starts a new worker, which begins at the
-        pose it measures and moves nothing. What was asked before is forgotten.
+        measured pose and moves nothing. Earlier commands are forgotten.
 
-        Raises EmergencyStop while one is engaged (a person must release it), and whatever connecting raises. A person
-        decides whether it may be called: nothing here calls it.
+        Raises EmergencyStop while one is engaged (a person must release it), and whatever connecting raises. Only a
+        person decides to call it: nothing here does.
         """
         with self._lock:
             if self._closed:
@@ -269,7 +266,7 @@ class URArm:
             ) from failure
 
     def _end_worker(self) -> None:
-        """Asks the worker to ramp down and end, then kills it."""
+        """Asks the worker to brake and end, then kills it."""
         if self._worker is None:
             return
         record = self._channel.states.latest()
@@ -296,7 +293,7 @@ class URArm:
     # -- records -------------------------------------------------------------------------------------------------
 
     def _record(self) -> shared_ring.Record:
-        """The newest record, if it may be believed."""
+        """The newest record. Raises unless it is fresh."""
         status = self.status()
         record = None if self._closed else self._channel.states.latest()
         if status == ArmStatus.LINK_LOST and record is not None:
@@ -330,7 +327,7 @@ class URArm:
         )
 
     def _require_able(self) -> None:
-        """Raises the error of a status in which the arm follows no command."""
+        """Raises the error of a status in which the arm follows no commands."""
         deadline = time.monotonic() + PARTNER_PATIENCE
         while (status := self.status()) == ArmStatus.WAITING and time.monotonic() < deadline:
             time.sleep(POLL)
@@ -338,7 +335,7 @@ class URArm:
             raise self._error(status)
 
     def _spheres(self) -> list[tuple[np.ndarray, float]]:
-        """Where the other arms are, and how far to stay away."""
+        """Positions (3,) of the other arms [m], and the keep-out distance to each [m]."""
         spheres = []
         for partner in self._worker_config.partners:
             if partner.segment not in self._others:
@@ -368,58 +365,5 @@ _DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStat
 
 
 def _fresh(record: shared_ring.Record, now: float, link_timeout: float) -> bool:
-    """Whether the worker still hears the controller; while it waits for a slow call it says until when."""
+    """True if the newest package is fresh, or the worker is in a call of the controller that may take this long."""
     return now <= max(float(record["time"]) + link_timeout + 5 * POLL, float(record["busy_until"]))
-
-
-def _check_host(config: UrArmConfig, name: str) -> None:
-    """A mock lives on loopback and nothing else does: neither may be taken for the other."""
-    loopback = is_loopback(config.host)
-    if config.mock is not None and not loopback:
-        raise DeviceNotConnectedError(
-            f"arm '{name}' has a `mock:` block, but its host {config.host} is outside this machine; a mock's host is a "
-            "loopback address such as 127.0.0.2. Remove `mock:` to talk to the real arm"
-        )
-    if config.mock is None and loopback:
-        raise DeviceNotConnectedError(
-            f"arm '{name}' is a real one, but its host {config.host} is this machine; give its address, or add `mock: "
-            "{}` for a mock controller"
-        )
-
-
-def _worker_config(config: UrArmConfig, name: str, segment: str, keep_out: Mapping[str, float]) -> WorkerConfig:
-    limits, tool = config.limits, se3.to_matrix(config.flange_from_tool.pose)
-    return WorkerConfig(
-        name=name,
-        host=config.host,
-        model=config.model,
-        refused_serial=MOCK_SERIAL if config.mock is None else None,
-        realtime=config.mock is None or config.mock.realtime,
-        parent=os.getpid(),
-        segment=segment,
-        world_from_base=se3.to_matrix(config.world_from_base.pose).tolist(),
-        flange_from_tool=tool.tolist(),
-        tool_from_sensor=se3.to_matrix(config.tool_from_sensor.pose).tolist(),
-        tcp=pose(tool).tolist(),
-        mass=config.payload.mass,
-        mass_centre=list(config.payload.centre),
-        lower=list(limits.workspace.lower),
-        upper=list(limits.workspace.upper),
-        planes=[[list(wall.point), list(wall.normal)] for wall in limits.planes],
-        speed=limits.speed,
-        turn_rate=limits.turn_rate,
-        acceleration=limits.acceleration,
-        turn_acceleration=limits.turn_acceleration,
-        joint_speed=limits.joint_speed,
-        force=limits.force,
-        torque=limits.torque,
-        depth=limits.depth,
-        shear=limits.shear,
-        link_timeout=config.link_timeout,
-        action_timeout=config.action_timeout,
-        observation_timeout=config.observation_timeout,
-        watchdog=config.watchdog,
-        lookahead=config.lookahead,
-        gain=config.gain,
-        partners=[Partner(shared_ring.segment_name(os.getpid(), other), gap) for other, gap in keep_out.items()],
-    )

@@ -187,6 +187,6 @@ def test_mock_and_real_are_never_mistaken(mock: MockUR, monkeypatch: pytest.Monk
         with pytest.raises(DeviceNotConnectedError, match="is this machine"):
             URArm(config(host, mock=None), "left").close()
     assert MOCK_SERIAL  # a mock that is reached under another address gives itself away
-    monkeypatch.setattr(ur, "_check_host", lambda *_: None)
+    monkeypatch.setattr(ur, "check_host", lambda *_: None)
     with pytest.raises(DeviceNotConnectedError, match="is a mock controller"):
         URArm(config(mock=None), "left").close()

@@ -111,8 +111,8 @@ def test_a_dead_partner_stops_the_arm_that_moves(pair: Pair) -> None:
     """The other one counts as dead after link_timeout, 1 s here; this one is under way for much longer."""
     left, right, _ = pair
     in_motion(left, moved(left.state().pose, x=-0.14))
-    assert right._process is not None
-    os.kill(right._process.pid, signal.SIGKILL)
+    assert right._worker is not None
+    os.kill(right._worker.pid, signal.SIGKILL)
     until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "stop")
 
 

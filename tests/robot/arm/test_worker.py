@@ -14,7 +14,7 @@ import pytest
 
 from robot.arm import shared_ring, worker
 from robot.arm.channel import ArmStatus, Channel, WorkerConfig
-from robot.arm.ur import _worker_config
+from robot.arm.worker_config import worker_config as config_of
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
 
 ROOT = Path(worker.__file__).parents[2]
@@ -30,7 +30,7 @@ def worker_config(segment: str, **changes: object) -> WorkerConfig:
         limits=ArmLimits(workspace=box),
         mock=MockArmConfig(),
     )
-    return dataclasses.replace(_worker_config(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(config_of(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
 
 
 def start(config: WorkerConfig) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,68 @@
+"""From an arm in a rig file to the configuration of its worker, and the check of its host."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+from robot.arm.channel import Partner, WorkerConfig
+from robot.arm.shared_ring import segment_name
+from robot.common import MOCK_SERIAL
+from robot.common.kinematics import pose
+from robot.common.loopback import is_loopback
+from robot.errors import DeviceNotConnectedError
+from tacsim import pose as se3
+from tacsim.models.hardware import UrArmConfig
+
+
+def check_host(config: UrArmConfig, name: str) -> None:
+    """Raises DeviceNotConnectedError unless a mock is on loopback and a real arm is not."""
+    loopback = is_loopback(config.host)
+    if config.mock is not None and not loopback:
+        raise DeviceNotConnectedError(
+            f"arm '{name}' has a `mock:` block, but its host {config.host} is outside this machine; a mock's host is a "
+            "loopback address such as 127.0.0.2. Remove `mock:` to talk to the real arm"
+        )
+    if config.mock is None and loopback:
+        raise DeviceNotConnectedError(
+            f"arm '{name}' is a real one, but its host {config.host} is this machine; give its address, or add `mock: "
+            "{}` for a mock controller"
+        )
+
+
+def worker_config(config: UrArmConfig, name: str, segment: str, keep_out: Mapping[str, float]) -> WorkerConfig:
+    limits, tool = config.limits, se3.to_matrix(config.flange_from_tool.pose)
+    return WorkerConfig(
+        name=name,
+        host=config.host,
+        model=config.model,
+        refused_serial=MOCK_SERIAL if config.mock is None else None,
+        realtime=config.mock is None or config.mock.realtime,
+        parent=os.getpid(),
+        segment=segment,
+        world_from_base=se3.to_matrix(config.world_from_base.pose).tolist(),
+        flange_from_tool=tool.tolist(),
+        tool_from_sensor=se3.to_matrix(config.tool_from_sensor.pose).tolist(),
+        tcp=pose(tool).tolist(),
+        mass=config.payload.mass,
+        mass_centre=list(config.payload.centre),
+        lower=list(limits.workspace.lower),
+        upper=list(limits.workspace.upper),
+        planes=[[list(wall.point), list(wall.normal)] for wall in limits.planes],
+        speed=limits.speed,
+        turn_rate=limits.turn_rate,
+        acceleration=limits.acceleration,
+        turn_acceleration=limits.turn_acceleration,
+        joint_speed=limits.joint_speed,
+        force=limits.force,
+        torque=limits.torque,
+        depth=limits.depth,
+        shear=limits.shear,
+        link_timeout=config.link_timeout,
+        action_timeout=config.action_timeout,
+        observation_timeout=config.observation_timeout,
+        watchdog=config.watchdog,
+        lookahead=config.lookahead,
+        gain=config.gain,
+        partners=[Partner(segment_name(os.getpid(), other), gap) for other, gap in keep_out.items()],
+    )

@@ -7,6 +7,7 @@ from tacsim.compute.runtime import start, ti
 from tacsim.physics.body.material import convect, hencky_return, mat3, vec6
 from tacsim.physics.body.plasticine import BodyParams, BodyState
 from tacsim.physics.body.transfers import (
+    Body,
     Particles,
     Strips,
     clear_masses,
@@ -14,33 +15,21 @@ from tacsim.physics.body.transfers import (
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.exec.lanes import LANES, NODES, PARTS, Counts, Params, Partial, first_of, strip, vec3
-from tacsim.physics.exec.layout import (
-    BACKING,
-    COUNTS,
-    ELEMENTS,
-    GEL_DAMPING,
-    GRID,
-    NUMBERS,
-    OFF_GRID,
-    PARAMS,
-    SMALLEST_STEP_VOLUME,
-    SMALLEST_VOLUME,
-    STEP,
-    STEPS,
-)  # fmt: skip
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, vec3
 from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, piece_done, run_team
 from tacsim.physics.gel.element import SMALLEST_STRETCH
-from tacsim.physics.gel.gel import (
+from tacsim.physics.gel.gel import GelParams, GelState
+from tacsim.physics.gel.kernels import (
+    ContactForce,
     Corners,
-    GelParams,
-    GelState,
     Lattice,
     Nodes,
-    Skin,
-    Touch,
+    Surface,
     gel_advance,
     gel_forces,
+    gels_of,
     margin,
 )
 
@@ -59,20 +48,22 @@ def body_substeps(
     own substeps are (tacsim.physics.worlds.hybrid_kernels)."""
     for task in range(team * CHUNK):
         for _ in range(first_in_chunk(task)):
-            plane, rows = counts[0, GRID + 1] * (counts[0, GRID + 2] // NODES), counts[0, GRID]
+            env = ti.static(Environment(0, params, counts, partial))
+            body = ti.static(Body(particles, masses, velocities))
+            rows, plane = env.count(layout.GRID), env.count(layout.GRID + 1) * (env.count(layout.GRID + 2) // NODES)
             pieces = PARTS * (2 * steps.shape[1] + 1)
             piece = next_piece(sync, 0, pieces)
             while piece < pieces:
                 stage, part = piece // PARTS, piece % PARTS
                 for _gather in range(once_if(stage % 2 == 0 and stage > 0)):
-                    grid_to_particles(0, part, particles, velocities, params, counts, partial)
+                    grid_to_particles(env, part, body)
                 for _scatter in range(once_if(stage % 2 == 0 and stage < 2 * steps.shape[1])):
-                    clear_masses(0, part, masses, counts)
-                    particles_to_grid(0, part, particles, masses, params, counts, partial)
+                    clear_masses(env, part, body)
+                    particles_to_grid(env, part, body)
                 for _motion in range(once_if(stage % 2 == 1)):
-                    for i in range(first_of(rows, part, PARTS), first_of(rows, part + 1, PARTS)):
+                    for i in range(share_start(rows, part, PARTS), share_start(rows, part + 1, PARTS)):
                         for at in range(i * plane, (i + 1) * plane):
-                            q = node_sum(0, i, at, masses, velocities, counts)
+                            q = node_sum(env, i, at, body)
                             moved = strip(0.0)
                             for n in ti.static(range(NODES)):
                                 if q[4 * n + 3] > 0.0:
@@ -86,24 +77,26 @@ def body_substeps(
 
 @ti.kernel
 def gel_substeps(
-    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial,
     keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32,
 ):  # fmt: skip
     """A gel on its backing; `keep` as above. If `driven`, the top moves along z with `speed`."""
     ti.loop_config(serialize=True)
-    for _ in range(counts[0, STEPS]):
-        nx, ny, layers = counts[0, ELEMENTS], counts[0, ELEMENTS + 1], counts[0, ELEMENTS + 2]
+    for _ in range(counts[0, layout.STEPS]):
+        env = ti.static(Environment(0, params, counts, partial))
+        gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
+        nx, ny, layers = gels.nx, gels.ny, gels.layers
         for part in range(PARTS):
-            gel_forces(0, part, 1, nodes, corners, lattice, params, counts, partial, layers, nx, ny)
+            gel_forces(env, part, gels)
         for part in range(PARTS):
-            gel_advance(0, part, 1, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
+            gel_advance(env, part, gels)
         layer = ((nx + 1) * (ny + 1) + LANES - 1) // LANES * LANES
-        dt, keep = params[0, STEP], vec3(keep_x, keep_y, keep_z)
+        dt, keep = env.param(layout.STEP), vec3(keep_x, keep_y, keep_z)
         for d in ti.static(range(3)):
             for k in range(1, layers + 1):
                 for n in range((nx + 1) * (ny + 1)):
-                    v = margin(ny) + ((3 + d) * (layers + 1) + k) * layer + n
+                    v = margin(gels) + ((3 + d) * (layers + 1) + k) * layer + n
                     before = nodes[v]
                     after = keep[d] * before
                     if driven == 1 and k == layers and d == 2:
@@ -132,12 +125,12 @@ class Block:
 
     def __init__(self, params: dict[int, float], dt: float) -> None:
         start(cpu_only="a single block of a material (tacsim bench materials)")
-        self.params = np.zeros((1, PARAMS), np.float32)
+        self.params = np.zeros((1, layout.PARAMS), np.float32)
         self.params[0, list(params)] = list(params.values())
-        self.params[0, STEP] = dt
-        self.counts = np.zeros((1, COUNTS), np.int32)
-        self.partial = np.zeros((1, PARTS, NUMBERS), np.float32)
-        self.partial[:, :, [SMALLEST_VOLUME, SMALLEST_STEP_VOLUME]] = 1.0
+        self.params[0, layout.STEP] = dt
+        self.counts = np.zeros((1, layout.COUNTS), np.int32)
+        self.partial = np.zeros((1, PARTS, layout.NUMBERS), np.float32)
+        self.partial[:, :, [layout.SMALLEST_VOLUME, layout.SMALLEST_STEP_VOLUME]] = 1.0
 
 
 class BodyBlock(Block):
@@ -157,7 +150,7 @@ class BodyBlock(Block):
         steps = np.zeros((1, substeps), np.int32)
         arguments = self.state.arguments()
         run_team(body_substeps, steps, arguments, self.params, self.counts, self.partial, *keep)
-        if self.partial[0, :, OFF_GRID].any():
+        if self.partial[0, :, layout.OFF_GRID].any():
             raise RuntimeError("particles left the grid of a body block: fit it anew, or with a wider margin")
 
 
@@ -165,20 +158,20 @@ class GelBlock(Block):
     """A gel on its backing that nothing touches; damping rate [1/mm], time step dt [mm]."""
 
     def __init__(self, params: GelParams, dt: float, damping: float) -> None:
-        super().__init__({**params.params(), GEL_DAMPING: damping}, dt)
+        super().__init__({**params.params(), layout.GEL_DAMPING: damping}, dt)
         self.state = GelState(params, 1, 1)
-        self.counts[:, ELEMENTS : ELEMENTS + 3] = params.elements
+        self.counts[:, layout.ELEMENTS : layout.ELEMENTS + 3] = params.elements
         self._arguments = (*self.state.arguments(), self.params, self.counts, self.partial)
 
     def advance(self, substeps: int, keep: tuple[float, float, float], speed: float | None = None) -> None:
         """keep: as for a body; speed: of the top along z, if driven. Raises RuntimeError if an element inverts."""
-        self.counts[0, STEPS] = substeps
+        self.counts[0, layout.STEPS] = substeps
         gel_substeps(*self._arguments, *keep, int(speed is not None), speed or 0.0)
-        smallest = float(self.partial[0, :, SMALLEST_VOLUME].min())
+        smallest = float(self.partial[0, :, layout.SMALLEST_VOLUME].min())
         if not smallest > SMALLEST_STRETCH:
             raise RuntimeError(f"an element of a gel block shrank to {smallest:.3g} of its volume: drive it less far")
 
     @property
     def backing(self) -> np.ndarray:
         """Force of the gel on its backing in the last substep [N], (3,)."""
-        return self.partial[0, :, BACKING : BACKING + 3].sum(axis=0, dtype=np.float64)
+        return self.partial[0, :, layout.BACKING : layout.BACKING + 3].sum(axis=0, dtype=np.float64)

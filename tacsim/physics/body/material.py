@@ -13,7 +13,7 @@ mat3 = ti.types.matrix(3, 3, ti.f32)
 
 ROOT = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the flow
 ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
-NEAR_LOG1P, NEAR_LOG, NEAR_EXP = 0.4, 0.5, 0.2  # arguments up to which the series below are exact enough
+SERIES_LOG1P, SERIES_LOG, SERIES_EXP = 0.4, 0.5, 0.2  # arguments up to which the series below are exact enough
 
 
 @ti.func
@@ -85,7 +85,7 @@ def log1p_series(z):
 def log1p(x):
     """ln(1 + x), accurate in f32 for small x."""
     y = 0.0
-    if ti.abs(x) < NEAR_LOG1P:
+    if ti.abs(x) < SERIES_LOG1P:
         y = log1p_series(x / (2.0 + x))
     else:
         y = ti.log(1.0 + x)
@@ -96,7 +96,7 @@ def log1p(x):
 def lanes_log1p(x):
     """The same for lanes, without a branch: far from 0 by the fourth root."""
     t = ti.sqrt(ti.sqrt(1.0 + x)) - 1.0
-    far = ti.abs(x) > NEAR_LOG1P
+    far = ti.abs(x) > SERIES_LOG1P
     return ti.select(far, 4.0, 1.0) * log1p_series(ti.select(far, t / (2.0 + t), x / (2.0 + x)))
 
 
@@ -133,9 +133,9 @@ def logarithm(a):
     """log(I + a). Large strain (|a| > 0.5) falls back on log(I + a) = 2^n log((I + a)^(1/2^n)), n <= 3."""
     scale = 1.0
     root = a
-    if frobenius(a) > NEAR_LOG:
+    if frobenius(a) > SERIES_LOG:
         for _ in range(3):
-            if frobenius(root) > NEAR_LOG:
+            if frobenius(root) > SERIES_LOG:
                 root = square_root(root)
                 scale *= 2.0
     return scale * log_pade(root)
@@ -157,7 +157,7 @@ def exponential_minus_identity(x, norm):
     halvings = 0
     small = norm
     for _ in range(4):
-        if small > NEAR_EXP:
+        if small > SERIES_EXP:
             small *= 0.5
             halvings += 1
     y = exponential_series((small / norm) * x)
@@ -191,7 +191,7 @@ def third_root(z):
 
 
 @ti.func
-def strain_near(e):
+def small_strain(e):
     """log J, dev(eps) and J^(2/3) of b_e = I + e, for elastic strain up to some 0.2, without a branch: lanes can do it
     side by side.
 
@@ -203,24 +203,24 @@ def strain_near(e):
     shape = volume_preserving(e, (1.0 - t) / (1.0 + t))
     strain = 0.5 * log_pade(shape)
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    far = ti.select(ti.abs(x) > NEAR_LOG1P, 1, 0) | ti.select(square(shape) > NEAR_LOG**2, 1, 0)
+    far = ti.select(ti.abs(x) > SERIES_LOG1P, 1, 0) | ti.select(square(shape) > SERIES_LOG**2, 1, 0)
     return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), far
 
 
 @ti.func
-def stress_near(e, mu, bulk):
-    """Kirchhoff stress of a body that never yields, as by `hencky_return`; and 1 beyond `strain_near`, else 0."""
-    log_j, strain, _, far = strain_near(e)
+def stress_small_strain(e, mu, bulk):
+    """Kirchhoff stress of a body that never yields, as by `hencky_return`; and 1 beyond `small_strain`, else 0."""
+    log_j, strain, _, far = small_strain(e)
     return plus_identity(2.0 * mu * strain, bulk * log_j), far
 
 
 @ti.func
-def return_near(e, flow, mu, bulk, limit, hardening):
-    """`hencky_return` for elastic strain up to some 0.2, without a branch: see `strain_near`.
+def return_small_strain(e, flow, mu, bulk, limit, hardening):
+    """`hencky_return` for elastic strain up to some 0.2, without a branch: see `small_strain`.
 
     Returns also 1 where the strain is larger (and all else is wrong), else 0.
     """
-    log_j, strain, grow, far = strain_near(e)
+    log_j, strain, grow, far = small_strain(e)
     strain2, i2, i3 = product(strain, strain), minors(strain), determinant(strain)
     norm = ti.sqrt(strain2[0] + strain2[1] + strain2[2])
     now, give = limit + hardening * flow, 1.0 / (1.0 + ROOT * hardening)
@@ -234,14 +234,14 @@ def return_near(e, flow, mu, bulk, limit, hardening):
     returned = plus_identity(growth * volume, volume - 1.0)
     yields = norm > now
     elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
-    far = far | ti.select(2.0 * f * norm > NEAR_EXP, 1, 0)
+    far = far | ti.select(2.0 * f * norm > SERIES_EXP, 1, 0)
     return (
         elastic, flow + ROOT * give * ti.max(0.0, norm - now), plus_identity(2.0 * mu * f * strain, bulk * log_j), far
     )  # fmt: skip
 
 
 @ti.func
-def return_far(e, flow, mu, bulk, limit, hardening):
+def return_any_strain(e, flow, mu, bulk, limit, hardening):
     """`hencky_return` for any strain."""
     log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
     shrink = ti.exp(-2.0 / 3.0 * log_j)
@@ -268,9 +268,9 @@ def hencky_return(e, flow, mu, bulk, limit, hardening):
     box 3.1). Returns the elastic e after the return, the new flow, and the Kirchhoff stress
     tau = 2 mu dev(eps) + K ln(J) I.
     """
-    elastic, new_flow, tau, far = return_near(e, flow, mu, bulk, limit, hardening)
+    elastic, new_flow, tau, far = return_small_strain(e, flow, mu, bulk, limit, hardening)
     if far != 0:
-        elastic, new_flow, tau = return_far(e, flow, mu, bulk, limit, hardening)
+        elastic, new_flow, tau = return_any_strain(e, flow, mu, bulk, limit, hardening)
     return elastic, new_flow, tau
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from tacsim.models.scene import BodyMaterial, lame
 from tacsim.physics.body.material import ELASTIC
-from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MOST, NODES, aligned_zeros, padded
+from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, aligned_zeros, padded
 from tacsim.physics.exec.layout import (
     AFFINE,
     BODY_BULK,
@@ -22,13 +22,13 @@ from tacsim.physics.exec.layout import (
     BODY_MU,
     BODY_VOLUME,
     CAPACITY,
-    FLOW,
     GRID,
-    KNOWN,
     ORIGIN,
+    PARTICLE_ROWS,
     PARTICLES,
-    PLACE,
     PLANE,
+    PLASTIC_STRAIN,
+    POSITION,
     SLAB,
     STRAIN,
     STRIDE,
@@ -64,7 +64,7 @@ class BodyParams:
         return self.density * self.volume
 
     def params(self) -> dict[int, float]:
-        """Entries of the array `facts` (tacsim.physics.exec.layout)."""
+        """Entries of the array `params` (tacsim.physics.exec.layout)."""
         return {
             BODY_CELL: self.cell, BODY_MU: self.mu, BODY_BULK: self.bulk, BODY_LIMIT: self.limit,
             BODY_HARDENING: self.hardening, BODY_MASS: self.particle_mass, BODY_VOLUME: self.volume,
@@ -82,17 +82,17 @@ def body_params(material: BodyMaterial, spacing: float, volume: float | None = N
 
 
 class BodyState:
-    """Particles of all environments and the grid they move on, kept as kernels like them: whole lanes, whole lines.
+    """Particles of all environments and the grid they move on, laid out for the kernels: whole lanes and cache lines.
 
-    known: (E, KNOWN, W) one number of all particles a row (tacsim.physics.exec.layout), zeros behind the last particle;
-    masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part; velocities:
-    (E, strips, 4 NODES). Lines of the grid have an even number of nodes where NODES is 2.
+    rows: (E, PARTICLE_ROWS, W) one number of all particles a row (tacsim.physics.exec.layout), zeros behind the last
+    particle; masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part;
+    velocities: (E, strips, 4 NODES). Lines of the grid have an even number of nodes where NODES is 2.
     """
 
     def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
         """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes no particle knows a surface."""
         self.counts = [len(p) for p in points]
-        self.known = aligned_zeros(len(points), KNOWN, spread(max(self.counts)))
+        self.rows = aligned_zeros(len(points), PARTICLE_ROWS, row_length(max(self.counts)))
         for index, p in enumerate(points):
             self.x(index)[...] = p
             if planes is not None:
@@ -101,11 +101,11 @@ class BodyState:
         self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
 
     def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
-        return self.known[environment, first : first + count, : self.counts[environment]]
+        return self.rows[environment, first : first + count, : self.counts[environment]]
 
     def x(self, environment: int = 0) -> np.ndarray:
         """Positions [mm], (n, 3), a view."""
-        return self._rows(environment, PLACE, 3).T
+        return self._rows(environment, POSITION, 3).T
 
     def plane(self, environment: int = 0) -> np.ndarray:
         """Tangent planes [1/mm], (n, 3), a view."""
@@ -117,7 +117,7 @@ class BodyState:
 
     def c(self, environment: int = 0) -> np.ndarray:
         """Affine velocities, (n, 3, 3), a view."""
-        columns: np.ndarray = self.known[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
+        columns: np.ndarray = self.rows[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
         return columns[..., : self.counts[environment]].T
 
     def e(self, environment: int = 0) -> np.ndarray:
@@ -126,18 +126,18 @@ class BodyState:
 
     def flow(self, environment: int = 0) -> np.ndarray:
         """Equivalent plastic strains, (n,), a view."""
-        return self._rows(environment, FLOW, 1).reshape(-1)
+        return self._rows(environment, PLASTIC_STRAIN, 1).reshape(-1)
 
     @property
     def most(self) -> int:
         """Grid nodes that each environment may have: its share of what kernels can count, in all copies."""
-        return MOST // (4 * COPIES * len(self.known))
+        return MAX_NUMBERS // (4 * COPIES * len(self.rows))
 
     def fit(self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray) -> None:
         """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
 
         margin [mm]: what they may move during the launch. Writes origin, node counts and the parts' slabs of node
-        planes into `facts` and `counts` (tacsim.physics.exec.layout).
+        planes into `params` and `counts` (tacsim.physics.exec.layout).
 
         The memory of all environments grows if this one needs more; what stands in it lasts no longer than a substep.
         Raises MemoryError, with that memory as it was, where there is none.
@@ -161,14 +161,14 @@ class BodyState:
             room = max(strips, min(strips * 5 // 4, self.most // NODES))
             masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
             self.masses, self.velocities = masses, aligned_zeros(len(masses), room, 4 * NODES)
-        counts[:, STRIDE], counts[:, CAPACITY] = self.known.shape[2], self.masses.shape[2]
+        counts[:, STRIDE], counts[:, CAPACITY] = self.rows.shape[2], self.masses.shape[2]
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """What every kernel with a body takes, in this order."""
-        return self.known.reshape(-1), self.masses.reshape(-1, 4 * NODES), self.velocities.reshape(-1, 4 * NODES)
+        return self.rows.reshape(-1), self.masses.reshape(-1, 4 * NODES), self.velocities.reshape(-1, 4 * NODES)
 
 
-def spread(particles: int) -> int:
+def row_length(particles: int) -> int:
     """Room for so many particles in a row: whole cache lines and odd many, so that rows do not compete for places in
     the cache, which holds few lines whose addresses differ by a power of two."""
     return (-(-particles // CACHE_LINE) | 1) * CACHE_LINE

@@ -7,11 +7,12 @@ holds nothing.
 """
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.exec.lanes import ON_DEVICE, add_four, note_more, note_most, slot_of, vec2, vec3, vec4
-from tacsim.physics.exec.layout import BODY_CELL, CAPPED, FRICTION, GEL_SPACING, HOUSING, OVERLAP, STEP, STIFFNESS
-from tacsim.physics.gel.gel import skin_at
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.environment import record_more, record_most
+from tacsim.physics.exec.lanes import ON_DEVICE, add_four, slot_of, vec2, vec3, vec4
+from tacsim.physics.gel.kernels import surface_at, surface_row
 
-Kept = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
+ContactHistory = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
 
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
@@ -30,7 +31,7 @@ def spline(a):
 
 
 @ti.func
-def skin_sum(skin: ti.template(), row, i, j, wx, wy, ny):
+def surface_sum(gels: ti.template(), row, i, j, wx, wy):
     """Sum over the 3 x 3 nodes of a stencil from (i, j) on, weighted by wx and wy; row: the quantity's first.
 
     A loop over the four numbers of a node, of which a CPU makes vectors; all four nodes' first numbers at once would be
@@ -39,34 +40,36 @@ def skin_sum(skin: ti.template(), row, i, j, wx, wy, ny):
     if ti.static(ON_DEVICE):
         total = vec4(0.0)
         for p, q in ti.static(ti.ndrange(3, 3)):
-            at = skin_at(row + i + p + 1, j + q + 1, ny)
-            total += (wx[p] * wy[q]) * vec4([skin[at + c] for c in range(4)])
+            at = surface_at(gels, row + i + p + 1, j + q + 1)
+            total += (wx[p] * wy[q]) * vec4([gels.surface[at + c] for c in range(4)])
         return total
     else:
         sums = ti.Matrix.zero(ti.f32, 4, 1)
         for c in range(4):
             total = 0.0
             for p, q in ti.static(ti.ndrange(3, 3)):
-                total += (wx[p] * wy[q]) * skin[skin_at(row + i + p + 1, j + q + 1, ny) + c]
+                total += (wx[p] * wy[q]) * gels.surface[surface_at(gels, row + i + p + 1, j + q + 1) + c]
             sums[c, 0] = total
         return vec4([sums[c, 0] for c in range(4)])
 
 
 @ti.func
-def skin_sums(skin: ti.template(), row, i, j, wx, wy, dx, dy, ny):
+def surface_sums(gels: ti.template(), row, i, j, wx, wy, dx, dy):
     """The same sum, with the weights' derivatives by x, and by y."""
     if ti.static(ON_DEVICE):
         return (
-            skin_sum(skin, row, i, j, wx, wy, ny),
-            skin_sum(skin, row, i, j, dx, wy, ny),
-            skin_sum(skin, row, i, j, wx, dy, ny),
+            surface_sum(gels, row, i, j, wx, wy),
+            surface_sum(gels, row, i, j, dx, wy),
+            surface_sum(gels, row, i, j, wx, dy),
         )
     else:
         sums = ti.Matrix.zero(ti.f32, 3, 4)
         for c in range(4):
             value, by_x, by_y = 0.0, 0.0, 0.0
             for p in ti.static(range(3)):
-                first, second, third = [skin[skin_at(row + i + p + 1, j + q + 1, ny) + c] for q in range(3)]
+                first, second, third = [
+                    gels.surface[surface_at(gels, row + i + p + 1, j + q + 1) + c] for q in range(3)
+                ]
                 line = wy[0] * first + wy[1] * second + wy[2] * third
                 value += wx[p] * line
                 by_x += dx[p] * line
@@ -81,7 +84,7 @@ def skin_sums(skin: ti.template(), row, i, j, wx, wy, dx, dy, ny):
 
 @ti.func
 def newton_step(t1, t2, miss):
-    """Way in lattice coordinates to where the surface lies under a point; miss: how far it is away in them, unmoved.
+    """Step in lattice coordinates to where the surface lies under a point; miss: its distance in them, were it unmoved.
 
     t1, t2: tangents of the surface. One that is folded has no inverse: then the step is that of an unmoved surface.
     """
@@ -108,63 +111,62 @@ def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
 
 
 @ti.func
-def surface_node(i, j, nx, ny):
+def surface_node(gels: ti.template(), i, j):
     """Index of the surface node (i, j) in a layer's row, repeated beyond the rim."""
-    return ti.max(0, ti.min(i, nx)) * (ny + 1) + ti.max(0, ti.min(j, ny))
+    return ti.max(0, ti.min(i, gels.nx)) * (gels.ny + 1) + ti.max(0, ti.min(j, gels.ny))
 
 
 @ti.func
 def support_radius(plane, spacing):
-    """Distance of a particle from the body's surface: 1 / |plane|; half a spacing where it knows none (plane = 0).
+    """Distance of a particle from the body's surface: 1 / |plane|; half a spacing deep inside (plane = 0).
 
-    plane: the nearest surface's tangent plane, outward normal over distance [1/mm], see body_surface.py.
+    plane: the nearest surface's tangent plane, outward normal over distance [1/mm], see tacsim/physics/body/surface.py.
     """
     size = plane.norm()
     radius = 0.5 * spacing
     if size > 0.0:
-        radius = ti.min(1.0 / size, spacing)  # a plane torn further away is no longer this particle's to speak for
+        radius = ti.min(1.0 / size, spacing)  # a plane stretched further away says nothing of this particle
     return radius
 
 
 @ti.func
-def contact_ceiling(skin: ti.template(), row, nx, ny):
-    """Height of the highest surface node [mm], at least 0: the spline stays below it, and what is above touches not."""
-    highest = 0.0
-    for i in range(1, nx + 2):
-        for j in range(1, ny + 2):
-            height = skin[skin_at(row + i, j, ny) + 2]
+def contact_ceiling(env: ti.template(), gels: ti.template(), g):
+    """Height of the highest surface node [mm], at least 0: the spline stays below it, so nothing above it touches."""
+    row, highest = surface_row(env, gels, g), 0.0
+    for i in range(1, gels.nx + 2):
+        for j in range(1, gels.ny + 2):
+            height = gels.surface[surface_at(gels, row + i, j) + 2]
             highest = ti.select(height > highest, height, highest)
     return highest
 
 
 @ti.func
-def particle_contact(
-    env, part, g, x, v, memory, radius, skin: ti.template(), row, touch: ti.template(), pushed, params: ti.template(),
-    layers, nx, ny, partial: ti.template(),
-):  # fmt: skip
+def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: ti.template(), row, forces):
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
-    x, v: position, and velocity relative to the moving sensor. memory: elastic slip, and the multiplier as the overlap
-    whose penalty it equals [mm]. Returns touching, whether the housing, force, new memory.
+    x, v: position, and velocity relative to the moving sensor. history: elastic slip, and the multiplier as the overlap
+    whose penalty it equals [mm]. row: the gel's first in `surface`; forces: where those on its nodes begin. Returns
+    whether it touches, whether the housing, the force, and the new history.
     """
-    h, k_n, dt = params[env, GEL_SPACING], params[env, STIFFNESS], params[env, STEP]
-    mu, housing = params[env, FRICTION + g], params[env, HOUSING]
-    deepest = params[env, BODY_CELL]  # two particle spacings: the largest overlap answered in full
+    h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
+    mu, housing = env.param(layout.FRICTION + g), env.param(layout.HOUSING)
+    deepest = env.param(layout.BODY_CELL)  # two particle spacings: the largest overlap answered in full
+    nx, ny, layers = gels.nx, gels.ny, gels.layers
     touching, housed = False, False
     force = vec3(0.0)
-    slip = vec3(memory[0], memory[1], memory[2])
-    taken = memory[3]
+    slip = vec3(history[0], history[1], history[2])
+    multiplier = history[3]
     moved = vec2(0.0)
     overlap = 0.0
     reach = 2.2 * 0.5 * h
     c_n = CONTACT_DAMPING * k_n * dt
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
         start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved
-        last = start - vec2(memory[4], memory[5]) / h
+        last = start - vec2(history[4], history[5]) / h
         a = vec2(ti.max(0.0, ti.min(last[0], nx)), ti.max(0.0, ti.min(last[1], ny)))
         i, wx, dx = spline(a[0])
         j, wy, dy = spline(a[1])
-        us, t1, t2 = skin_sums(skin, row, i, j, wx, wy, dx / h, dy / h, ny)
+        us, t1, t2 = surface_sums(gels, row, i, j, wx, wy, dx / h, dy / h)
         t1[0] += 1.0
         t2[1] += 1.0
         step = newton_step(t1, t2, start - a - vec2(us[0], us[1]) / h)
@@ -173,40 +175,40 @@ def particle_contact(
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
             depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
-            if depth + taken > 0.0:
-                vs = skin_sum(skin, row + nx + 3, i, j, wx, wy, ny)
+            if depth + multiplier > 0.0:
+                vs = surface_sum(gels, row + nx + 3, i, j, wx, wy)
                 n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
                 if gap > deepest:  # an overlap found late must not explode; counted
                     gap = deepest
-                    note_more(partial, env, slot_of(part), CAPPED, 1.0)
+                    record_more(env, slot_of(part), layout.CAPPED, 1.0)
                 vr = v - vec3(vs[0], vs[1], vs[2])
                 vn = vr.dot(n)
-                fn = ti.max(k_n * (gap + taken) - c_n * vn, 0.0)
-                taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
+                fn = ti.max(k_n * (gap + multiplier) - c_n * vn, 0.0)
+                multiplier = ti.max(multiplier + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vr - vn * n, fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
                 touching = True
                 overlap = gap
                 back = vec4(force[0], force[1], force[2], 0.0)
                 for p, q in ti.static(ti.ndrange(3, 3)):
-                    node = surface_node(i + p, j + q, nx, ny)
-                    add_four(touch, pushed + 4 * node, -(wx[p] * wy[q]) * back)
+                    node = surface_node(gels, i + p, j + q)
+                    add_four(gels.contact_force, forces + 4 * node, -(wx[p] * wy[q]) * back)
         elif housing >= 0.0:
             gap = radius - housing - x[2]
-            if gap + taken > 0.0:
+            if gap + multiplier > 0.0:
                 if gap > deepest:
                     gap = deepest
-                    note_more(partial, env, slot_of(part), CAPPED, 1.0)
+                    record_more(env, slot_of(part), layout.CAPPED, 1.0)
                 n = vec3(0.0, 0.0, 1.0)
-                fn = ti.max(k_n * (gap + taken) - c_n * v[2], 0.0)
-                taken = ti.max(taken + MULTIPLIER_RATE * gap, 0.0)
+                fn = ti.max(k_n * (gap + multiplier) - c_n * v[2], 0.0)
+                multiplier = ti.max(multiplier + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vec3(v[0], v[1], 0.0), fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
                 touching, housed = True, True
                 overlap = gap
-    kept = Kept([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
+    remembered = ContactHistory([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
     if touching:
-        kept = Kept([slip[0], slip[1], slip[2], taken, moved[0], moved[1]])
-        note_most(partial, env, slot_of(part), OVERLAP, overlap)
-    return touching, housed, force, kept
+        remembered = ContactHistory([slip[0], slip[1], slip[2], multiplier, moved[0], moved[1]])
+        record_most(env, slot_of(part), layout.OVERLAP, overlap)
+    return touching, housed, force, remembered

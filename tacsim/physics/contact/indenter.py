@@ -5,24 +5,21 @@ Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penal
 Everything is in the sensor frame [mm, MPa].
 """
 
+from typing import Any, NamedTuple
+
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import CONTACT_DAMPING, TANGENT_STIFFNESS, friction, skin_sum, spline, surface_node
-from tacsim.physics.exec.lanes import ON_DEVICE, add_four, copy_of, note_most, note_sum, part_range, slot_of, vec3, vec4
-from tacsim.physics.exec.layout import (
-    FORCE,
-    FRICTION,
-    GEL_SPACING,
-    KIND,
-    OVERLAP,
-    SHAPE,
-    SHAPE_FIRST,
-    SHAPE_NODES,
-    SHAPE_ORIGIN,
-    SHAPE_SPACING,
-    STEP,
-    STIFFNESS,
+from tacsim.physics.contact.contact import (
+    CONTACT_DAMPING,
+    TANGENT_STIFFNESS,
+    friction,
+    spline,
+    surface_node,
+    surface_sum,
 )
-from tacsim.physics.gel.gel import skin_at, skin_row, touch_start
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.environment import record_most, record_sum
+from tacsim.physics.exec.lanes import ON_DEVICE, add_four, copy_of, part_range, slot_of, vec3, vec4
+from tacsim.physics.gel.kernels import contact_force_start, surface_at, surface_row
 
 Slip = ti.types.ndarray(dtype=vec3, ndim=3)
 Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
@@ -30,9 +27,27 @@ Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
-FAR = 1e9
-FAR_CELL = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
+UNKNOWN = 1e9  # distance where none is known
+CELL_REACH = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
 MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
+
+
+class Indenter(NamedTuple):
+    """The indenters of all environments inside a kernel: memory of the quadrature points, distances from a mesh."""
+
+    slip: Any
+    pressure: Any
+    values: Any
+
+
+class DistanceGrid(NamedTuple):
+    """Distances of one environment's mesh inside a kernel: `values` has `nodes` of them, from number `first` on."""
+
+    values: Any
+    first: Any
+    nodes: Any
+    origin: Any
+    spacing: Any
 
 
 @ti.func
@@ -71,14 +86,13 @@ def box_distance(size, y):
 
 
 @ti.func
-def signed_distance(env, kind, size, y, values: ti.template(), first, nodes, origin, spacing):
+def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
     """Distance from the indenter's surface (negative inside) and its outward normal, at y in the indenter's frame.
 
     size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; of a mesh half extents of
-    its bounding box. first, nodes, origin, spacing: of this environment's distance grid, of which `values` has `nodes`
-    from number `first` on along each axis; the world keeps at hand what can touch (`PressState.cover`).
+    its bounding box. The world lays as much of a mesh's grid as can touch (`PressState.cover`).
     """
-    phi, n = FAR, vec3(0.0, 0.0, 1.0)
+    phi, n = UNKNOWN, vec3(0.0, 0.0, 1.0)
     if kind == SPHERE:
         r = y.norm()
         phi = r - size[0]
@@ -87,21 +101,21 @@ def signed_distance(env, kind, size, y, values: ti.template(), first, nodes, ori
         phi, n = box_distance(size, y)
     elif kind == CYLINDER:
         r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
-        phi, radial = corner_distance(vec3(r - size[0], -FAR, ti.abs(y[2]) - size[2]), vec3(1.0))
+        phi, radial = corner_distance(vec3(r - size[0], -UNKNOWN, ti.abs(y[2]) - size[2]), vec3(1.0))
         n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])
     else:
-        at = (y - origin) / spacing
+        at = (y - grid.origin) / grid.spacing
         whole = ti.floor(at)
-        cell, w = whole.cast(ti.i32) - first, at - whole
+        cell, w = whole.cast(ti.i32) - grid.first, at - whole
         known = True
         for d in ti.static(range(3)):
-            known = known and cell[d] >= 0 and cell[d] < nodes[d] - 1
+            known = known and cell[d] >= 0 and cell[d] < grid.nodes[d] - 1
         if known:
             phi = 0.0
             n = vec3(0.0)
             for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
                 wx, wy, wz = (w[0] if a else 1.0 - w[0]), (w[1] if b else 1.0 - w[1]), (w[2] if c else 1.0 - w[2])
-                value = values[env, cell[0] + a, cell[1] + b, cell[2] + c]
+                value = grid.values[env.index, cell[0] + a, cell[1] + b, cell[2] + c]
                 phi += value * wx * wy * wz
                 n += value * vec3((2 * a - 1) * wy * wz, (2 * b - 1) * wx * wz, (2 * c - 1) * wx * wy)
             n = n / ti.max(n.norm(), 1e-12)
@@ -109,29 +123,27 @@ def signed_distance(env, kind, size, y, values: ti.template(), first, nodes, ori
 
 
 @ti.func
-def indent(
-    env, part, it, drive: ti.template(), skin: ti.template(), touch: ti.template(), slip: ti.template(),
-    pressure: ti.template(), values: ti.template(), params: ti.template(), counts: ti.template(),
-    partial: ti.template(), nx, ny,
-):  # fmt: skip
+def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template(), indenter: ti.template()):
     """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
 
-    drive: pose and velocity of the indenter in the sensor frame; slip, pressure: memory of each quadrature point.
+    drive: pose and velocity of the indenter in the sensor frame.
     """
-    h, k_n, mu, dt = params[env, GEL_SPACING], params[env, STIFFNESS], params[env, FRICTION], params[env, STEP]
-    kind, size = counts[env, KIND], vec3(params[env, SHAPE], params[env, SHAPE + 1], params[env, SHAPE + 2])
-    grid_origin = vec3(params[env, SHAPE_ORIGIN], params[env, SHAPE_ORIGIN + 1], params[env, SHAPE_ORIGIN + 2])
-    grid_spacing = params[env, SHAPE_SPACING]
-    nodes = ti.Vector([counts[env, SHAPE_NODES], counts[env, SHAPE_NODES + 1], counts[env, SHAPE_NODES + 2]])
-    first_node = ti.Vector([counts[env, SHAPE_FIRST], counts[env, SHAPE_FIRST + 1], counts[env, SHAPE_FIRST + 2]])
-    rows = [vec3(drive[env, it, 0, r, 0], drive[env, it, 0, r, 1], drive[env, it, 0, r, 2]) for r in range(6)]
+    e, nx, ny = env.index, gels.nx, gels.ny
+    h, k_n = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS)
+    mu, dt = env.param(layout.FRICTION), env.param(layout.STEP)
+    kind, size = env.count(layout.KIND), env.param3(layout.SHAPE)
+    nodes = ti.Vector([env.count(layout.SHAPE_NODES + d) for d in range(3)])
+    first = ti.Vector([env.count(layout.SHAPE_FIRST + d) for d in range(3)])
+    origin, spacing = env.param3(layout.SHAPE_ORIGIN), env.param(layout.SHAPE_SPACING)
+    grid = ti.static(DistanceGrid(indenter.values, first, nodes, origin, spacing))
+    rows = [vec3([drive[e, it, 0, r, c] for c in range(3)]) for r in range(6)]
     rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
     area = h * h / (POINTS * POINTS)
     c_n = CONTACT_DAMPING * k_n * dt
     back = rotate.transpose()
     total, moment = vec3(0.0), vec3(0.0)
     deepest = 0.0
-    row, pushed = skin_row(env, 1, 0, nx), touch_start(env, copy_of(part), 1, 0, nx, ny)
+    row, forces = surface_row(env, gels, 0), contact_force_start(env, gels, copy_of(part), 0)
     first_cell, last_cell, low, high = 0, 0, 0, ny
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny
@@ -141,68 +153,66 @@ def indent(
     for cell_i in range(first_cell, last_cell):
         for cell_j in range(low, high):
             # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh,
-            # whose distances are true only near it, that of its bounding box. A distance grows no faster than the way,
-            # and no point of the cell is farther from its middle than two elements.
+            # whose distances are true only near it, that of its bounding box. A distance grows no faster than
+            # the path, and no point of the cell is farther from its middle than two elements.
             middle = vec3(0.0)
             for p, q in ti.static(ti.ndrange(2, 2)):
-                node = skin_at(row + cell_i + p + 1, cell_j + q + 1, ny)
-                middle += 0.25 * vec3(skin[node], skin[node + 1], skin[node + 2])
+                node = surface_at(gels, row + cell_i + p + 1, cell_j + q + 1)
+                middle += 0.25 * vec3([gels.surface[node + c] for c in range(3)])
             at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
             at += middle
             far = 0.0
             if kind == GRID:
                 far, _ = box_distance(size, back @ (at - centre))
             else:
-                far, _ = signed_distance(
-                    env, kind, size, back @ (at - centre), values, first_node, nodes, grid_origin, grid_spacing
-                )
-            if far > FAR_CELL * h:
+                far, _ = signed_distance(env, kind, size, back @ (at - centre), grid)
+            if far > CELL_REACH * h:
                 # Nothing passes this margin in one substep, so what is beyond has forgotten.
-                if far < (FAR_CELL + 1) * h:
+                if far < (CELL_REACH + 1) * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
-                        slip[env, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
-                        pressure[env, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
+                        indenter.slip[e, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
+                        indenter.pressure[e, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
             else:
                 for point in range(POINTS * POINTS):
                     i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
                     a, b = (i + 0.5) / POINTS, (j + 0.5) / POINTS
                     first_i, wx, _dx = spline(a)
                     first_j, wy, _dy = spline(b)
-                    us = skin_sum(skin, row, first_i, first_j, wx, wy, ny)
-                    vs = skin_sum(skin, row + nx + 3, first_i, first_j, wx, wy, ny)
+                    us = surface_sum(gels, row, first_i, first_j, wx, wy)
+                    vs = surface_sum(gels, row + nx + 3, first_i, first_j, wx, wy)
                     x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
-                    phi, n_local = signed_distance(
-                        env, kind, size, back @ (x - centre), values, first_node, nodes, grid_origin, grid_spacing
-                    )
+                    phi, n_local = signed_distance(env, kind, size, back @ (x - centre), grid)
                     touching = False
                     if phi < 0.5 * h:
                         n = rotate @ n_local  # out of the indenter: pushes the gel
                         moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
                         closing = moving.dot(n)
-                        normal = pressure[env, i, j] - k_n * phi + c_n * closing
+                        normal = indenter.pressure[e, i, j] - k_n * phi + c_n * closing
                         if normal > 0.0:
                             touching = True
-                            ft, memory = friction(
-                                slip[env, i, j], n, moving - closing * n, normal, TANGENT_STIFFNESS * k_n, c_n, mu, dt
+                            sliding = moving - closing * n
+                            ft, slip = friction(
+                                indenter.slip[e, i, j], n, sliding, normal, TANGENT_STIFFNESS * k_n, c_n, mu, dt
                             )
-                            slip[env, i, j] = memory
-                            pressure[env, i, j] = ti.max(pressure[env, i, j] - MULTIPLIER_RATE * k_n * phi, 0.0)
+                            indenter.slip[e, i, j] = slip
+                            multiplier = indenter.pressure[e, i, j] - MULTIPLIER_RATE * k_n * phi
+                            indenter.pressure[e, i, j] = ti.max(multiplier, 0.0)
                             force = area * (normal * n - ft)
                             total += force
                             moment += x.cross(force)
                             deepest = ti.max(deepest, -phi)
                             push = vec4(force[0], force[1], force[2], 0.0)
                             for p, q in ti.static(ti.ndrange(3, 3)):
-                                node = surface_node(first_i + p, first_j + q, nx, ny)
-                                add_four(touch, pushed + 4 * node, (wx[p] * wy[q]) * push)
+                                node = surface_node(gels, first_i + p, first_j + q)
+                                add_four(gels.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
                     if not touching:
-                        slip[env, i, j] = vec3(0.0)
-                        pressure[env, i, j] = 0.0
+                        indenter.slip[e, i, j] = vec3(0.0)
+                        indenter.pressure[e, i, j] = 0.0
     slot = slot_of(part)
     if ti.static(ON_DEVICE):
-        note_most(partial, env, slot, OVERLAP, deepest)
+        record_most(env, slot, layout.OVERLAP, deepest)
     else:
-        partial[env, part, OVERLAP] = deepest
+        env.partial[e, part, layout.OVERLAP] = deepest
     for d in ti.static(range(3)):
-        note_sum(partial, env, slot, FORCE + d, total[d])
-        note_sum(partial, env, slot, FORCE + 3 + d, moment[d])
+        record_sum(env, slot, layout.FORCE + d, total[d])
+        record_sum(env, slot, layout.FORCE + 3 + d, moment[d])

@@ -22,7 +22,7 @@ ON_DEVICE = DEVICE != "cpu"
 LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
 PARTS = 4  # of an environment's work on the CPU; of its sums everywhere
 CACHE_LINE = 16  # floats
-MOST = 2**30  # numbers in an array that kernels take
+MAX_NUMBERS = 2**30  # numbers in an array that kernels take
 COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
 
 NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
@@ -30,12 +30,8 @@ NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in o
 vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
-real = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
+lanes = ti.types.vector(LANES, ti.f32)  # one number of LANES neighbours
 strip = ti.types.vector(4 * NODES, ti.f32)  # four numbers of each of NODES neighbours
-
-Params = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, facts)
-Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, counts)
-Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, numbers)
 
 
 def padded(n: int) -> int:
@@ -46,12 +42,13 @@ def padded(n: int) -> int:
 def aligned_zeros(*shape: int) -> np.ndarray:
     """float32 zeros that begin at a cache line, so that no vector register's worth of them lies across two.
 
-    Raises MemoryError for more than kernels can count (see `small`): 4 GB.
+    Raises MemoryError for more than kernels can count (see `bounded`): 4 GB.
     """
     count = math.prod(shape)
-    if count > MOST:
+    if count > MAX_NUMBERS:
         raise MemoryError(
-            f"an array of {count:,} numbers, kernels count to {MOST:,}: use a coarser preset, or fewer worlds a batch"
+            f"an array of {count:,} numbers, kernels count to {MAX_NUMBERS:,}: use a coarser "
+            f"preset, or fewer worlds a batch"
         )
     memory = np.zeros(count + CACHE_LINE, np.float32)
     start = -memory.ctypes.data // 4 % CACHE_LINE
@@ -59,7 +56,7 @@ def aligned_zeros(*shape: int) -> np.ndarray:
 
 
 @ti.func
-def keep_or(never, old, new):
+def overwrite(never, old, new):
     """new; `old` in words only (never is 0, which the compiler can't know): a value stored over the one just read."""
     if ti.static(ON_DEVICE):
         return new
@@ -74,32 +71,32 @@ def opaque(never, index):
 
 
 @ti.func
-def small(index, width: ti.template()):
+def bounded(index, width: ti.template()):
     """index, of things of `width` numbers. That it is neither negative nor large lets the compiler see which numbers
     behind it are neighbours."""
     if ti.static(ON_DEVICE):
         return index
     else:
-        return index & (MOST // width - 1)
+        return index & (MAX_NUMBERS // width - 1)
 
 
 @ti.func
-def lanes_at(array: ti.template(), at):
+def load_lanes(array: ti.template(), at):
     """LANES neighbours, from any place on."""
-    start = small(at, 1)
-    return real([array[start + lane] for lane in range(LANES)])
+    start = bounded(at, 1)
+    return lanes([array[start + lane] for lane in range(LANES)])
 
 
 @ti.func
-def put_lanes(array: ti.template(), at, values, never):
-    start = small(at, 1)
-    kept = real([keep_or(never, array[start + lane], values[lane]) for lane in range(LANES)])
+def store_lanes(array: ti.template(), at, values, never):
+    start = bounded(at, 1)
+    kept = lanes([overwrite(never, array[start + lane], values[lane]) for lane in range(LANES)])
     for lane in ti.static(range(LANES)):
         array[start + lane] = kept[lane]
 
 
 @ti.func
-def least_lane(rows: ti.template(), row: ti.template()):
+def smallest_lane(rows: ti.template(), row: ti.template()):
     """Smallest number of a row of lanes."""
     least = rows[row, 0]
     for lane in ti.static(range(1, LANES)):
@@ -108,7 +105,7 @@ def least_lane(rows: ti.template(), row: ti.template()):
 
 
 @ti.func
-def first_of(count, part, parts):
+def share_start(count, part, parts):
     """Where share `part` of `count` things begins; it ends where the next begins."""
     return count * part // parts
 
@@ -119,7 +116,7 @@ def part_range(count, part):
     if ti.static(ON_DEVICE):
         return part, part + 1
     else:
-        return first_of(count, part, PARTS), first_of(count, part + 1, PARTS)
+        return share_start(count, part, PARTS), share_start(count, part + 1, PARTS)
 
 
 @ti.func
@@ -157,45 +154,3 @@ def add_four(array: ti.template(), at, value):
             ti.atomic_add(array[at + c], value[c])
         else:
             array[at + c] = array[at + c] + value[c]
-
-
-# What a part notes in `partial`. On the CPU a slot has one writer. On a device it has many, so a sum starts from a zero
-# that the launch's kernel has put there, and what changes nothing is not written, since that would only stand in line.
-
-
-@ti.func
-def note_sum(partial: ti.template(), env, slot, number, value):
-    """The part's whole sum of one substep."""
-    if ti.static(ON_DEVICE):
-        if value != 0.0:  # true of what is not a number
-            ti.atomic_add(partial[env, slot, number], value)
-    else:
-        partial[env, slot, number] = value
-
-
-@ti.func
-def note_more(partial: ti.template(), env, slot, number, value):
-    """What is added over a launch."""
-    if ti.static(ON_DEVICE):
-        if value != 0.0:
-            ti.atomic_add(partial[env, slot, number], value)
-    else:
-        partial[env, slot, number] += value
-
-
-@ti.func
-def note_least(partial: ti.template(), env, slot, number, value):
-    if ti.static(ON_DEVICE):
-        if value < partial[env, slot, number]:
-            ti.atomic_min(partial[env, slot, number], value)
-    else:
-        partial[env, slot, number] = ti.min(partial[env, slot, number], value)
-
-
-@ti.func
-def note_most(partial: ti.template(), env, slot, number, value):
-    if ti.static(ON_DEVICE):
-        if value > partial[env, slot, number]:
-            ti.atomic_max(partial[env, slot, number], value)
-    else:
-        partial[env, slot, number] = ti.max(partial[env, slot, number], value)

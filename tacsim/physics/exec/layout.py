@@ -15,7 +15,7 @@ BODY_HARDENING = 10  # growth of the limit by equivalent plastic strain [-]
 BODY_MASS = 11  # of a particle [N mm]: over wave speed^2
 BODY_VOLUME = 12  # of a particle [mm^3]
 BODY_DAMPING = 13  # rate [1/mm], against the driven affine motion
-LIGHTNESS = 14  # how much lighter the body answers to its total force [-]
+RIGID_MASS_SCALE = 14  # how much lighter the body answers to its total force [-]
 STIFFNESS = 15  # of one particle's contact [N/mm], or of the indenter's [MPa/mm]
 FRICTION = 16  # of gel 0 and gel 1 [-]
 HOUSING = 18  # below the gel's surface [mm]; negative: none
@@ -24,13 +24,13 @@ ORIGIN = 22  # of the grid x, y, z [mm]
 SHAPE = 25  # of an indenter: three sizes [mm]
 SHAPE_ORIGIN = 28  # of its distance grid, node (0, 0, 0): x, y, z [mm]
 SHAPE_SPACING = 31  # of its distance grid [mm]
-SPREAD = 32  # share of an incompressible body's widening that is part of the motion its damping is against
+WIDENING = 32  # share of an incompressible body's widening that is part of the motion its damping is against
 CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
-TURNING = 36  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
+INVERSE_INERTIA = 36  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
 PARAMS = 42
 
 # counts (environments, COUNTS) int32
-NEVER = 0  # always 0: see tacsim.physics.exec.lanes.keep_or
+ZERO = 0  # always 0: see tacsim.physics.exec.lanes.keep_or
 STEPS = 1  # substeps of this launch
 PARTICLES = 2
 GRID = 3  # node counts x, y, z
@@ -52,15 +52,15 @@ CAPPED = 4  # contact overlaps cut to the largest allowed
 OVERLAP = 5  # largest of the last substep [mm]
 FORCE = 6  # on gel 0, gel 1: force x, y, z [N], moment x, y, z [N mm]; of the last substep
 BACKING = 18  # force of this part's gel on its backing [N], of the last substep
-MOTION = 21  # sum of the particles' velocities
-HOUSED = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
+VELOCITY_SUM = 21  # sum of the particles' velocities
+HOUSING_FORCE = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
 NUMBERS = 30
 
 # rows of a body's particles, one number of all of them each: float32
 PLANE = 0  # tangent plane x, y, z [1/mm] (tacsim.physics.body.surface)
-PLACE = 3  # x, y, z [mm]
+POSITION = 3  # x, y, z [mm]
 STRAIN = 6  # elastic e = b_e - I: xx, yy, zz, xy, xz, yz
-FLOW = 12  # equivalent plastic strain
+PLASTIC_STRAIN = 12  # equivalent plastic strain
 VELOCITY = 13  # x, y, z
 AFFINE = 16  # affine velocity C, column by column [1/mm]
-KNOWN = 25
+PARTICLE_ROWS = 25

@@ -1,10 +1,10 @@
 """The gel's element: a trilinear hexahedron with one-point quadrature and hourglass stiffness (Flanagan & Belytschko
-1981), neo-Hookean. LANES neighbours at once, laid out as in tacsim/physics/body/transfers.py."""
+1981), neo-Hookean. LANES neighbours at once, laid out as the particles are in tacsim/physics/body/transfers.py."""
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import lanes_log1p
-from tacsim.physics.exec.lanes import LANES, lanes_at, opaque, put_lanes, real, vec3
-from tacsim.physics.exec.layout import GEL_LAMBDA, GEL_MU, GEL_SPACING
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.lanes import LANES, lanes, load_lanes, opaque, store_lanes, vec3
 
 HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
 SMALLEST_STRETCH = 0.05  # J below this counts as inverted
@@ -24,21 +24,20 @@ def fill(rows: ti.template(), row, values):
 
 @ti.func
 def element_block(
-    env, u, axis, layer, to, row, block, nodes: ti.template(), across_j, across_i, corners: ti.template(),
-    lattice: ti.template(), params: ti.template(), rows: ti.template(), never,
+    env: ti.template(), gels: ti.template(), block, u, axis, layer, to, row, rows: ti.template()
 ):  # fmt: skip
     """Forces of LANES elements on their corners; notes the smallest det F of each lane in row SMALLEST.
 
-    u: where the displacement of the block's first node begins, `axis` and `layer` the way to the next of each; to:
-    where the forces go, `row` the way to the next corner or axis; across_j, across_i: the way to the next node.
+    u: where the displacement of the block's first node stands in `nodes`, `axis` and `layer` the distance to the next
+    of each; to: where the forces go in `corners`, `row` the distance to the next corner or axis.
     """
-    h, mu, lam = params[env, GEL_SPACING], params[env, GEL_MU], params[env, GEL_LAMBDA]
-    quarter = 0.25 / h
+    h, mu, lam = env.param(layout.GEL_SPACING), env.param(layout.GEL_MU), env.param(layout.GEL_LAMBDA)
+    never, quarter = env.count(layout.ZERO), 0.25 / h
     for d in range(3):  # not unrolled here: kernels of more statements compile for much longer
         for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
-            at = u + d * axis + k * layer + j * across_j + i * across_i
-            fill(rows, 8 * d + 4 * i + 2 * j + k, lanes_at(nodes, at))
-    fill(rows, WHOLE, lattice[opaque(never, block)])
+            at = u + d * axis + k * layer + j + i * (gels.ny + 1)
+            fill(rows, 8 * d + 4 * i + 2 * j + k, load_lanes(gels.nodes, at))
+    fill(rows, WHOLE, gels.lattice[opaque(never, block)])
     for lane in range(LANES):
         whole = rows[WHOLE, lane]
         area, stiffness = (0.25 * h * h) * whole, (HOURGLASS * 2.0 * mu * h / 8.0) * whole
@@ -80,4 +79,4 @@ def element_block(
                 rows[3 * k + d, lane] = yz[k] + odd[k]
                 rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
     for r in range(24):
-        put_lanes(corners, to + r * row, real([rows[r, lane] for lane in range(LANES)]), never)
+        store_lanes(gels.corners, to + r * row, lanes([rows[r, lane] for lane in range(LANES)]), never)

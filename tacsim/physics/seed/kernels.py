@@ -8,7 +8,7 @@ All particles lie in one array: lower gel, upper gel, body. Loops are serial and
 """
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.material import ELASTIC, full, stress_near, vec6
+from tacsim.physics.body.material import ELASTIC, full, stress_small_strain, vec6
 
 f32 = ti.f32
 Vec3 = ti.types.vector(3, f32)
@@ -174,7 +174,7 @@ def body_law(F, solid):
     tau = Mat3(0.0)
     far = 1
     if solid.limit >= ELASTIC:
-        near, far = stress_near(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
+        near, far = stress_small_strain(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
         tau = full(near)
     if far != 0:
         elastic, tau = return_mapping(F, solid)

@@ -5,7 +5,7 @@ substeps. What happens to one particle or node stands in the functions that the 
 the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
 
 Arrays stay on the device for a launch. Before it they are copied there (distances from meshes only once they have
-changed), after it what has changed is copied back, so everybody else goes on working with NumPy.
+changed), after it what has changed is copied back, so everybody else is_active on working with NumPy.
 """
 
 from typing import Any
@@ -14,130 +14,107 @@ import numpy as np
 
 from tacsim.compute.runtime import launching, ti
 from tacsim.physics.body.plasticine import BodyState
-from tacsim.physics.body.transfers import Particles, Strips, grid_to_particles, particles_to_grid
-from tacsim.physics.contact.contact import Kept
-from tacsim.physics.contact.indenter import POINTS, Pressure, Slip, Values, indent
-from tacsim.physics.exec.lanes import (
-    LANES,
-    PARTS,
-    Counts,
-    Params,
-    Partial,
-    least_lane,
-    note_least,
-    real,
-    strip,
-    vec3,
-    vec4,
-)
-from tacsim.physics.exec.layout import (
-    BACKING,
-    CAPACITY,
-    ELEMENTS,
-    FORCE,
-    GRID,
-    HOUSED,
-    MOTION,
-    OVERLAP,
-    PARTICLES,
-    SMALLEST_VOLUME,
-    STEPS,
-)  # fmt: skip
+from tacsim.physics.body.transfers import Body, Particles, Strips, grid_to_particles, particles_to_grid
+from tacsim.physics.contact.contact import ContactHistory
+from tacsim.physics.contact.indenter import POINTS, Indenter, Pressure, Slip, Values, indent
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.environment import Counts, Environment, Params, Partial, record_least
+from tacsim.physics.exec.lanes import LANES, PARTS, lanes, smallest_lane, strip, vec3, vec4
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
-from tacsim.physics.gel.gel import (
+from tacsim.physics.gel.gel import GelState
+from tacsim.physics.gel.kernels import (
+    ContactForce,
     Corners,
-    GelState,
     Lattice,
     Nodes,
-    Skin,
-    Touch,
+    Surface,
     gel_advance,
+    gels_of,
     margin,
     node_block,
-    skin_at,
-    skin_row,
+    surface_at,
+    surface_row,
 )
-from tacsim.physics.worlds.hybrid_kernels import ContactMemory, Drive, grid_update, touch_gel
+from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, gel_contact, grid_update
 
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
 
 
 @ti.func
-def goes(env, it, counts: ti.template()):
+def is_active(env: ti.template(), it):
     """Whether an environment takes part in this substep."""
-    return it < counts[env, STEPS]
+    return it < env.count(layout.STEPS)
 
 
 @ti.func
-def clear_sums(env, slot, partial: ti.template()):
-    """What parts add up anew each substep, but for the particles' motion, which outlives it."""
-    partial[env, slot, OVERLAP] = 0.0
+def grid_nodes(env: ti.template()):
+    return env.count(layout.GRID) * env.count(layout.GRID + 1) * env.count(layout.GRID + 2)
+
+
+@ti.func
+def clear_sums(env: ti.template(), slot):
+    """What parts add up anew each substep, but for the particles' velocities, which outlive it."""
+    env.partial[env.index, slot, layout.OVERLAP] = 0.0
     for n in range(12):
-        partial[env, slot, FORCE + n] = 0.0
+        env.partial[env.index, slot, layout.FORCE + n] = 0.0
     for n in range(3):
-        partial[env, slot, BACKING + n] = 0.0
+        env.partial[env.index, slot, layout.BACKING + n] = 0.0
     for n in range(6):
-        partial[env, slot, HOUSED + n] = 0.0
+        env.partial[env.index, slot, layout.HOUSING_FORCE + n] = 0.0
 
 
 @ti.func
-def element(
-    env, gel, k, block, nodes: ti.template(), corners: ti.template(), lattice: ti.template(), params: ti.template(),
-    partial: ti.template(), layers, nx, ny,
-):  # fmt: skip
-    """Forces of one element on its corners; gel: counted over all environments."""
-    blocks = (nx + 1) * (ny + 1)
-    axis, row = (layers + 1) * blocks, blocks + ny + 2
-    u = margin(ny) + gel * 9 * axis + k * blocks + block
-    to = margin(ny) + (gel * layers + k) * 24 * row + ny + 2 + block
+def element(env: ti.template(), gels: ti.template(), g, k, block):
+    """Forces of one element of gel g on its corners."""
+    gel, blocks = env.index * gels.number + g, (gels.nx + 1) * (gels.ny + 1)
+    axis, row = (gels.layers + 1) * blocks, blocks + gels.ny + 2
+    u = margin(gels) + gel * 9 * axis + k * blocks + block
+    to = margin(gels) + (gel * gels.layers + k) * 24 * row + gels.ny + 2 + block
     rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
     rows[SMALLEST, 0] = 1e9
-    element_block(env, u, axis, blocks, to, row, block, nodes, 1, ny + 1, corners, lattice, params, rows, 0)
-    note_least(partial, env, block % PARTS, SMALLEST_VOLUME, least_lane(rows, SMALLEST))
+    element_block(env, gels, block, u, axis, blocks, to, row, rows)
+    record_least(env, block % PARTS, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
 
 
 @ti.func
-def column(
-    env, g, gels, block, nodes: ti.template(), skin: ti.template(), touch: ti.template(), corners: ti.template(),
-    lattice: ti.template(), params: ti.template(), counts: ti.template(), partial: ti.template(), layers, nx, ny,
-):  # fmt: skip
+def column(env: ti.template(), gels: ti.template(), g, block):
     """Forces on one column of nodes of gel g, from its backing to its surface, and its motion."""
-    gel, blocks = env * gels + g, (nx + 1) * (ny + 1)
-    axis, row = (layers + 1) * blocks, blocks + ny + 2
+    gel, blocks, layers = env.index * gels.number + g, (gels.nx + 1) * (gels.ny + 1), gels.layers
+    axis, row = (layers + 1) * blocks, blocks + gels.ny + 2
     for k in range(layers + 1):
-        i = margin(ny) + (gel * layers + ti.min(k, layers - 1)) * 24 * row + ny + 2 + block
-        j = margin(ny) + (gel * layers + ti.max(k - 1, 0)) * 24 * row + ny + 2 + block
+        i = margin(gels) + (gel * layers + ti.min(k, layers - 1)) * 24 * row + gels.ny + 2 + block
+        j = margin(gels) + (gel * layers + ti.max(k - 1, 0)) * 24 * row + gels.ny + 2 + block
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for d in ti.static(range(3)):
-            node_block(
-                margin(ny) + (gel * 9 + 6 + d) * axis + k * blocks + block, i + d * row, j + d * row, below, above, row,
-                nodes, corners, 1, ny + 1, 0,
-            )  # fmt: skip
-    gel_advance(env, g * blocks + block, gels, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
+            to = margin(gels) + (gel * 9 + 6 + d) * axis + k * blocks + block
+            node_block(gels, to, i + d * row, j + d * row, below, above, row, 0)
+    gel_advance(env, g * blocks + block, gels)
 
 
 @ti.kernel
 def press_substep(
     it: ti.i32, drive: Drive,
-    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values, params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
-    for at in range(counts.shape[0] * PARTS):
-        if goes(at // PARTS, it, counts):
-            clear_sums(at // PARTS, at % PARTS, partial)
-    for env, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
-        if goes(env, it, counts):
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
-            element(env, env, k, n, nodes, corners, lattice, params, partial, layers, nx, ny)
-    for env, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
-        if goes(env, it, counts):
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
-            indent(env, cell, it, drive, skin, touch, slip, pressure, values, params, counts, partial, nx, ny)
-    for env, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
-        if goes(env, it, counts):
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
-            column(env, 0, 1, n, nodes, skin, touch, corners, lattice, params, counts, partial, layers, nx, ny)
+    for e, slot in ti.ndrange(counts.shape[0], PARTS):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            clear_sums(env, slot)
+    for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, k, n)
+    for e, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
+            indent(env, cell, it, drive, gels, ti.static(Indenter(slip, pressure, values)))
+    for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            column(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, n)
 
 
 # One kernel may have local arrays in one of its loops only: Taichi 1.7 mixes up the constants of several (IR broken:
@@ -146,87 +123,93 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    it: ti.i32, nodes: Nodes, skin: Skin, corners: Corners, lattice: Lattice, masses: Strips,
-    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most: ti.i32,
+    it: ti.i32,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice, masses: Strips,
+    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body
     (`tacsim.physics.worlds.hybrid_kernels.substeps`): what is summed starts from zero; elements pull at their corners.
-    most: nodes of the largest grid."""
-    for at in range(counts.shape[0] * PARTS):
-        if goes(at // PARTS, it, counts):
-            clear_sums(at // PARTS, at % PARTS, partial)
-    for env, g in ti.ndrange(counts.shape[0], 2):
-        if goes(env, it, counts):
-            ceiling[env, g] = 0.0
-    for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
-        if goes(env, it, counts):
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
-            height = skin[skin_at(skin_row(env, 2, g, nx) + n // (ny + 1) + 1, n % (ny + 1) + 1, ny) + 2]
-            if height > ceiling[env, g]:
-                ti.atomic_max(ceiling[env, g], height)
-    for env, node in ti.ndrange(counts.shape[0], most):
-        if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
-            masses[env * counts[env, CAPACITY] + node] = strip(0.0)
-    for env, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
-        if goes(env, it, counts):
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
-            element(env, env * 2 + g, k, n, nodes, corners, lattice, params, partial, layers, nx, ny)
+    most_nodes: of the largest grid."""
+    for e, slot in ti.ndrange(counts.shape[0], PARTS):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            clear_sums(env, slot)
+    for e, g in ti.ndrange(counts.shape[0], 2):
+        if it < counts[e, layout.STEPS]:
+            ceiling[e, g] = 0.0
+    for e, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+            i, j = n // (gels.ny + 1), n % (gels.ny + 1)
+            height = surface[surface_at(gels, surface_row(env, gels, g) + i + 1, j + 1) + 2]
+            if height > ceiling[e, g]:
+                ti.atomic_max(ceiling[e, g], height)
+    for e, node in ti.ndrange(counts.shape[0], most_nodes):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it) and node < grid_nodes(env):
+            masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
+    for e, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, k, n)
 
 
 @ti.kernel
 def scatter_of_hybrid(
     it: ti.i32, drive: Drive,
-    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
-    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, room: ti.i32, most: ti.i32,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
+    particles: Particles, masses: Strips, velocities: Strips, histories: ContactHistories,
+    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, most_particles: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
 
-    room: particles of the largest body.
+    most_particles, most_nodes: of the largest body and grid.
     """
-    for env, p in ti.ndrange(counts.shape[0], room):
-        if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
+    for e, p in ti.ndrange(counts.shape[0], most_particles):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it) and p < env.count(layout.PARTICLES):
+            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+            body = ti.static(Body(particles, masses, velocities))
             for g in range(2):
-                touch_gel(
-                    env, p, g, it, drive, particles, memory, skin, touch, params, counts, partial, ceiling[env, g],
-                    layers, nx, ny,
-                )  # fmt: skip
-    for env, p in ti.ndrange(counts.shape[0], room):
-        if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            particles_to_grid(env, p, particles, masses, params, counts, partial)
-    for env, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
-        if goes(env, it, counts):
-            nx, ny = counts[env, ELEMENTS], counts[env, ELEMENTS + 1]
-            column(env, g, 2, n, nodes, skin, touch, corners, lattice, params, counts, partial, layers, nx, ny)
-    for env, node in ti.ndrange(counts.shape[0], most):
-        if goes(env, it, counts) and node < counts[env, GRID] * counts[env, GRID + 1] * counts[env, GRID + 2]:
-            grid_update(env, node, it, drive, masses, velocities, params, counts, partial)
-    for at in range(counts.shape[0] * PARTS):
-        if goes(at // PARTS, it, counts):
-            for d in range(3):
-                partial[at // PARTS, at % PARTS, MOTION + d] = 0.0
+                gel_contact(env, p, g, it, drive, body, histories, gels, ceiling[e, g])
+    for e, p in ti.ndrange(counts.shape[0], most_particles):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it) and p < env.count(layout.PARTICLES):
+            particles_to_grid(env, p, ti.static(Body(particles, masses, velocities)))
+    for e, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it):
+            column(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, n)
+    for e, node in ti.ndrange(counts.shape[0], most_nodes):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it) and node < grid_nodes(env):
+            grid_update(env, node, it, drive, ti.static(Body(particles, masses, velocities)))
+    for e, slot, d in ti.ndrange(counts.shape[0], PARTS, 3):
+        if it < counts[e, layout.STEPS]:
+            partial[e, slot, layout.VELOCITY_SUM + d] = 0.0
 
 
 @ti.kernel
 def gather_of_hybrid(
-    it: ti.i32, particles: Particles, velocities: Strips, params: Params, counts: Counts, partial: Partial,
-    room: ti.i32,
+    it: ti.i32, particles: Particles, masses: Strips, velocities: Strips,
+    params: Params, counts: Counts, partial: Partial, most_particles: ti.i32,
 ):  # fmt: skip
     """Last third: the grid back to the particles."""
-    for env, p in ti.ndrange(counts.shape[0], room):
-        if goes(env, it, counts) and p < counts[env, PARTICLES]:
-            grid_to_particles(env, p, particles, velocities, params, counts, partial)
+    for e, p in ti.ndrange(counts.shape[0], most_particles):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, it) and p < env.count(layout.PARTICLES):
+            grid_to_particles(env, p, ti.static(Body(particles, masses, velocities)))
 
 
-class Mirror:
-    """What a device has of the host's arrays, by name; made when first asked for, and anew when a shape changes."""
+class DeviceArrays:
+    """Arrays on the device, by name: made when first asked for, and anew when a shape changes."""
 
     def __init__(self) -> None:
         self._there: dict[str, Any] = {}
         self._versions: dict[str, int] = {}
 
-    def room(self, name: str, dtype: Any, shape: tuple[int, ...]) -> Any:
+    def allocate(self, name: str, dtype: Any, shape: tuple[int, ...]) -> Any:
         """An array that only the device uses; zeros at first."""
         known = self._there.get(name)
         if known is None or known.shape != shape:
@@ -234,76 +217,77 @@ class Mirror:
             known.fill(0)
         return known
 
-    def sent(self, name: str, host: np.ndarray, dtype: Any) -> Any:
+    def upload(self, name: str, host: np.ndarray, dtype: Any) -> Any:
         """A copy of `host`, whose last axis is the vector if dtype is one."""
-        there = self.room(name, dtype, host.shape[:-1] if isinstance(dtype, type(vec4)) else host.shape)
+        there = self.allocate(name, dtype, host.shape[:-1] if isinstance(dtype, type(vec4)) else host.shape)
         there.from_numpy(np.ascontiguousarray(host))
         return there
 
-    def kept(self, name: str, host: np.ndarray, dtype: Any, version: int) -> Any:
+    def upload_if_changed(self, name: str, host: np.ndarray, dtype: Any, version: int) -> Any:
         """The same of an array that seldom changes: copied only if it has another `version` than what is there."""
         if self._versions.get(name) != version:
-            self.sent(name, host, dtype)
+            self.upload(name, host, dtype)
             self._versions[name] = version
         return self._there[name]
 
-    def bring(self, **hosts: np.ndarray) -> None:
+    def download(self, **hosts: np.ndarray) -> None:
         """Copies back into these arrays what the device has by their names."""
         for name, host in hosts.items():
             host[...] = self._there[name].to_numpy().reshape(host.shape)
 
-    def send_gels(self, gels: GelState) -> tuple[Any, ...]:
+    def upload_gels(self, gels: GelState) -> tuple[Any, ...]:
         """What every kernel with gels takes."""
-        nodes, skin, touch, corners, lattice = gels.arguments()
+        nodes, surface, contact_force, corners, lattice = gels.arguments()
         return (
-            self.sent("nodes", nodes, ti.f32), self.sent("skin", skin, ti.f32),
-            self.room("touch", ti.f32, touch.shape), self.room("corners", ti.f32, corners.shape),
-            self.sent("lattice", lattice, real),
+            self.upload("nodes", nodes, ti.f32), self.upload("surface", surface, ti.f32),
+            self.allocate("contact_force", ti.f32, contact_force.shape),
+            self.allocate("corners", ti.f32, corners.shape), self.upload("lattice", lattice, lanes),
+        )  # fmt: skip
+
+    def upload_numbers(self, params: np.ndarray, counts: np.ndarray, partial: np.ndarray) -> tuple[Any, ...]:
+        return (
+            self.upload("params", params, ti.f32), self.upload("counts", counts, ti.i32),
+            self.upload("partial", partial, ti.f32),
         )  # fmt: skip
 
 
 @launching()
 def run_press(
-    mirror: Mirror, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray, values: np.ndarray,
-    version: int, params: np.ndarray, counts: np.ndarray, partial: np.ndarray,
+    arrays: DeviceArrays, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray,
+    values: np.ndarray, version: int, numbers: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
-    """One launch; the arrays are those of `PressState`. version: another whenever `values` has changed."""
+    """One launch; the arrays are those of `PressState`. version: another whenever `values` has changed; numbers:
+    params, counts, partial."""
     arguments = (
-        mirror.sent("drive", drive, ti.f32), *mirror.send_gels(gels), mirror.sent("slip", slip, vec3),
-        mirror.sent("pressure", pressure, ti.f32), mirror.kept("values", values, ti.f32, version),
-        mirror.sent("facts", params, ti.f32), mirror.sent("counts", counts, ti.i32),
-        mirror.sent("partial", partial, ti.f32),
+        arrays.upload("drive", drive, ti.f32), *arrays.upload_gels(gels), arrays.upload("slip", slip, vec3),
+        arrays.upload("pressure", pressure, ti.f32), arrays.upload_if_changed("values", values, ti.f32, version),
+        *arrays.upload_numbers(*numbers),
     )  # fmt: skip
     for it in range(drive.shape[1]):
         press_substep(it, *arguments, gels.nodes.shape[4] - 1)
-    mirror.bring(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=partial)
+    arrays.download(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=numbers[2])
 
 
 @launching()
 def run_hybrid(
-    mirror: Mirror, drive: np.ndarray, gels: GelState, body: BodyState, memory: np.ndarray, params: np.ndarray,
-    counts: np.ndarray, partial: np.ndarray,
+    arrays: DeviceArrays, drive: np.ndarray, gels: GelState, body: BodyState, contact_history: np.ndarray,
+    numbers: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
-    """One launch; the arrays are those of `HybridState`."""
-    known, masses, velocities = body.arguments()
-    there = mirror.sent("drive", drive, ti.f32)
-    nodes, skin, touch, corners, lattice = mirror.send_gels(gels)
-    particles = mirror.sent("known", known, ti.f32)
-    mass = mirror.room("masses", strip, masses.shape[:-1])
-    velocity = mirror.room("velocities", strip, velocities.shape[:-1])
-    kept = mirror.sent("memory", memory, Kept)
-    numbers = (
-        mirror.sent("facts", params, ti.f32), mirror.sent("counts", counts, ti.i32),
-        mirror.sent("partial", partial, ti.f32),
+    """One launch; the arrays are those of `HybridState`. numbers: params, counts, partial."""
+    rows, masses, velocities = body.arguments()
+    drives, gel_arrays = arrays.upload("drive", drive, ti.f32), arrays.upload_gels(gels)
+    bodies = (
+        arrays.upload("rows", rows, ti.f32), arrays.allocate("masses", strip, masses.shape[:-1]),
+        arrays.allocate("velocities", strip, velocities.shape[:-1]),
     )  # fmt: skip
-    ceiling = mirror.room("ceiling", ti.f32, (len(counts), 2))
-    layers, room = gels.nodes.shape[4] - 1, max(body.counts)
-    most = int(counts[:, GRID : GRID + 3].prod(axis=1).max())
+    histories = arrays.upload("contact_history", contact_history, ContactHistory)
+    small = arrays.upload_numbers(*numbers)
+    counts = numbers[1]
+    ceiling = arrays.allocate("ceiling", ti.f32, (len(counts), 2))
+    layers, most_particles = gels.nodes.shape[4] - 1, max(body.counts)
+    most_nodes = int(counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max())
     for it in range(drive.shape[1]):
-        elements_of_hybrid(it, nodes, skin, corners, lattice, mass, *numbers, ceiling, layers, most)
-        scatter_of_hybrid(
-            it, there, nodes, skin, touch, corners, lattice, particles, mass, velocity, kept, *numbers, ceiling,
-            layers, room, most,
-        )  # fmt: skip
-        gather_of_hybrid(it, particles, velocity, *numbers, room)
-    mirror.bring(nodes=gels.arguments()[0], known=known, memory=memory, partial=partial)
+        elements_of_hybrid(it, *gel_arrays, bodies[1], *small, ceiling, layers, most_nodes)
+        scatter_of_hybrid(it, drives, *gel_arrays, *bodies, histories, *small, ceiling, most_particles, most_nodes)
+        gather_of_hybrid(it, *bodies, *small, most_particles)
+    arrays.download(nodes=gels.arguments()[0], rows=rows, contact_history=contact_history, partial=numbers[2])

@@ -19,7 +19,7 @@ from tacsim.physics.body.plasticine import (
     centre_of,
 )
 from tacsim.physics.body.surface import surface_points, tangent_planes
-from tacsim.physics.contact.contact import Kept
+from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.contact.gel_overlap import gel_overlap
 from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
 from tacsim.physics.exec.layout import (
@@ -34,23 +34,23 @@ from tacsim.physics.exec.layout import (
     GEL_DAMPING,
     GEL_DENSITY,
     GRAVITY,
-    HOUSED,
     HOUSING,
-    LIGHTNESS,
+    HOUSING_FORCE,
+    INVERSE_INERTIA,
     NUMBERS,
     PARAMS,
-    SPREAD,
+    RIGID_MASS_SCALE,
     STEP,
     STIFFNESS,
-    TURNING,
+    WIDENING,
 )  # fmt: skip
 from tacsim.physics.exec.team import run_team
 from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
-from tacsim.physics.gel.gel import MM, MPA, GelState, gel_params, one_lattice
+from tacsim.physics.gel.gel import MM, MPA, GelState, common_lattice, gel_params
 from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.snapshot import copies
-from tacsim.physics.worlds.device import Mirror, run_hybrid
+from tacsim.physics.worlds.device import DeviceArrays, run_hybrid
 from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
 from tacsim.pose import HALF_TURN_X
@@ -74,29 +74,28 @@ class HybridState:
         """Raises ValueError for gels that are not cut alike."""
         start()
         self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        self.gels = GelState(one_lattice(self.gel), len(scenes), 2)
+        self.gels = GelState(common_lattice(self.gel), len(scenes), 2)
         placed = [_body_at_start(scene) for scene in scenes]
         self.body = [body for body, _, _ in placed]
         self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
-        self.memory = np.zeros((len(scenes), 2, max(self.particles.counts), Kept.n), np.float32)
+        self.contact_history = np.zeros((len(scenes), 2, max(self.particles.counts), ContactHistory.n), np.float32)
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._mirror = Mirror()
+        self._device_arrays = DeviceArrays()
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 2, 6, 3) of the environments that go on, n each one's own."""
         drive = stack_drives(drives, self.counts)
         self.gels.refresh()
         if ON_DEVICE:
-            run_hybrid(
-                self._mirror, drive, self.gels, self.particles, self.memory, self.params, self.counts, self.partial
-            )
+            numbers = self.params, self.counts, self.partial
+            run_hybrid(self._device_arrays, drive, self.gels, self.particles, self.contact_history, numbers)
         else:
             run_team(
-                substeps, drive, self.gels.arguments(), self.particles.arguments(), self.memory, self.params,
+                substeps, drive, self.gels.arguments(), self.particles.arguments(), self.contact_history, self.params,
                 self.counts, self.partial, active=list(drives),
             )  # fmt: skip
 
@@ -157,13 +156,13 @@ class HybridWorld(FemWorld):
             # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were
             # lighter by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
             # the step limit.
-            LIGHTNESS: max(1.0, height / self._body.spacing),
+            RIGID_MASS_SCALE: max(1.0, height / self._body.spacing),
         }  # fmt: skip
         held = {
             GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
         }  # fmt: skip
         masses = self._masses(self._gel.density, self._body.density, step)
-        return Inertia({**masses, **damping, SPREAD: 0.0}, step, held=held, flowing={SPREAD: 1.0})
+        return Inertia({**masses, **damping, WIDENING: 0.0}, step, held=held, flowing={WIDENING: 1.0})
 
     def _true_inertia(self) -> Inertia:
         assert self.scene.body is not None
@@ -171,7 +170,7 @@ class HybridWorld(FemWorld):
         density = kernel_density(self.scene.body.material.density, second)
         wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
         step = COURANT * min(self._body.cell / wave, self._gel.spacing)
-        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, LIGHTNESS: 1.0, SPREAD: 0.0}
+        undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, WIDENING: 0.0}
         return Inertia({**self._masses(self._gel.density, density, step), **undamped}, step, second)
 
     def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
@@ -205,7 +204,7 @@ class HybridWorld(FemWorld):
         return {
             "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i],
             "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.flow(i),
-            "planes": b.plane(i), "contact": state.memory[i, :, : b.counts[i]], "sums": state.partial[i],
+            "planes": b.plane(i), "contact": state.contact_history[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
 
     def _scalars(self) -> dict[str, np.ndarray]:
@@ -227,7 +226,7 @@ class HybridWorld(FemWorld):
         state, index, path = self._state, self._index, launch.path
         span = (launch.last - launch.first) * path.dt
         weight = float(np.linalg.norm(state.params[index, GRAVITY : GRAVITY + 3]))
-        fall = float(state.params[index, LIGHTNESS]) * weight * span
+        fall = float(state.params[index, RIGID_MASS_SCALE]) * weight * span
         drive = path.drive(launch.first, launch.last)
         driven = max(self._mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
         margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
@@ -256,7 +255,12 @@ class HybridWorld(FemWorld):
         inertia = np.trace(second) * np.eye(3) - second
         inverse = np.linalg.pinv(inertia, rcond=1e-6, hermitian=True)  # particles on a line have none about it
         params[CENTRE : CENTRE + 3] = centre
-        params[TURNING : TURNING + 6] = [*np.diagonal(inverse), inverse[0, 1], inverse[0, 2], inverse[1, 2]]
+        params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = [
+            *np.diagonal(inverse),
+            inverse[0, 1],
+            inverse[0, 2],
+            inverse[1, 2],
+        ]
 
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """What the launch came to. Raises SimulationDiverged if that is unphysical."""
@@ -267,7 +271,7 @@ class HybridWorld(FemWorld):
         sums = partial.astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
         backing = sums[:, BACKING : BACKING + 3].reshape(2, -1, 3).sum(axis=1)  # which holds the housing too
-        backing += sums[:, HOUSED : HOUSED + 6].sum(axis=0).reshape(2, 3)
+        backing += sums[:, HOUSING_FORCE : HOUSING_FORCE + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
         centre = centre_of(self._state.particles.x(self._index))

@@ -2,6 +2,7 @@
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.transfers import (
+    Body,
     Particles,
     Strips,
     block_range,
@@ -10,89 +11,52 @@ from tacsim.physics.body.transfers import (
     node_sum,
     particles_to_grid,
 )
-from tacsim.physics.contact.contact import Kept, contact_ceiling, particle_contact, support_radius
-from tacsim.physics.exec.lanes import (
-    LANES,
-    NODES,
-    ON_DEVICE,
-    PARTS,
-    Counts,
-    Params,
-    Partial,
-    copy_of,
-    note_sum,
-    part_range,
-    slot_of,
-    strip,
-    vec3,
-)
-from tacsim.physics.exec.layout import (
-    BODY_CELL,
-    BODY_DAMPING,
-    BODY_MASS,
-    CAPACITY,
-    CENTRE,
-    ELEMENTS,
-    FORCE,
-    GRAVITY,
-    GRID,
-    HOUSED,
-    KNOWN,
-    LIGHTNESS,
-    MOTION,
-    ORIGIN,
-    OVERLAP,
-    PARTICLES,
-    PLACE,
-    PLANE,
-    SPREAD,
-    STEP,
-    STEPS,
-    STRIDE,
-    TURNING,
-    VELOCITY,
-)  # fmt: skip
+from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.environment import Counts, Environment, Params, Partial, record_sum
+from tacsim.physics.exec.lanes import LANES, NODES, ON_DEVICE, PARTS, copy_of, part_range, slot_of, strip, vec3
 from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, piece_done
-from tacsim.physics.gel.gel import (
+from tacsim.physics.gel.kernels import (
+    ContactForce,
     Corners,
     Lattice,
     Nodes,
-    Skin,
-    Touch,
+    Surface,
+    contact_force_start,
     gel_advance,
     gel_forces,
-    skin_row,
-    touch_start,
+    gels_of,
+    surface_row,
 )
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
 TURN = 1.0 / 3.0  # share of the boost that rotations get: with more of it bodies overshoot when a slide stops
 
-ContactMemory = ti.types.ndarray(dtype=Kept, ndim=3)
+ContactHistories = ti.types.ndarray(dtype=ContactHistory, ndim=3)
 
 
 @ti.func
-def row(drive: ti.template(), env, it, g, r):
-    return vec3(drive[env, it, g, r, 0], drive[env, it, g, r, 1], drive[env, it, g, r, 2])
+def row(drive: ti.template(), env: ti.template(), it, g, r):
+    return vec3([drive[env.index, it, g, r, c] for c in range(3)])
 
 
 @ti.func
-def numbers(particles: ti.template(), at, stride):
+def three_rows(particles: ti.template(), at, stride):
     """Three rows of one particle, from that at `at` on."""
     return vec3(particles[at], particles[at + stride], particles[at + 2 * stride])
 
 
 @ti.func
-def rotation(drive: ti.template(), env, it, g):
+def rotation(drive: ti.template(), env: ti.template(), it, g):
     return ti.Matrix.rows([row(drive, env, it, g, 0), row(drive, env, it, g, 1), row(drive, env, it, g, 2)])
 
 
 @ti.func
-def part_sum(partial: ti.template(), env, first):
+def part_sum(env: ti.template(), first):
     """Sum of three numbers over all parts, in their order."""
     total = vec3(0.0)
     for part in ti.static(range(PARTS)):
-        total += vec3(partial[env, part, first], partial[env, part, first + 1], partial[env, part, first + 2])
+        total += vec3([env.partial[env.index, part, first + c] for c in range(3)])
     return total
 
 
@@ -103,44 +67,41 @@ def moment_about(centre, origin, rotate, force, moment):
 
 
 @ti.func
-def symmetric(params: ti.template(), env, first):
-    """A symmetric matrix of six facts: xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz = params[env, first], params[env, first + 1], params[env, first + 2]
-    xy, xz, yz = params[env, first + 3], params[env, first + 4], params[env, first + 5]
+def symmetric(env: ti.template(), first):
+    """A symmetric matrix of six numbers: xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz, xy, xz, yz = [env.param(first + c) for c in range(6)]
     return ti.Matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 @ti.func
-def grid_update(
-    env, part, it, drive: ti.template(), masses: ti.template(), velocities: ti.template(), params: ti.template(),
-    counts: ti.template(), partial: ti.template(),
-):  # fmt: skip
+def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.template()):
     """Momentum to velocity; damps towards the affine motion that the two sensors impose, not towards rest.
 
     A boost is added to every velocity: selective mass scaling of the slowest modes, the rigid motions of a body that
     hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
 
-    With SPREAD the reference also widens as fast as a body must whose volume stays (docs/decisions/0002).
+    With `layout.WIDENING` the reference also widens as fast as a body must whose volume stays (docs/decisions/0002).
 
     Only a sensor that touches the body imposes anything; one that nobody touches is damped towards rest. Across the
     sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides on one
     sensor must not be dragged back by the other.
     """
-    dt, cell, damping = params[env, STEP], params[env, BODY_CELL], params[env, BODY_DAMPING]
-    origin = vec3(params[env, ORIGIN], params[env, ORIGIN + 1], params[env, ORIGIN + 2])
-    weight = vec3(params[env, GRAVITY], params[env, GRAVITY + 1], params[env, GRAVITY + 2])
-    force0, force1 = part_sum(partial, env, FORCE), part_sum(partial, env, FORCE + 6)
-    push = params[env, BODY_MASS] * counts[env, PARTICLES] * weight  # total force on the body: weight and contact
+    dt, cell, damping = env.param(layout.STEP), env.param(layout.BODY_CELL), env.param(layout.BODY_DAMPING)
+    origin = env.param3(layout.ORIGIN)
+    weight = env.param3(layout.GRAVITY)
+    force0, force1 = part_sum(env, layout.FORCE), part_sum(env, layout.FORCE + 6)
+    mass, particles = env.param(layout.BODY_MASS), env.count(layout.PARTICLES)
+    push = mass * particles * weight  # total force on the body: weight and contact
     push -= rotation(drive, env, it, 0) @ force0
     push -= rotation(drive, env, it, 1) @ force1
     touch0, touch1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
-    mean = part_sum(partial, env, MOTION) / counts[env, PARTICLES]
-    boost = ((params[env, LIGHTNESS] - 1.0) * dt / (params[env, BODY_MASS] * counts[env, PARTICLES])) * push
+    mean = part_sum(env, layout.VELOCITY_SUM) / particles
+    boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (mass * particles)) * push
     p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
-    centre = vec3(params[env, CENTRE], params[env, CENTRE + 1], params[env, CENTRE + 2])
-    torque = -moment_about(centre, p0, rotation(drive, env, it, 0), force0, part_sum(partial, env, FORCE + 3))
-    torque -= moment_about(centre, p1, rotation(drive, env, it, 1), force1, part_sum(partial, env, FORCE + 9))
-    turn = (TURN * (params[env, LIGHTNESS] - 1.0) * dt) * symmetric(params, env, TURNING) @ torque
+    centre = env.param3(layout.CENTRE)
+    torque = -moment_about(centre, p0, rotation(drive, env, it, 0), force0, part_sum(env, layout.FORCE + 3))
+    torque -= moment_about(centre, p1, rotation(drive, env, it, 1), force1, part_sum(env, layout.FORCE + 9))
+    turn = (TURN * (env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt) * symmetric(env, layout.INVERSE_INERTIA) @ torque
     v0, v1 = row(drive, env, it, 0, 4), row(drive, env, it, 1, 4)
     w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
     axis = p1 - p0
@@ -150,9 +111,9 @@ def grid_update(
     held = ti.select(touch0 or touch1, 1.0, 0.0)
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
-    widening = -0.5 * params[env, SPREAD] * share * (v1 - v0).dot(axis) / length2
-    nx, ny, nz = counts[env, GRID], counts[env, GRID + 1], counts[env, GRID + 2]
-    base = env * counts[env, CAPACITY]
+    widening = -0.5 * env.param(layout.WIDENING) * share * (v1 - v0).dot(axis) / length2
+    nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    base = env.index * env.count(layout.CAPACITY)
     nz = nz // NODES  # strips
     i0, i1, j0, j1, k0, k1 = 0, 0, 0, ny, 0, nz
     if ti.static(ON_DEVICE):  # one node
@@ -164,7 +125,7 @@ def grid_update(
         for j in range(j0, j1):
             for k in range(k0, k1):
                 at = (i * ny + j) * nz + k
-                q = node_sum(env, i, at, masses, velocities, counts)
+                q = node_sum(env, i, at, body)
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
                     if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
@@ -179,13 +140,13 @@ def grid_update(
                         velocity -= damping * dt * (velocity - reference)
                         for d in ti.static(range(3)):
                             moved[4 * n + d] = velocity[d]
-                velocities[base + at] = moved
+                body.velocities[base + at] = moved
 
 
 @ti.func
-def touch_gel(
-    env, part, g, it, drive: ti.template(), particles: ti.template(), memory: ti.template(), skin: ti.template(),
-    touch: ti.template(), params: ti.template(), counts: ti.template(), partial: ti.template(), highest, layers, nx, ny,
+def gel_contact(
+    env: ti.template(), part, g, it, drive: ti.template(), body: ti.template(), histories: ti.template(),
+    gels: ti.template(), highest,
 ):  # fmt: skip
     """Contact of this part's particles with gel g. Notes force and moment of the body on the sensor, sensor axes.
 
@@ -195,65 +156,50 @@ def touch_gel(
     origin, velocity, spin = row(drive, env, it, g, 3), row(drive, env, it, g, 4), row(drive, env, it, g, 5)
     back = rotate.transpose()
     outward = vec3(rotate[0, 2], rotate[1, 2], rotate[2, 2])  # the sensor's z axis
-    spacing = 0.5 * params[env, BODY_CELL]
-    rate = params[env, STEP] / params[env, BODY_MASS]
+    spacing = 0.5 * env.param(layout.BODY_CELL)
+    rate = env.param(layout.STEP) / env.param(layout.BODY_MASS)
     total, moment, on_housing = vec3(0.0), vec3(0.0), vec3(0.0)
-    stride, rows = counts[env, STRIDE], skin_row(env, 2, g, nx)
-    pushed = touch_start(env, copy_of(part), 2, g, nx, ny)
-    first, last = block_range(env, part, counts)
-    for p in range(first * LANES, ti.min(last * LANES, counts[env, PARTICLES])):
-        known = env * KNOWN * stride + p
-        arm = numbers(particles, known + PLACE * stride, stride) - origin
+    stride, rows = env.count(layout.STRIDE), surface_row(env, gels, g)
+    forces = contact_force_start(env, gels, copy_of(part), g)
+    first, last = block_range(env, part)
+    for p in range(first * LANES, ti.min(last * LANES, env.count(layout.PARTICLES))):
+        at = env.index * layout.PARTICLE_ROWS * stride + p
+        arm = three_rows(body.particles, at + layout.POSITION * stride, stride) - origin
         away = outward.dot(arm) - highest  # most of the body is far away: one dot product decides
         radius = spacing  # at most
         if away < 2.5 * spacing:
-            radius = support_radius(numbers(particles, known + PLANE * stride, stride), spacing)
+            radius = support_radius(three_rows(body.particles, at + layout.PLANE * stride, stride), spacing)
         # one radius to touch, half a spacing for what the contact's memory still bridges
         if away < radius + 0.5 * spacing:
             local = back @ arm
-            moving = numbers(particles, known + VELOCITY * stride, stride)
+            moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
             relative = back @ (moving - velocity - spin.cross(arm))
-            touching, housed, force, kept = particle_contact(
-                env,
-                part,
-                g,
-                local,
-                relative,
-                memory[env, g, p],
-                radius,
-                skin,
-                rows,
-                touch,
-                pushed,
-                params,
-                layers,
-                nx,
-                ny,
-                partial,
+            touching, housed, force, history = particle_contact(
+                env, part, g, local, relative, histories[env.index, g, p], radius, gels, rows, forces
             )
-            memory[env, g, p] = kept
+            histories[env.index, g, p] = history
             if touching:
                 moving += rate * (rotate @ force)
                 for d in ti.static(range(3)):
-                    particles[known + (VELOCITY + d) * stride] = moving[d]
+                    body.particles[at + (layout.VELOCITY + d) * stride] = moving[d]
                 total -= force
                 moment -= local.cross(force)
                 if housed:
                     on_housing -= force
         elif away < 2.5 * spacing:  # nothing passes this margin in one substep, so what is beyond has forgotten
-            memory[env, g, p] = Kept(0.0)
+            histories[env.index, g, p] = ContactHistory(0.0)
     slot = slot_of(part)
     for d in ti.static(range(3)):
-        note_sum(partial, env, slot, FORCE + 6 * g + d, total[d])
-        note_sum(partial, env, slot, FORCE + 6 * g + 3 + d, moment[d])
-        note_sum(partial, env, slot, HOUSED + 3 * g + d, on_housing[d])
+        record_sum(env, slot, layout.FORCE + 6 * g + d, total[d])
+        record_sum(env, slot, layout.FORCE + 6 * g + 3 + d, moment[d])
+        record_sum(env, slot, layout.HOUSING_FORCE + 3 * g + d, on_housing[d])
 
 
 @ti.kernel
 def substeps(
     team: ti.i32, drive: Drive,
-    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
-    particles: Particles, masses: Strips, velocities: Strips, memory: ContactMemory,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
+    particles: Particles, masses: Strips, velocities: Strips, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
@@ -264,9 +210,11 @@ def substeps(
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
             turn = task // CHUNK // team
-            env = sync[turn, ENVIRONMENT]
-            nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
-            steps = counts[env, STEPS]
+            index = sync[turn, ENVIRONMENT]
+            env = ti.static(Environment(index, params, counts, partial))
+            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+            body = ti.static(Body(particles, masses, velocities))
+            steps = env.count(layout.STEPS)
             pieces = PARTS * (2 * steps + 1)
             highest, known = ti.Vector([0.0, 0.0]), -1  # of the two gels, in this stage
             piece = next_piece(sync, turn, pieces)
@@ -276,24 +224,18 @@ def substeps(
                 for _new in range(once_if(scatters and stage != known)):
                     known = stage
                     for g in ti.static(range(2)):
-                        highest[g] = contact_ceiling(skin, skin_row(env, 2, g, nx), nx, ny)
+                        highest[g] = contact_ceiling(env, gels, g)
                 for _gather in range(once_if(scatters and it > 0)):
-                    grid_to_particles(env, part, particles, velocities, params, counts, partial)
+                    grid_to_particles(env, part, body)
                 for _scatter in range(once_if(scatters and it < steps)):
-                    partial[env, part, OVERLAP] = 0.0
+                    partial[index, part, layout.OVERLAP] = 0.0
                     for g in range(2):
-                        touch_gel(
-                            env, part, g, it, drive, particles, memory, skin, touch, params, counts, partial,
-                            highest[g], layers, nx, ny,
-                        )  # fmt: skip
-                    clear_masses(env, part, masses, counts)
-                    particles_to_grid(env, part, particles, masses, params, counts, partial)
-                    gel_forces(
-                        env, part, 2, nodes, corners, lattice, params, counts, partial,
-                        layers, nx, ny,
-                    )  # fmt: skip
+                        gel_contact(env, part, g, it, drive, body, histories, gels, highest[g])
+                    clear_masses(env, part, body)
+                    particles_to_grid(env, part, body)
+                    gel_forces(env, part, gels)
                 for _motion in range(once_if(not scatters)):
-                    gel_advance(env, part, 2, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
-                    grid_update(env, part, it, drive, masses, velocities, params, counts, partial)
+                    gel_advance(env, part, gels)
+                    grid_update(env, part, it, drive, body)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, pieces)

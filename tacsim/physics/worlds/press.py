@@ -16,12 +16,15 @@ from tacsim.physics.contact.indenter import (
     GRID,
     POINTS,
     SPHERE,
+    Indenter,
     Pressure,
     Slip,
     Values,
     indent,
 )
-from tacsim.physics.exec.lanes import MOST, ON_DEVICE, PARTS, Counts, Params, Partial, aligned_zeros
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.lanes import MAX_NUMBERS, ON_DEVICE, PARTS, aligned_zeros
 from tacsim.physics.exec.layout import (
     BACKING,
     COUNTS,
@@ -38,7 +41,6 @@ from tacsim.physics.exec.layout import (
     SHAPE_ORIGIN,
     SHAPE_SPACING,
     STEP,
-    STEPS,
     STIFFNESS,
 )  # fmt: skip
 from tacsim.physics.exec.team import (
@@ -52,25 +54,21 @@ from tacsim.physics.exec.team import (
     run_team,
 )
 from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
-from tacsim.physics.gel.gel import (
-    MM,
-    MPA,
+from tacsim.physics.gel.gel import MM, MPA, GelParams, GelState, common_lattice, gel_params
+from tacsim.physics.gel.kernels import (
+    ContactForce,
     Corners,
-    GelParams,
-    GelState,
     Lattice,
     Nodes,
-    Skin,
-    Touch,
+    Surface,
     gel_advance,
     gel_forces,
-    gel_params,
-    one_lattice,
+    gels_of,
 )
 from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.snapshot import copies
-from tacsim.physics.worlds.device import Mirror, run_press
+from tacsim.physics.worlds.device import DeviceArrays, run_press
 from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
@@ -87,7 +85,7 @@ TOO_MUCH = "cut off of mesh and gel what cannot touch; worlds of a smaller batch
 @ti.kernel
 def press_substeps(
     team: ti.i32, drive: Drive,
-    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
@@ -95,21 +93,19 @@ def press_substeps(
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
             turn = task // CHUNK // team
-            env = sync[turn, ENVIRONMENT]
-            nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
-            pieces = 2 * PARTS * counts[env, STEPS]  # two stages a substep: forces, then motion
+            index = sync[turn, ENVIRONMENT]
+            env = ti.static(Environment(index, params, counts, partial))
+            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
+            indenter = ti.static(Indenter(slip, pressure, values))
+            pieces = 2 * PARTS * env.count(layout.STEPS)  # two stages a substep: forces, then motion
             piece = next_piece(sync, turn, pieces)
             while piece < pieces:
                 stage, part = piece // PARTS, piece % PARTS
                 for _forces in range(once_if(stage % 2 == 0)):
-                    it = stage // 2
-                    indent(env, part, it, drive, skin, touch, slip, pressure, values, params, counts, partial, nx, ny)
-                    gel_forces(
-                        env, part, 1, nodes, corners, lattice, params, counts, partial,
-                        layers, nx, ny,
-                    )  # fmt: skip
+                    indent(env, part, stage // 2, drive, gels, indenter)
+                    gel_forces(env, part, gels)
                 for _motion in range(once_if(stage % 2 == 1)):
-                    gel_advance(env, part, 1, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
+                    gel_advance(env, part, gels)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, pieces)
 
@@ -137,7 +133,7 @@ class PressState:
         """Raises ValueError for gels that are not cut alike, and an indenter too fine for them."""
         start()
         self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        lattice = one_lattice(self.gel)
+        lattice = common_lattice(self.gel)
         self.gels = GelState(lattice, len(scenes), 1)
         nx, ny, _ = lattice.elements
         self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
@@ -146,7 +142,7 @@ class PressState:
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._mirror = Mirror()
+        self._device_arrays = DeviceArrays()
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
         self._covered = 0  # how often these have changed: a device has its copy of them until they do
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
@@ -177,7 +173,7 @@ class PressState:
             if (first >= old[0]).all() and (end <= old[1]).all():
                 return
             both = np.minimum(first, old[0]), np.maximum(end, old[1])
-            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= min(MAX_NODES, MOST // len(self._values)):
+            if np.prod(TILE * (both[1] - both[0]).astype(float)) <= min(MAX_NODES, MAX_NUMBERS // len(self._values)):
                 first, end = both
         values = mesh.values(first, end) * np.float32(MM)
         held = self._values.shape[1:]
@@ -199,8 +195,8 @@ class PressState:
         self.gels.refresh()
         if ON_DEVICE:
             run_press(
-                self._mirror, drive, self.gels, self.slip, self.pressure, self._values, self._covered, self.params,
-                self.counts, self.partial,
+                self._device_arrays, drive, self.gels, self.slip, self.pressure, self._values, self._covered,
+                (self.params, self.counts, self.partial),
             )  # fmt: skip
         else:
             run_team(

@@ -8,19 +8,20 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import Gel, GelMaterial
-from tacsim.physics.exec.lanes import PARTS, Counts, Params, Partial
+from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.layout import BACKING, COUNTS, ELEMENTS, GEL_DAMPING, NUMBERS, PARAMS, SMALLEST_VOLUME, STEP
 from tacsim.physics.gel.element import HOURGLASS
-from tacsim.physics.gel.gel import (
+from tacsim.physics.gel.gel import GelState, gel_params
+from tacsim.physics.gel.kernels import (
+    ContactForce,
     Corners,
-    GelState,
     Lattice,
     Nodes,
-    Skin,
-    Touch,
+    Surface,
     gel_advance,
     gel_forces,
-    gel_params,
+    gels_of,
 )
 from tacsim.physics.oracle import laws
 
@@ -29,17 +30,18 @@ pytestmark = pytest.mark.cpu
 
 @ti.kernel
 def substep(
-    gels: ti.i32, advance: ti.i32,
-    nodes: Nodes, skin: Skin, touch: Touch, corners: Corners, lattice: Lattice,
+    number: ti.template(), advance: ti.i32,
+    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
     ti.loop_config(serialize=True)
-    for env in range(counts.shape[0]):
-        nx, ny, layers = counts[env, ELEMENTS], counts[env, ELEMENTS + 1], counts[env, ELEMENTS + 2]
+    for e in range(counts.shape[0]):
+        env = ti.static(Environment(e, params, counts, partial))
+        gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, number))
         for part in range(PARTS):
-            gel_forces(env, part, gels, nodes, corners, lattice, params, counts, partial, layers, nx, ny)
+            gel_forces(env, part, gels)
         for part in range(PARTS * advance):
-            gel_advance(env, part, gels, nodes, skin, touch, lattice, params, counts, partial, layers, nx, ny)
+            gel_advance(env, part, gels)
 
 
 GEL = Gel(size=(6e-3, 5e-3, 4e-3), material=GelMaterial(poisson_ratio=0.48))
@@ -96,17 +98,17 @@ def test_each_gel_of_each_environment_has_its_own_forces(element: float) -> None
 
 
 def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
-    """v <- (1 - alpha dt) v + dt (f + touch) / m, u <- u + dt v, held at the backing; the skin follows the surface."""
+    """v <- (1 - alpha dt) v + dt (f + contact_force) / m, u <- u + dt v, held at the backing; the surface follows."""
     params = gel_params(GEL, 1e-3)
     state = GelState(params, 1, 2)
     rng = np.random.default_rng(2)
     count = np.prod(state.u.shape[2:4])
     state.u[..., 1:, :] = u = rng.normal(scale=0.05, size=state.u[..., 1:, :].shape)
     state.v[..., 1:, :] = v = rng.normal(scale=0.01, size=u.shape)
-    state.touch[..., :count, :3] = rng.normal(scale=0.01, size=state.touch[..., :count, :3].shape)
-    touch = state.touch.copy()
+    state.contact_force[..., :count, :3] = rng.normal(scale=0.01, size=state.contact_force[..., :count, :3].shape)
+    contact_force = state.contact_force.copy()
     partial = launch(state, advance=True)
-    assert not state.touch.any()  # zero for the next substep
+    assert not state.contact_force.any()  # zero for the next substep
     share = np.full(state.u.shape[2:5], 1.0)
     share[[0, -1]] *= 0.5
     share[:, [0, -1]] *= 0.5
@@ -117,15 +119,15 @@ def test_a_substep_is_symplectic_euler_with_lumped_masses() -> None:
         force = laws.gel_forces(whole, params.spacing, params.mu, params.lam, HOURGLASS)
         held = partial[0].reshape(2, -1, NUMBERS)[gel, :, BACKING : BACKING + 3].sum(axis=0)
         assert held == pytest.approx(force[:, :, 0].sum(axis=(0, 1)), abs=1e-5 * np.abs(force).max())
-        contact = touch[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
+        contact = contact_force[0, :, gel, :count, :3].sum(axis=0, dtype=float).reshape(*state.u.shape[2:4], 3)
         force[:, :, -1] += contact
         velocity = (1 - DAMPING * DT) * v[0, gel] + DT * force[:, :, 1:] / mass
         assert np.abs(state.v[0, gel, :, :, 1:] - velocity).max() < 1e-5 * np.abs(velocity).max()
         assert np.abs(state.u[0, gel, :, :, 1:] - u[0, gel] - DT * velocity).max() < 1e-5 * np.abs(u).max()
     assert not state.u[..., 0, :].any()
-    skin = state.skin.copy()
+    surface = state.surface.copy()
     state.refresh()
-    assert np.array_equal(skin[..., :3], state.skin[..., :3])
+    assert np.array_equal(surface[..., :3], state.surface[..., :3])
 
 
 def test_rigid_motion_gives_no_force() -> None:

@@ -9,26 +9,29 @@ from hypothesis import strategies as st
 from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import Gel
 from tacsim.optics.spline import displacement_and_jacobian
-from tacsim.physics.contact.contact import skin_sums, spline
+from tacsim.physics.contact.contact import spline, surface_sums
+from tacsim.physics.exec.environment import Environment
 from tacsim.physics.exec.lanes import vec2, vec4
-from tacsim.physics.gel.gel import MM, GelState, Skin, gel_params, gel_surface, skin_row
+from tacsim.physics.gel.gel import MM, GelState, gel_params, gel_surface
+from tacsim.physics.gel.kernels import Gels, Surface, surface_row
 
 GEL = gel_params(Gel(size=(6e-3, 5e-3, 2e-3)), 0.5e-3)
 NX, NY, _ = GEL.elements
-SECOND = 1  # of two gels: its surface does not begin where `skin` does
+SECOND = 1  # of two gels: its surface does not begin where `surface` does
 F32 = float(np.finfo(np.float32).eps)
 Points = ti.types.ndarray(dtype=vec2, ndim=1)
 Sums = ti.types.ndarray(dtype=vec4, ndim=2)
 
 
 @ti.kernel
-def evaluate(skin: Skin, points: Points, found: Sums, gel: ti.i32, h: ti.f32, nx: ti.i32, ny: ti.i32):
+def evaluate(surface: Surface, points: Points, found: Sums, gel: ti.i32, h: ti.f32, nx: ti.i32, ny: ti.i32):
     """Displacement [mm] and its derivatives by x and y, as contact has them, at lattice coordinates."""
-    row = skin_row(0, 2, gel, nx)
+    gels = ti.static(Gels(None, surface, None, None, None, 2, nx, ny, 0))
+    row = surface_row(ti.static(Environment(0, None, None, None)), gels, gel)
     for p in range(points.shape[0]):
         i, wx, dx = spline(points[p][0])
         j, wy, dy = spline(points[p][1])
-        value, by_x, by_y = skin_sums(skin, row, i, j, wx, wy, dx / h, dy / h, ny)
+        value, by_x, by_y = surface_sums(gels, row, i, j, wx, wy, dx / h, dy / h)
         found[p, 0], found[p, 1], found[p, 2] = value, by_x, by_y
 
 
@@ -58,7 +61,7 @@ def test_contact_and_renderer_see_the_same_surface(seed: int, size: float) -> No
     between = nodes[(nodes < [NX, NY]).all(axis=1)] + 0.5  # where the stencil changes
     points = np.concatenate([rng.uniform(0.0, (NX, NY), (300, 2)), rim(20), nodes, between]).astype(np.float32)
     found = np.zeros((len(points), 3, 4), np.float32)
-    evaluate(state.skin.reshape(-1), points, found, SECOND, GEL.spacing, NX, NY)
+    evaluate(state.surface.reshape(-1), points, found, SECOND, GEL.spacing, NX, NY)
 
     surface = gel_surface(GEL, state, 0, SECOND)
     drawn, jacobian = displacement_and_jacobian(surface, surface.origin + points.astype(np.float64) * surface.spacing)

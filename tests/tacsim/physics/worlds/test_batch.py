@@ -25,7 +25,7 @@ from tacsim.models.scene import (
     Sphere,
 )
 from tacsim.physics.body import plasticine
-from tacsim.physics.exec.lanes import COPIES, MOST
+from tacsim.physics.exec.lanes import COPIES, MAX_NUMBERS
 from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.motion.retry import RETRIES
@@ -178,13 +178,13 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 
 @pytest.mark.cpu
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
-    arrays = fresh._state.particles.known, fresh._state.memory, fresh._state.gels.nodes
+    arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.nodes
     nodes = fresh._state.particles.masses.shape[2]
     fresh.worlds[0].arrays()["position"][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
-        arrays, (fresh._state.particles.known, fresh._state.memory, fresh._state.gels.nodes), strict=True
+        arrays, (fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.nodes), strict=True
     ))  # fmt: skip
     alone = HybridWorld(SCENES[1])
     assert alone.move(closed(alone, 0.4e-3)) == stats
@@ -210,7 +210,7 @@ def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
     """Its grid would be allowed in a world of its own; of four, in four copies, kernels could not count the nodes."""
     batch = Batch(SCENES[:1] * 4)
     most = batch._state.particles.most
-    assert most < LARGEST_GRID and 4 * COPIES * 4 * most <= MOST
+    assert most < LARGEST_GRID and 4 * COPIES * 4 * most <= MAX_NUMBERS
     way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
     batch.worlds[1].arrays()["position"][-1] += [way, way, way]
     before = [state(world) for world in batch.worlds]

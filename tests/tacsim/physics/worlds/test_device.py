@@ -190,14 +190,14 @@ def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]])
 
 SENT = """
 import numpy as np
-from tacsim.physics.worlds.device import Mirror
+from tacsim.physics.worlds.device import DeviceArrays
 from tacsim.compute.runtime import start, ti
 start()
-mirror, host = Mirror(), np.ones((2, 3), np.float32)
+arrays, host = DeviceArrays(), np.ones((2, 3), np.float32)
 for version in (0, 0, 1):
-    print(mirror.kept("values", host, ti.f32, version).to_numpy().max())
+    print(arrays.upload_if_changed("values", host, ti.f32, version).to_numpy().max())
     host += 1
-print(mirror.kept("values", np.ones((4, 3), np.float32), ti.f32, 2).shape)
+print(arrays.upload_if_changed("values", np.ones((4, 3), np.float32), ti.f32, 2).shape)
 """
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene
 from tacsim.physics.contact.gel_overlap import gel_overlap
-from tacsim.physics.exec.layout import HOUSED
+from tacsim.physics.exec.layout import HOUSING_FORCE
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.gel.gel import gel_params
 from tacsim.physics.worlds import hybrid
@@ -338,7 +338,7 @@ def over_the_rim(housing: float | None) -> HybridWorld:
 def housing_forces(w: HybridWorld) -> np.ndarray:
     """(2,) that the body presses on the housing of each gel with [N]."""
     sums = w.snapshot()["sums"].astype(float).sum(axis=0)
-    return -sums[HOUSED : HOUSED + 6].reshape(2, 3)[:, 2]
+    return -sums[HOUSING_FORCE : HOUSING_FORCE + 6].reshape(2, 3)[:, 2]
 
 
 def beside_the_gel(w: HybridWorld, name: str) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -87,32 +87,10 @@ class MockArms:
 
 
 class MockUR(MockArms):
-    """One mock controller in a process of its own. See MockArms."""
+    """One mock controller in a process of its own; `options` are those of MockArms."""
 
-    def __init__(
-        self,
-        host: str = "127.0.0.2",
-        *,
-        model: Model = "ur5e",
-        joints: Sequence[float] | None = None,
-        version: Version = VERSION,
-        fault_port: int = FAULT_PORT,
-        serial: str = MOCK_SERIAL,
-        ready_timeout: float = 10.0,
-        allow_network: bool = False,
-        realtime: bool = False,
-    ) -> None:
-        super().__init__(
-            [host],
-            model=model,
-            joints=joints,
-            version=version,
-            fault_port=fault_port,
-            serial=serial,
-            ready_timeout=ready_timeout,
-            allow_network=allow_network,
-            realtime=realtime,
-        )
+    def __init__(self, host: str = "127.0.0.2", **options: Any) -> None:
+        super().__init__([host], **options)
         self.host = host
         self.faults = self.fault_clients[0]
 

@@ -10,9 +10,9 @@ import pytest
 
 from robot.common.kinematics import matrix, motion, pose
 from robot.mock.ur.machine.arm import PERIOD, Arm
-from robot.mock.ur.machine.commands import REALTIME
 from robot.mock.ur.machine.load import GRAVITY, Wall
 from robot.mock.ur.machine.machine import Machine, Mode, Runtime, Safety
+from robot.mock.ur.machine.registry import COMMANDS
 from tacsim.interface import FloatArray
 from tests.robot.mock.wire_client import control_script
 
@@ -43,12 +43,12 @@ class Bench:
     def write(self, command: int, doubles: Sequence[float] = (), integers: Sequence[int] = ()) -> None:
         self.machine.in_int[: 1 + len(integers)] = [command, *integers]
         self.machine.in_double[: len(doubles)] = [float(value) for value in doubles]
-        self.machine.feed(0)
+        self.machine.on_int_register(0)
 
     def call(self, command: int, doubles: Sequence[float] = (), integers: Sequence[int] = ()) -> int:
         """One command to its end; ticks it took."""
         self.write(command, doubles, integers)
-        if command in REALTIME:
+        if COMMANDS[command].every_cycle:
             self.tick()
             return 1
         count = self.until(lambda: self.machine.out_int[0] == 2 or self.machine.program is None)
@@ -91,14 +91,14 @@ def test_movel_stays_on_its_line_and_below_its_speed(bench: Bench) -> None:
     fastest = steepest = before = 0.0
     for _ in range(700):
         bench.tick()
-        way = bench.arm.target_frame[:3, 3] - start
-        off = np.linalg.norm(np.cross(way, [0.6, 0.8, 0.0]))
+        path_length = bench.arm.target_frame[:3, 3] - start
+        off = np.linalg.norm(np.cross(path_length, [0.6, 0.8, 0.0]))
         assert off < 1e-8
         speed = float(np.linalg.norm(bench.arm.target_twist[:3]))
         fastest, steepest, before = max(fastest, speed), max(steepest, abs(speed - before) / PERIOD), speed
     assert 0.0999 < fastest < 0.1001
     assert steepest < 0.51
-    assert way @ [0.6, 0.8, 0.0] == pytest.approx(0.1, abs=1e-9)
+    assert path_length @ [0.6, 0.8, 0.0] == pytest.approx(0.1, abs=1e-9)
 
 
 def test_movej_takes_the_time_of_its_leading_joint(bench: Bench) -> None:
@@ -234,7 +234,7 @@ def test_watchdog_stops_a_silent_client_only(bench: Bench) -> None:
     bench.call(10, [0, 0, -0.02, 0, 0, 0, 0.5, 0])
     for _ in range(20):
         bench.tick(40)
-        bench.machine.feed(0)
+        bench.machine.on_int_register(0)
     assert bench.machine.program is not None
     ticks = bench.until(lambda: bench.machine.program is None)
     assert ticks * PERIOD == pytest.approx(0.1, abs=2 * PERIOD)

@@ -45,11 +45,11 @@ def sim_server(config: RigConfig) -> Iterator[SimServer]:
         yield running
 
 
-def closer(sim_server: SimServer, way: float) -> dict[str, Pose]:
+def closer(sim_server: SimServer, path_length: float) -> dict[str, Pose]:
     """Both sensors moved along their own z [m]."""
     signs = {"lower": 1.0, "upper": -1.0}
     return {
-        name: Pose(pose.position + [0, 0, signs[name] * way], pose.quaternion)
+        name: Pose(pose.position + [0, 0, signs[name] * path_length], pose.quaternion)
         for name, pose in sim_server.initial.items()
     }
 

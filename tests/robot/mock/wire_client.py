@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 from robot.common.loopback import loopback_host
-from robot.mock.ur.machine.commands import NEEDS, REALTIME
+from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS
 from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, package
@@ -24,7 +24,7 @@ def wire_host(number: int) -> str:
 
 def control_script(offset: int = 0, path: Sequence[str] = ()) -> str:
     """What the mock looks for in ur_rtde's control script, and no more."""
-    calls = "\n".join(f"    {call}" for call in NEEDS.values())
+    calls = "\n".join(f"    {call}" for call in {each.needs for each in COMMANDS.values()})
     moves = "\n".join(f"        {line}" for line in path)
     return (
         "def rtde_control():\n"
@@ -181,7 +181,7 @@ class ControlClient(RtdeClient):
         """One command; the package with its answers, or None when the program has ended over it."""
         self.wait(lambda state: state["output_int_register_0"][0] == 1)
         self.write(command, doubles, integers)
-        if command in REALTIME:
+        if COMMANDS[command].every_cycle:
             return None
         state = self.wait(lambda state: state["output_int_register_0"][0] == 2 or state["runtime_state"][0] != 2)
         ended = state["runtime_state"][0] != 2

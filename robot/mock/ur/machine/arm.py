@@ -29,7 +29,7 @@ HOME = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)  # tool
 HISTORY = 2500  # periods of joint positions that are kept
 REST = 1e-9  # joint speed below which the arm rests [rad/s]
 
-Motion = Iterator[None]  # a motion as generator: one `yield` is one control period
+MotionSteps = Iterator[None]  # a motion as a generator: one `yield` is one control period
 
 
 class ProgramError(Exception):
@@ -53,7 +53,7 @@ class Arm:
         self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
         self.history: deque[FloatArray] = deque([self.q] * HISTORY, maxlen=HISTORY)
         self._next: FloatArray | None = None
-        self.look()
+        self.update()
 
     # -- commands of a motion: at most one a control period ----------------------------------------------------------
 
@@ -105,16 +105,16 @@ class Arm:
         self.target_qdd = (self.target_qd - before) / PERIOD
         self._servo(start)
         self.history.append(self.q)
-        self.look()
+        self.update()
 
     def halt(self) -> None:
         """Brakes have closed: speeds are zero, and the target is where the arm is."""
         self.target_q, self.target_qd, self.target_qdd = self.q.copy(), np.zeros(6), np.zeros(6)
         self.qd = np.zeros(6)
         self._next = None
-        self.look()
+        self.update()
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Renews frames, Jacobian and twists after the joints or the tool have changed."""
         self.target_frame, self.jacobian = self.kinematics.forward_and_jacobian(self.target_q, self.tool)
         self.frame, actual_jacobian = self.kinematics.forward_and_jacobian(self.q, self.tool)

@@ -38,7 +38,7 @@ class Load:
     felt: FloatArray = field(default_factory=lambda: np.zeros(6))  # the same less the bias: actual_TCP_force
     history: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=HISTORY))  # of `felt`, a period each
 
-    def look(self, arm: Arm) -> None:
+    def update(self, arm: Arm) -> None:
         """Renews `true` and `felt` at the arm's present pose."""
         true = self.wrench.copy()
         if self.wall is not None:
@@ -59,7 +59,7 @@ class Load:
         """zero_ftsensor: what is felt now counts as nothing. The bias belongs to the sensor and turns with it."""
         flange = arm.frame @ inverse_frame(arm.tool)
         self.bias = self.at_flange(self.true, arm, flange)
-        self.look(arm)
+        self.update(arm)
 
     @staticmethod
     def at_flange(wrench: FloatArray, arm: Arm, flange: FloatArray | None = None) -> FloatArray:

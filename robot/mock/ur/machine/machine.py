@@ -18,7 +18,7 @@ import numpy as np
 
 from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
 from robot.mock.ur.machine.load import GRAVITY, Load, cross
-from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, admit
+from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
 from robot.mock.ur.machine.script import Program
 from tacsim.interface import FloatArray
 
@@ -108,7 +108,7 @@ class Machine:
         self.paused = False
         self.freedrive: tuple[FloatArray, tuple[int, ...]] | None = None  # frame and free axes
         self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
-        self.fed = 0  # tick of the watchdog's last meal
+        self.watchdog_reset = 0  # tick at which its register was last written
         self.stop_reason = ""  # why the last program ended
         self.stopped_at = -math.inf  # time of the last protective stop [s]
         self.unlock_delay = UNLOCK_DELAY
@@ -161,7 +161,7 @@ class Machine:
         compliant = self.freedrive is not None or (self.program is not None and self.program.compliant)
         return self.arm.rests and not compliant
 
-    def say(self, text: str) -> None:
+    def write_log(self, text: str) -> None:
         self.log.append((self.time, text))
 
     # -- program -----------------------------------------------------------------------------------------------------
@@ -169,19 +169,19 @@ class Machine:
     def start(self, text: str) -> bool:
         """Runs an uploaded program instead of the present one; False where the robot is in no state to."""
         if not self.operational:
-            self.say(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
+            self.write_log(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
             return False
         program = Program(self, text)
         if program.kind != "def":
-            self.say(f"not run: {text[:60]!r}... is no program, or a secondary one")
+            self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
             return False
         self.stop("replaced by another program")
         if not program.known:
-            self.say(f"program '{program.name}' ended: the mock runs no URScript but ur_rtde's control script")
+            self.write_log(f"program '{program.name}' ended: the mock runs no URScript but ur_rtde's control script")
             self.stop_reason = f"'{program.name}' is not ur_rtde's control script"
             return False
         self.program, self.paused = program, False
-        self.say(f"program '{program.name}' started")
+        self.write_log(f"program '{program.name}' started")
         return True
 
     def stop(self, why: str) -> None:
@@ -189,26 +189,26 @@ class Machine:
         self.watchdog, self.freedrive, self.arm.waypoint = None, None, None
         if self.program is not None:
             self.program, self.stop_reason = None, why
-            self.say(f"program stopped: {why}")
+            self.write_log(f"program stopped: {why}")
 
     # -- safety and power --------------------------------------------------------------------------------------------
 
     def protective_stop(self, why: str) -> None:
         if self.safety in (Safety.NORMAL, Safety.REDUCED, Safety.SAFEGUARD_STOP):
             self.safety, self.stopped_at = Safety.PROTECTIVE_STOP, self.time
-            self.say(f"protective stop: {why}")
+            self.write_log(f"protective stop: {why}")
             self.stop(f"protective stop: {why}")
 
     def emergency_stop(self) -> None:
         self.safety = Safety.ROBOT_EMERGENCY_STOP
-        self.say("emergency stop")
+        self.write_log("emergency stop")
         self.stop("emergency stop")
 
     def safeguard_stop(self, on: bool) -> None:
         """Pauses a running program; it goes on when the gate is closed again."""
         if on and self.operational:
             self.safety, self.paused = Safety.SAFEGUARD_STOP, True
-            self.say("safeguard stop")
+            self.write_log("safeguard stop")
         elif not on and self.safety is Safety.SAFEGUARD_STOP:
             self.safety, self.paused = Safety.NORMAL, False
 
@@ -252,7 +252,7 @@ class Machine:
         """Watchdog, program, motion, forces, safety: in this order."""
         self.ticks += 1
         self._power()
-        if self.watchdog is not None and (self.ticks - self.fed) * PERIOD > self.watchdog[1]:
+        if self.watchdog is not None and (self.ticks - self.watchdog_reset) * PERIOD > self.watchdog[1]:
             self.stop(
                 f"RTDE watchdog: input_int_register_{self.watchdog[0]} was not written for {self.watchdog[1]:g} s"
             )
@@ -260,11 +260,11 @@ class Machine:
         if self.program is not None and not (self.paused and self.arm.scale == 0.0):
             self._guarded(self.program.step)
         if self.freedrive is not None and not self.arm.commanded:
-            self._guarded(self._give_way)
+            self._guarded(self._follow_hand)
         self.arm.advance(COAST if self.safety in (Safety.NORMAL, Safety.REDUCED) else BRAKE)
-        self.load.look(self.arm)
+        self.load.update(self.arm)
         self.load.history.append(self.load.felt)
-        self._watch()
+        self._check_limits()
 
     def _guarded(self, work: Callable[[], object]) -> None:
         try:
@@ -272,11 +272,11 @@ class Machine:
         except ProgramError as error:
             self.stop(str(error))
 
-    def _give_way(self) -> None:
+    def _follow_hand(self) -> None:
         assert self.freedrive is not None
         damping = np.repeat([FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING], 3)
         frame, free = self.freedrive
-        admit(self.arm, frame, free, self.load.true / damping, np.array([0.25] * 3 + [1.0] * 3))
+        comply(self.arm, frame, free, self.load.true / damping, np.array([0.25] * 3 + [1.0] * 3))
 
     def _power(self) -> None:
         if self._changing is not None and self.ticks >= self._changing[0]:
@@ -290,8 +290,8 @@ class Machine:
         if abs(self.arm.scale - wanted) < 1e-12:
             self.arm.scale = wanted
 
-    def _watch(self) -> None:
-        """The robot's own limits."""
+    def _check_limits(self) -> None:
+        """Makes a protective stop beyond the robot's own limits: force, joint speed, joint range."""
         if self.safety not in (Safety.NORMAL, Safety.REDUCED):
             return
         arm = self.arm
@@ -308,13 +308,13 @@ class Machine:
 
     # -- what comes in -----------------------------------------------------------------------------------------------
 
-    def feed(self, register: int) -> None:
-        """Tells the watchdog that an input_int_register was written."""
+    def on_int_register(self, register: int) -> None:
+        """An input_int_register was written: the watchdog starts anew if it is its own."""
         if self.watchdog is not None and register == self.watchdog[0]:
-            self.fed = self.ticks
+            self.watchdog_reset = self.ticks
 
     def set_slider(self, fraction: float) -> None:
         if 0.0 <= fraction <= 1.0:
             self.slider = fraction
         else:
-            self.say(f"speed slider {fraction} ignored: not within 0 and 1")
+            self.write_log(f"speed slider {fraction} ignored: not within 0 and 1")

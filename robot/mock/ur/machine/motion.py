@@ -3,7 +3,7 @@
 Where the real thing is not published, the mock does the plain thing, and says so:
 
 * movej, movel, paths: trapezoidal speed. In movel a turn counts as its angle, so that `a` and `v` are rad/s^2 and rad/s
-  when it is longer (as number) than the way. A move that begins while the arm moves brakes first.
+  when that number is the larger one. A move that begins while the arm moves brakes first.
 * paths: waypoints with a blend radius are rounded by a parabola that begins and ends that far from the waypoint. A
   blended stretch is run at the smallest speed and acceleration of its waypoints. movej in a path stops at each one.
 * servoj: a lag of first order with the time constant `lookahead_time`, within the joints' top speeds and 40 rad/s^2.
@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 
 from robot.common.kinematics import motion, rotation, rotation_vector
-from robot.mock.ur.machine.arm import JOINT_ACCELERATION, PERIOD, Arm, Motion, ProgramError, slowed
+from robot.mock.ur.machine.arm import JOINT_ACCELERATION, PERIOD, Arm, MotionSteps, ProgramError, slowed
 from tacsim.interface import FloatArray
 
 FORCE_DAMPING = 1000.0  # [N/(m/s)], and [N m/(rad/s)]
@@ -33,15 +33,15 @@ ADMITTANCE_ACCELERATION = 2.0  # of force mode and freedrive [m/s^2, rad/s^2]
 
 
 def between(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
-    """The frame (4, 4) a fraction s of the way from a to b: straight line, one axis of rotation."""
+    """The frame (4, 4) a fraction s of the path from a to b: straight line, one axis of rotation."""
     frame = np.eye(4)
     frame[:3, 3] = a[:3, 3] + s * (b[:3, 3] - a[:3, 3])
     frame[:3, :3] = rotation(s * rotation_vector(b[:3, :3] @ a[:3, :3].T)) @ a[:3, :3]
     return frame
 
 
-def way(a: FloatArray, b: FloatArray) -> float:
-    """Length of the way between two frames: metres, or radians if those are more."""
+def path_length(a: FloatArray, b: FloatArray) -> float:
+    """Length of the path between two frames: metres, or radians if those are more."""
     step = motion(a, b)
     return max(float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:])))
 
@@ -66,7 +66,7 @@ def trapezoid(arm: Arm, length: float, speed: float, acceleration: float) -> Ite
     yield length
 
 
-def movej(arm: Arm, q: FloatArray, acceleration: float, speed: float) -> Motion:
+def movej(arm: Arm, q: FloatArray, acceleration: float, speed: float) -> MotionSteps:
     """All joints arrive together; speed [rad/s] and acceleration [rad/s^2] are those of the leading joint."""
     yield from stopj(arm, acceleration)
     start, step = arm.target_q, np.asarray(q, dtype=np.float64) - arm.target_q
@@ -78,7 +78,7 @@ def movej(arm: Arm, q: FloatArray, acceleration: float, speed: float) -> Motion:
     arm.waypoint = None
 
 
-def movel(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> Motion:
+def movel(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> MotionSteps:
     """The TCP on a straight line to the frame `goal`."""
     return path(arm, [Waypoint(goal, acceleration, speed, 0.0)])
 
@@ -93,7 +93,7 @@ class Waypoint:
     blend: float  # radius [m]
 
 
-def path(arm: Arm, waypoints: Sequence[Waypoint]) -> Motion:
+def path(arm: Arm, waypoints: Sequence[Waypoint]) -> MotionSteps:
     """Straight lines from waypoint to waypoint; blended ones in one go, a stop at all others."""
     first = 0
     while first < len(waypoints):
@@ -143,7 +143,7 @@ def _pieces(corners: list[FloatArray], blends: list[float]) -> list[Piece]:
 
 
 def _line(a: FloatArray, b: FloatArray) -> Piece:
-    length = way(a, b)
+    length = path_length(a, b)
     return Piece(length, lambda s: between(a, b, s / length if length > 0 else 1.0))
 
 
@@ -153,11 +153,11 @@ def _rounding(a: FloatArray, corner: FloatArray, b: FloatArray) -> Piece:
 
     share = np.linspace(0.0, 1.0, 33)
     frames = [at(float(u)) for u in share]
-    lengths = np.concatenate([[0.0], np.cumsum([way(p, q) for p, q in pairwise(frames)])])
+    lengths = np.concatenate([[0.0], np.cumsum([path_length(p, q) for p, q in pairwise(frames)])])
     return Piece(float(lengths[-1]), lambda s: at(float(np.interp(s, lengths, share))))
 
 
-def stopj(arm: Arm, deceleration: float) -> Motion:
+def stopj(arm: Arm, deceleration: float) -> MotionSteps:
     """Brakes the joints, the leading one at `deceleration` [rad/s^2]."""
     rate = _positive(deceleration, "deceleration")
     while arm.target_qd.any():
@@ -165,7 +165,7 @@ def stopj(arm: Arm, deceleration: float) -> Motion:
         yield
 
 
-def stopl(arm: Arm, deceleration: float) -> Motion:
+def stopl(arm: Arm, deceleration: float) -> MotionSteps:
     """Brakes the TCP along its direction at `deceleration` [m/s^2], or [rad/s^2] where it rather turns."""
     rate = _positive(deceleration, "deceleration")
     while arm.target_qd.any():
@@ -179,7 +179,7 @@ def stopl(arm: Arm, deceleration: float) -> Motion:
         yield
 
 
-def servoj(arm: Arm, q: FloatArray, time: float, lookahead: float) -> Motion:
+def servoj(arm: Arm, q: FloatArray, time: float, lookahead: float) -> MotionSteps:
     """Follows joints q for `time` [s]."""
     if not (math.isfinite(time) and lookahead > 0):
         raise ProgramError(f"servoj: lookahead_time must be positive and t finite, got {lookahead:g}, {time:g}")
@@ -194,12 +194,12 @@ def servoj(arm: Arm, q: FloatArray, time: float, lookahead: float) -> Motion:
         yield
 
 
-def speedj(arm: Arm, qd: FloatArray, acceleration: float, time: float) -> Motion:
+def speedj(arm: Arm, qd: FloatArray, acceleration: float, time: float) -> MotionSteps:
     """Joint speeds qd [rad/s]; ends after `time` [s], or with time 0 once they are reached."""
     return _speed(acceleration, time, lambda: _ramp(arm.target_qd, arm.scale * qd, acceleration, joint=True), arm.drive)
 
 
-def speedl(arm: Arm, twist: FloatArray, acceleration: float, time: float) -> Motion:
+def speedl(arm: Arm, twist: FloatArray, acceleration: float, time: float) -> MotionSteps:
     """Twist of the TCP in base axes; ends after `time` [s], or with time 0 once it is reached."""
 
     def drive(wanted: FloatArray) -> None:
@@ -212,7 +212,7 @@ def speedl(arm: Arm, twist: FloatArray, acceleration: float, time: float) -> Mot
 
 def _speed(
     acceleration: float, time: float, step: Callable[[], tuple[FloatArray, bool]], drive: Callable[[FloatArray], None]
-) -> Motion:
+) -> MotionSteps:
     _positive(acceleration, "acceleration")
     if not math.isfinite(time):
         raise ProgramError(f"time must be finite, got {time:g}")
@@ -234,7 +234,7 @@ def _ramp(now: FloatArray, wanted: FloatArray, acceleration: float, *, joint: bo
     return (wanted, True) if size <= limit else (now + change * (limit / size), False)
 
 
-def servoc(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> Motion:
+def servoc(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> MotionSteps:
     """Towards a frame at a bounded speed, braking in time; one control period."""
     step = motion(arm.target_frame, goal)
     size = max(_norm(step[:3]), _norm(step[3:]))
@@ -244,7 +244,7 @@ def servoc(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> Mot
     yield
 
 
-def admit(arm: Arm, frame: FloatArray, free: Sequence[float], push: FloatArray, limits: FloatArray) -> None:
+def comply(arm: Arm, frame: FloatArray, free: Sequence[float], push: FloatArray, limits: FloatArray) -> None:
     """One control period of compliance: the free axes of `frame` move at `push` (base axes, as a twist), at most
     `limits`; the others hold still."""
     turn = frame[:3, :3]

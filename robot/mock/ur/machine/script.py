@@ -2,7 +2,7 @@
 
 The text of the script is recognised, not interpreted: which registers it uses, which calls its `$version` lines left in
 it, and the path that was written into it. Its loop, its threads and its answers are done here and in
-`robot.mock.ur.machine.commands`, by the numbers of ur_rtde 1.6.5.
+`motion_commands` and `state_commands`, by the numbers of ur_rtde 1.6.5.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot.common.kinematics import matrix
-from robot.mock.ur.machine.arm import Arm, Motion, ProgramError
-from robot.mock.ur.machine.commands import COMMANDS, NEEDS, NOT_MODELLED, REALTIME
+from robot.mock.ur.machine import motion_commands, state_commands  # noqa: F401  # their functions enter COMMANDS
+from robot.mock.ur.machine.arm import Arm, MotionSteps, ProgramError
+from robot.mock.ur.machine.registry import COMMANDS
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ class Program:
         self.kind, self.name = named.groups() if named else ("", "?")
         self.known = self.name == "rtde_control"
         self.int_offset, self.float_offset = (self._offset(kind) for kind in ("int", "float"))
-        self.threads: dict[str, Motion] = {}
-        self.calls: dict[str, Callable[[], Motion]] = {}  # what a repeating thread does next
-        self.stops_linear = False  # whether stopJ and stopL are stopl: see commands.stop
+        self.threads: dict[str, MotionSteps] = {}
+        self.calls: dict[str, Callable[[], MotionSteps]] = {}  # what a repeating thread does next
+        self.stops_linear = False  # whether stopJ and stopL are stopl: see motion_commands.stop
         self.speeds_linear = True  # whether the last speed command was speedl
         self.internal = 0  # a command that the script gives itself
         self.contact_steps = 0
@@ -91,20 +92,20 @@ class Program:
 
     # -- threads -----------------------------------------------------------------------------------------------------
 
-    def run(self, name: str, work: Motion, *, tracked: bool = False) -> None:
+    def run(self, name: str, work: MotionSteps, *, tracked: bool = False) -> None:
         """Starts a thread. `tracked`: the asynchronous word tells of it."""
 
-        def tracking() -> Motion:
+        def tracking() -> MotionSteps:
             self.signal(0)
             yield from work
             self.signal(-1)
 
         self.threads[name] = tracking() if tracked else work
 
-    def repeat(self, name: str, call: Callable[[], Motion]) -> None:
+    def repeat(self, name: str, call: Callable[[], MotionSteps]) -> None:
         """What the thread shall do for ever from its next round on; starts it where it does not run."""
 
-        def rounds() -> Motion:
+        def rounds() -> MotionSteps:
             while True:
                 yield from self.calls[name]()
 
@@ -130,7 +131,7 @@ class Program:
 
     # -- the script's loop -------------------------------------------------------------------------------------------
 
-    def _loop(self) -> Motion:
+    def _loop(self) -> MotionSteps:
         self.signal(-1)
         self.answer_integer(READY, 0)
         executing = False
@@ -138,8 +139,9 @@ class Program:
             command = self.integer(0)
             if command == 0:
                 command, self.internal = self.internal, 0
-            if command in REALTIME:
-                yield from self._process(command)
+            work = self._work(command)
+            if command in COMMANDS and COMMANDS[command].every_cycle:
+                yield from work
                 self.answer_integer(READY, 0)
             elif command == 0:
                 executing = False
@@ -147,22 +149,19 @@ class Program:
             elif not executing:
                 if command == STOP_SCRIPT:
                     return
-                yield from self._process(command)
+                yield from work
                 self.answer_integer(DONE, 0)
                 executing = True
             yield
 
-    def _process(self, command: int) -> Motion:
-        if NEEDS.get(command, "") not in self.text:
-            return
-        if command in NOT_MODELLED:
-            raise ProgramError(f"{NOT_MODELLED[command]} is not modelled by the mock")
-        work = COMMANDS.get(command)
-        if work is not None:
-            yield from work(self) or ()
+    def _work(self, command: int) -> MotionSteps:
+        """What the command does; nothing for one that this controller has not."""
+        known = COMMANDS.get(command)
+        if known is not None and known.needs in self.text:
+            yield from known.work(self) or ()
 
 
-def _go_on(work: Motion) -> bool:
+def _go_on(work: MotionSteps) -> bool:
     """One control period of `work`; False when it has ended."""
     try:
         next(work)

@@ -92,13 +92,13 @@ class Controller:
             return
         for port in PORTS:
             self._listeners.append(open_port(self.config.host, port))
-            self._watch(self._listeners[-1], partial(self._accept, self._listeners[-1], port))
+            self._register(self._listeners[-1], partial(self._accept, self._listeners[-1], port))
 
     def refuse(self) -> None:
         """Closes the ports; who is connected stays."""
         for listener in self._listeners:
-            if not self.faults.black_hole:  # else nobody watches it
-                self._unwatch(listener)
+            if not self.faults.black_hole:  # else it is not registered
+                self._selector.unregister(listener)
             listener.close()
         self._listeners.clear()
 
@@ -133,20 +133,20 @@ class Controller:
         return len(chosen)
 
     def black_hole(self, on: bool) -> None:
-        """Takes the hands off all sockets, which stay open, or takes them up again."""
+        """Stops reading all sockets, which stay open, or begins again."""
         if on == self.faults.black_hole:
             return
         self.faults.black_hole = on
         for client in self.clients:
             if on:
-                self._unwatch(client.socket)
+                self._selector.unregister(client.socket)
             else:
-                self._watch(client.socket, partial(self._read, client))
+                self._register(client.socket, partial(self._read, client))
         for listener in self._listeners:
             if on:
-                self._unwatch(listener)
+                self._selector.unregister(listener)
             else:
-                self._watch(listener, partial(self._accept, listener, listener.getsockname()[1]))
+                self._register(listener, partial(self._accept, listener, listener.getsockname()[1]))
 
     # -- one control period ------------------------------------------------------------------------------------------
 
@@ -186,7 +186,7 @@ class Controller:
                     continue
                 data = made.get(recipe.names)
                 if data is None:
-                    data = made[recipe.names] = recipe.pack(self.machine, spoilt=self.faults.nan)
+                    data = made[recipe.names] = recipe.pack(self.machine, nan=self.faults.nan)
                 self._stream(client, data)
 
     def _stream(self, client: Connection, data: bytes) -> None:
@@ -200,11 +200,8 @@ class Controller:
 
     # -- sockets -----------------------------------------------------------------------------------------------------
 
-    def _watch(self, sock: socket.socket, work: Callable[[], None]) -> None:
+    def _register(self, sock: socket.socket, work: Callable[[], None]) -> None:
         self._selector.register(sock, selectors.EVENT_READ, work)
-
-    def _unwatch(self, sock: socket.socket) -> None:
-        self._selector.unregister(sock)
 
     def _accept(self, listener: socket.socket, port: int) -> None:
         try:
@@ -212,15 +209,15 @@ class Controller:
         except OSError:
             return  # gone again
         if len(self.clients) >= MAX_CLIENTS:
-            self.machine.say(f"client of port {port} closed: {MAX_CLIENTS} are connected already")
+            self.machine.write_log(f"client of port {port} closed: {MAX_CLIENTS} are connected already")
             sock.close()
             return
         client = Connection(sock, port)
         session = None
         if port == RTDE:
-            session = Session(lambda: self.machine, self._taken, self._write)
+            session = Session(lambda: self.machine, self._names_in_use, self._write)
         self.clients[client] = session
-        self._watch(sock, partial(self._read, client))
+        self._register(sock, partial(self._read, client))
         if port == DASHBOARD and not self.faults.dashboard_mute:
             client.send(dashboard.GREETING.encode() + b"\n", due=self._due())
 
@@ -228,7 +225,7 @@ class Controller:
         if client in self.clients:
             del self.clients[client]
             if not self.faults.black_hole:
-                self._unwatch(client.socket)
+                self._selector.unregister(client.socket)
             client.close(reset=reset)
 
     def _read(self, client: Connection) -> None:
@@ -243,7 +240,7 @@ class Controller:
             else:
                 self._serve_script(client)
         except BadPackage as error:
-            self.machine.say(f"port {client.port}: client cut: {error}")
+            self.machine.write_log(f"port {client.port}: client cut: {error}")
             alive = False
         if not alive:
             self._drop(client)
@@ -286,13 +283,13 @@ class Controller:
             if self.faults.remote_control:
                 self.machine.start(program)
             else:
-                self.machine.say("program refused: the robot is not in remote control")
+                self.machine.write_log("program refused: the robot is not in remote control")
         if len(client.received) > MAX_PROGRAM:
             raise BadPackage(f"a program of more than {MAX_PROGRAM} bytes")
 
     # -- input registers ---------------------------------------------------------------------------------------------
 
-    def _taken(self, asking: Session) -> set[str]:
+    def _names_in_use(self, asking: Session) -> set[str]:
         others = (session.claims for session in self.clients.values() if session is not None and session is not asking)
         return self.faults.claimed.union(*others)
 

@@ -17,13 +17,17 @@ def answer(machine: Machine, line: str, serial: str, *, remote: bool) -> str:
     asked = _QUESTIONS.get(request)
     if asked is not None:
         return asked(machine, serial, remote)
-    if request in _ORDERS:
-        return _ORDERS[request](machine)
+    if request in _COMMANDS:
+        act, reply = _COMMANDS[request]
+        act(machine)
+        return reply
+    if request in _ATTEMPTS:
+        return _ATTEMPTS[request](machine)
     if request.startswith("load "):
         # Nothing could run it: the mock runs ur_rtde's control script alone.
         return f"File not found: {words[5:]}"
     if request.startswith(("popup ", "addtolog ", "setuserrole ", "set operational mode ")):
-        machine.say(f"dashboard: {words}")
+        machine.write_log(f"dashboard: {words}")
         return {"p": "showing popup", "a": "Added log message"}.get(request[0], "Setting user role: none")
     return f"could not understand: '{words}'"
 
@@ -53,26 +57,6 @@ _QUESTIONS: dict[str, Callable[[Machine, str, bool], str]] = {
 }
 
 
-def _power_on(machine: Machine) -> str:
-    machine.power_on()
-    return "Powering on"
-
-
-def _power_off(machine: Machine) -> str:
-    machine.power_off()
-    return "Powering off"
-
-
-def _release_brakes(machine: Machine) -> str:
-    machine.release_brakes()
-    return "Brake releasing"
-
-
-def _stop(machine: Machine) -> str:
-    machine.stop("dashboard stop")
-    return "Stopped"
-
-
 def _pause(machine: Machine) -> str:
     if machine.program is None:
         return "Failed to execute: pause"
@@ -96,30 +80,19 @@ def _unlock(machine: Machine) -> str:
     )
 
 
-def _restart_safety(machine: Machine) -> str:
+def _restart_safety(machine: Machine) -> None:
     machine.power_off()
     if machine.safety is not Safety.ROBOT_EMERGENCY_STOP:
         machine.safety = Safety.NORMAL
-    return "Restarting safety"
 
 
-def _close_popup(machine: Machine) -> str:
-    return "closing popup"
-
-
-def _close_safety_popup(machine: Machine) -> str:
-    return "closing safety popup"
-
-
-_ORDERS = {
-    "power on": _power_on,
-    "power off": _power_off,
-    "brake release": _release_brakes,
-    "stop": _stop,
-    "pause": _pause,
-    "play": _play,
-    "unlock protective stop": _unlock,
-    "restart safety": _restart_safety,
-    "close popup": _close_popup,
-    "close safety popup": _close_safety_popup,
+_COMMANDS: dict[str, tuple[Callable[[Machine], object], str]] = {  # what is done, and the reply
+    "power on": (Machine.power_on, "Powering on"),
+    "power off": (Machine.power_off, "Powering off"),
+    "brake release": (Machine.release_brakes, "Brake releasing"),
+    "stop": (lambda machine: machine.stop("dashboard stop"), "Stopped"),
+    "restart safety": (_restart_safety, "Restarting safety"),
+    "close popup": (lambda machine: None, "closing popup"),
+    "close safety popup": (lambda machine: None, "closing safety popup"),
 }
+_ATTEMPTS = {"pause": _pause, "play": _play, "unlock protective stop": _unlock}  # whose reply tells how it went

@@ -162,7 +162,7 @@ def apply(machine: Machine, given: dict[str, Value | tuple[Value, ...]]) -> None
         kind, _, index = name.rpartition("_")
         if kind == "input_int_register":
             machine.in_int[int(index)] = int(value)  # type: ignore[arg-type]  # by its type in INPUTS
-            machine.feed(int(index))
+            machine.on_int_register(int(index))
         elif kind == "input_double_register":
             machine.in_double[int(index)] = float(value)  # type: ignore[arg-type]
     _outputs(machine, given)

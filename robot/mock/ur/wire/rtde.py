@@ -69,12 +69,12 @@ class OutputRecipe:
     layout: struct.Struct
     every: int  # control periods between two packages
 
-    def pack(self, machine: Machine, *, spoilt: bool) -> bytes:
-        """One data package. `spoilt`: what is measured is not a number."""
+    def pack(self, machine: Machine, *, nan: bool) -> bytes:
+        """One data package. `nan`: what is measured is not a number."""
         flat: list[Value] = []
         for name, output in zip(self.names, self.fields, strict=True):
             value = output.read(machine)
-            if spoilt and name.startswith("actual_") and FORMATS[output.type].endswith("d"):
+            if nan and name.startswith("actual_") and FORMATS[output.type].endswith("d"):
                 value = [math.nan] * len(value) if isinstance(value, (list, tuple)) else math.nan
             if isinstance(value, (list, tuple)):
                 flat.extend(value)
@@ -87,11 +87,11 @@ class OutputRecipe:
 class Session:
     """What one client of the port has set up.
 
-    `taken` says which input names others hold; `write` takes the values of an input package.
+    `names_in_use` gives the input names that others hold; `write` takes the values of an input package.
     """
 
     machine: Callable[[], Machine]
-    taken: Callable[[Session], set[str]]
+    names_in_use: Callable[[Session], set[str]]
     write: Callable[[dict[str, Value | tuple[Value, ...]]], None]
     recipes: dict[int, InputRecipe] = field(default_factory=dict)
     output: OutputRecipe | None = None
@@ -106,7 +106,7 @@ class Session:
         """The reply to a package, if it has one."""
         handler = _HANDLERS.get(kind)
         if handler is None:
-            self.machine().say(f"RTDE: package of unknown type {kind} ignored")
+            self.machine().write_log(f"RTDE: package of unknown type {kind} ignored")
             return None
         reply = handler(self, payload)
         return None if reply is None else package(kind, reply)
@@ -127,7 +127,7 @@ class Session:
 
     def _ask_outputs(self, payload: bytes) -> bytes:
         if len(payload) < 8:
-            self.machine().say("RTDE: output recipe without a frequency refused")
+            self.machine().write_log("RTDE: output recipe without a frequency refused")
             return b"\0"
         (frequency,) = struct.unpack_from(">d", payload)
         names = _names(payload[8:])
@@ -135,18 +135,18 @@ class Session:
         fields = [output for name in names if (output := OUTPUTS.get(name)) and output.known(version)]
         types = [OUTPUTS[name].type if OUTPUTS.get(name) in fields else "NOT_FOUND" for name in names]
         if not names or len(fields) < len(names) or not 1.0 <= frequency <= 1.0 / PERIOD:
-            self.machine().say(f"RTDE: output recipe at {frequency:g} Hz refused: {','.join(types)}")
+            self.machine().write_log(f"RTDE: output recipe at {frequency:g} Hz refused: {','.join(types)}")
             return b"\0" + ",".join(types).encode()
         layout = struct.Struct(">HBB" + "".join(FORMATS[kind] for kind in types))
         self.output = OutputRecipe(tuple(names), tuple(fields), layout, max(1, round(1.0 / (PERIOD * frequency))))
         return b"\1" + ",".join(types).encode()
 
     def _ask_inputs(self, payload: bytes) -> bytes:
-        names, taken = _names(payload), self.taken(self)
-        types = ["IN_USE" if name in taken else INPUTS.get(name, "NOT_FOUND") for name in names]
+        names, names_in_use = _names(payload), self.names_in_use(self)
+        types = ["IN_USE" if name in names_in_use else INPUTS.get(name, "NOT_FOUND") for name in names]
         number = len(self.recipes) + 1
         if not names or not all(kind in FORMATS for kind in types) or number > MAX_RECIPES:
-            self.machine().say(f"RTDE: input recipe refused: {','.join(types)[:200]}")
+            self.machine().write_log(f"RTDE: input recipe refused: {','.join(types)[:200]}")
             return b"\0" + ",".join(types).encode()
         layout = struct.Struct(">" + "".join(FORMATS[kind] for kind in types))
         counts = tuple(int(FORMATS[kind][:-1] or 1) for kind in types)
@@ -156,19 +156,19 @@ class Session:
     def _data(self, payload: bytes) -> None:
         recipe = self.recipes.get(payload[0]) if payload else None
         if recipe is None:
-            self.machine().say(f"RTDE: data for a recipe that was never set up ignored: {payload[:1].hex() or 'none'}")
+            self.machine().write_log(f"RTDE: data for an unknown recipe ignored: {payload[:1].hex() or 'none'}")
         else:
             # What a controller does with a wrong size is not known. Too much is read as far as the recipe goes (ur_rtde
             # 1.6.5 sends command 44 so), too little is ignored (command 55).
             given, size = len(payload) - 1, recipe.layout.size
             if given != size:
                 done = "ignored" if given < size else "cut"
-                self.machine().say(f"RTDE: data package {done}: {given} bytes, recipe {payload[0]} has {size}")
+                self.machine().write_log(f"RTDE: data package {done}: {given} bytes, recipe {payload[0]} has {size}")
             if given >= size:
                 self.write(recipe.unpack(payload[1 : 1 + size]))
 
     def _message(self, payload: bytes) -> None:
-        self.machine().say(f"RTDE: message of a client: {payload[:200]!r}")
+        self.machine().write_log(f"RTDE: message of a client: {payload[:200]!r}")
 
 
 _HANDLERS: dict[int, Callable[[Session, bytes], bytes | None]] = {

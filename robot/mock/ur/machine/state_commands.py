@@ -1,4 +1,4 @@
-"""The commands of ur_rtde's control script that set something or ask something; none of them moves the arm."""
+"""Commands of ur_rtde's control script that set or ask something; none of them moves the arm."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
+from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
@@ -19,10 +20,12 @@ NEAR_SINGULAR, SINGULAR = 0.05, 0.02  # of Kinematics.singularity, for get_freed
 # -- settings --------------------------------------------------------------------------------------------------------
 
 
+@command(8)
 def zero_sensor(p: Program) -> None:
     p.machine.load.zero(p.arm)
 
 
+@command(17)
 def payload(p: Program) -> None:
     """A centre of gravity that is all zero keeps the one before: the script has it so."""
     mass, centre = p.double(0), p.doubles(1, 3)
@@ -33,98 +36,114 @@ def payload(p: Program) -> None:
         p.machine.payload_centre = centre
 
 
+@command(65)
 def target_payload(p: Program) -> None:
     payload(p)
     p.machine.payload_inertia = p.doubles(4)
 
 
+@command(29)
 def tool(p: Program) -> None:
     p.arm.tool = p.frame(0)
-    p.arm.look()
-    p.machine.load.look(p.arm)
+    p.arm.update()
+    p.machine.load.update(p.arm)
 
 
+@command(59)
 def gravity(p: Program) -> None:
     p.machine.gravity = p.doubles(0, 3)
 
 
+@command(35)
 def watchdog(p: Program) -> None:
     frequency = p.double(0)
     if not frequency > 0:
         raise ProgramError(f"rtde_set_watchdog: frequency must be positive, got {frequency:g}")
-    p.machine.watchdog, p.machine.fed = (p.int_offset, 1.0 / frequency), p.machine.ticks
+    p.machine.watchdog, p.machine.watchdog_reset = (p.int_offset, 1.0 / frequency), p.machine.ticks
 
 
+@command(18)
 def teach(p: Program) -> None:
     p.machine.freedrive = np.eye(4), (1,) * 6
 
 
+@command(52, needs="freedrive_mode(")
 def freedrive(p: Program) -> None:
     p.machine.freedrive = p.frame(0), tuple(p.integer(index) for index in range(1, 7))
 
 
+@command(19)
+@command(53, needs="end_freedrive_mode(")
 def freedrive_end(p: Program) -> None:
     p.machine.freedrive = None
 
 
-def freedrive_status(p: Program) -> None:
-    measure = p.arm.kinematics.singularity(p.arm.q)
-    p.answer_integer((measure < NEAR_SINGULAR) + (measure < SINGULAR))
-
-
+@command(31, needs="protective_stop()")
 def protective_stop(p: Program) -> None:
     p.machine.protective_stop("asked for by the program")
 
 
+@command(56, 57)
 def external_sensor(p: Program) -> None:
     if p.integer(1) == 1:
         raise ProgramError("external force sensors are not modelled by the mock: give the wrench by its fault client")
 
 
-# -- questions -------------------------------------------------------------------------------------------------------
+# -- queries ---------------------------------------------------------------------------------------------------------
 
 
-def joints(p: Program, first: int = 0) -> FloatArray:
+def finite_joints(p: Program, first: int = 0) -> FloatArray:
     q = p.doubles(first)
     if not np.isfinite(q).all():
         raise ProgramError("joints with a number that is not finite")
     return q
 
 
-def inverse(p: Program) -> None:
-    p.answer(p.arm.solve(p.frame(0)))
+def _reaches(p: Program, seed: FloatArray) -> bool:
+    return p.arm.kinematics.inverse(p.frame(0), seed, p.arm.tool) is not None
 
 
-def inverse_near(p: Program) -> None:
-    p.answer(p.arm.solve(p.frame(0), joints(p, 6)))
+def _singular(p: Program) -> int:
+    measure = p.arm.kinematics.singularity(p.arm.q)
+    return (measure < NEAR_SINGULAR) + (measure < SINGULAR)
 
 
-def reaches(p: Program) -> None:
-    p.answer_integer(p.arm.kinematics.inverse(p.frame(0), p.arm.target_q, p.arm.tool) is not None)
+def _query(
+    *numbers: int, read: Callable[[Program], FloatArray | int], needs: str = "", every_cycle: bool = False
+) -> None:
+    """Enters a command that answers with what `read` returns: numbers, or one integer."""
+
+    @command(*numbers, needs=needs, every_cycle=every_cycle)
+    def work(p: Program) -> None:
+        value = read(p)
+        p.answer(value) if isinstance(value, np.ndarray) else p.answer_integer(value)
 
 
-def reaches_near(p: Program) -> None:
-    p.answer_integer(p.arm.kinematics.inverse(p.frame(0), joints(p, 6), p.arm.tool) is not None)
+_query(46, read=lambda p: p.arm.solve(p.frame(0)))
+_query(30, read=lambda p: p.arm.solve(p.frame(0), finite_joints(p, 6)))
+_query(36, read=lambda p: _reaches(p, p.arm.target_q))
+_query(60, read=lambda p: _reaches(p, p.arm.target_q), needs="get_inverse_kin_has_solution(")
+_query(61, read=lambda p: _reaches(p, finite_joints(p, 6)), needs="get_inverse_kin_has_solution(")
+_query(37, read=lambda p: bool(np.abs(p.doubles(0)).max() <= 2 * np.pi))
+_query(39, read=lambda p: pose(p.frame(0) @ p.frame(6)))
+_query(44, read=lambda p: pose(p.arm.kinematics.forward(finite_joints(p), p.frame(6))))
+_query(40, read=lambda p: pose(p.arm.tool), needs="get_tcp_offset(")
+_query(43, read=lambda p: pose(p.arm.target_frame))
+_query(58, read=lambda p: pose(p.arm.kinematics.forward(p.arm.q)), every_cycle=True)
+_query(
+    28,
+    read=lambda p: pose(p.arm.target_frame if p.arm.waypoint is None else p.arm.waypoint),
+    needs="get_target_waypoint(",
+)
+_query(47, read=lambda p: p.machine.steady)
+_query(54, read=_singular, needs="get_freedrive_status(")
+_query(26, read=lambda p: np.array([PERIOD]), needs="get_steptime(", every_cycle=True)
+_query(69, read=lambda p: p.arm.target_qdd, needs="get_target_joint_accelerations(", every_cycle=True)
 
 
-def joints_allowed(p: Program) -> None:
-    p.answer_integer(bool(np.abs(p.doubles(0)).max() <= 2 * np.pi))
-
-
-def compose(p: Program) -> None:
-    p.answer(pose(p.frame(0) @ p.frame(6)))
-
-
-def forward(p: Program) -> None:
-    p.answer(pose(p.arm.kinematics.forward(joints(p), p.frame(6))))
-
-
-def waypoint(p: Program) -> None:
-    p.answer(pose(p.arm.target_frame if p.arm.waypoint is None else p.arm.waypoint))
-
-
+@command(38, every_cycle=True)
 def torques(p: Program) -> None:
-    """What the joints bear of the load on the tool."""
+    """What the joints bear of the load on the tool [N m]."""
     p.answer(-p.arm.kinematics.jacobian(p.arm.q, p.arm.tool).T @ p.machine.load.true)
 
 
@@ -134,47 +153,13 @@ def _answer_matrix(p: Program, values: FloatArray) -> None:
     p.machine.out_double[:24], p.machine.out_double[36:48] = flat[:24], flat[24:]
 
 
+@command(70, needs="get_jacobian(", every_cycle=True)
 def jacobian(p: Program) -> None:
     _answer_matrix(p, p.arm.kinematics.jacobian(p.arm.q, p.arm.tool))
 
 
+@command(71, needs="get_jacobian_time_derivative(", every_cycle=True)
 def jacobian_rate(p: Program) -> None:
     arm, h = p.arm, 1e-5  # central difference along the motion [s]
     before, after = (arm.kinematics.jacobian(arm.q + step * arm.qd, arm.tool) for step in (-h, h))
     _answer_matrix(p, (after - before) / (2 * h))
-
-
-ANSWERS: dict[int, Callable[[Program], None]] = {
-    8: zero_sensor,
-    17: payload,
-    18: teach,
-    19: freedrive_end,
-    26: lambda p: p.answer(np.array([PERIOD])),
-    28: waypoint,
-    29: tool,
-    30: inverse_near,
-    31: protective_stop,
-    35: watchdog,
-    36: reaches,
-    37: joints_allowed,
-    38: torques,
-    39: compose,
-    40: lambda p: p.answer(pose(p.arm.tool)),
-    43: lambda p: p.answer(pose(p.arm.target_frame)),
-    44: forward,
-    46: inverse,
-    47: lambda p: p.answer_integer(p.machine.steady),
-    52: freedrive,
-    53: freedrive_end,
-    54: freedrive_status,
-    56: external_sensor,
-    57: external_sensor,
-    58: lambda p: p.answer(pose(p.arm.kinematics.forward(p.arm.q))),
-    59: gravity,
-    60: reaches,
-    61: reaches_near,
-    65: target_payload,
-    69: lambda p: p.answer(p.arm.target_qdd),
-    70: jacobian,
-    71: jacobian_rate,
-}

@@ -1,0 +1,36 @@
+"""The commands of ur_rtde's control script (ur_rtde 1.6.5), by the number that the client writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from robot.mock.ur.machine.arm import MotionSteps
+
+if TYPE_CHECKING:
+    from robot.mock.ur.machine.script import Program
+
+Work = Callable[["Program"], MotionSteps | None]
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of the script."""
+
+    work: Work
+    needs: str  # a call that older controllers lack: where the script's text is without it, the command does nothing
+    every_cycle: bool  # done again in every cycle of the script; any other once, until the client writes 0
+
+
+COMMANDS: dict[int, Command] = {}
+
+
+def command(*numbers: int, needs: str = "", every_cycle: bool = False) -> Callable[[Work], Work]:
+    """Enters a function into COMMANDS. Its result is a motion that the script waits for, or None."""
+
+    def enter(work: Work) -> Work:
+        COMMANDS.update(dict.fromkeys(numbers, Command(work, needs, every_cycle)))
+        return work
+
+    return enter

@@ -102,7 +102,7 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     assert code == 2 and "either --pixel-pitch or --view" in err
     (frames / "background.png").write_bytes(encode_png(pictures["background"]))
     code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "no")
-    assert code == 2 and "all must be of one camera and one setting" in err
+    assert code == 2 and "all pictures of a folder must have one size" in err
     for name, metric in pictures.items():
         (frames / f"{name}.png").write_bytes(encode_png(metric))
     code, _, err = run("sensor", frames, *ball, *seen, "--out", tmp_path / "no")

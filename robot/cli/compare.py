@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.output import Out, Overrides, busy, make, new_directory, notes, progress, results, say_files, writing
+from robot.cli.output import (
+    Out,
+    Overrides,
+    busy,
+    counted,
+    make,
+    new_directory,
+    notes,
+    results,
+    say_files,
+    show_table,
+    warn,
+    writing,
+)
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -79,36 +92,32 @@ def compare(
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
     bundles = [None if path is None else _calibration(path) for path in (calibration_a, calibration_b)]
     try:
-        truth = _metric(_read(b, reference_b, sensor_b), bundles[1])
+        truth = _rectify_view(_read(b, reference_b, sensor_b), bundles[1])
         if _is_scene(a):
             if corners_a or corners_b or reference_a or sensor_a:
                 raise BadFrames(
                     f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated"
                 )
-            made = _pressed(a, truth, calibration_b, set_ or [])
+            made = _simulate_presses(a, truth, calibration_b, set_ or [])
         else:
             if set_:
                 raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
-            made = _metric(_read(Path(a), reference_a, sensor_a), bundles[0])
+            made = _rectify_view(_read(Path(a), reference_a, sensor_a), bundles[0])
         # from here on all pictures are metric where a calibration says how
         bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
-        made, truth = _straight(made, truth, (corners_a, corners_b), bundles)
-        with progress() as bar:
-            row = bar.add_task("comparing", total=None)
-            result = run(
-                made, truth, bundles[0], bundles[1], Options(Pairing(pair.value), shift),
-                lambda done, total: bar.update(row, completed=done, total=total),
-            )  # fmt: skip
-        report = _invariance(result, bundles[1]) if invariance else None
+        made, truth = _rectify_corners(made, truth, (corners_a, corners_b), bundles)
+        with counted("comparing") as on_step:
+            result = run(made, truth, bundles[0], bundles[1], Options(Pairing(pair.value), shift), on_step)
+        report = _check_invariance(result, bundles[1]) if invariance else None
     except (BadFrames, BadCorners) as error:
         raise typer.BadParameter(str(error), param_hint="A B") from None
     values = figures(result, report)
-    _refuse_unknown(limits, values)
+    _require_known(limits, values)
     with writing(make(folder)), busy("writing"):
         written = write(folder, result, report)
     _show(result, report)
     say_files(*written)
-    if _broken(limits, values):
+    if _beyond_limits(limits, values):
         raise typer.Exit(1)
 
 
@@ -128,7 +137,7 @@ def _read(path: Path, reference: Path | None, sensor: str) -> FrameSet:
         return read_frame_set(path, reference, sensor)
 
 
-def _metric(side: FrameSet, bundle: Calibration | None) -> FrameSet:
+def _rectify_view(side: FrameSet, bundle: Calibration | None) -> FrameSet:
     """The side through lens and perspective of its calibration, where that has a view."""
     from calibration.frame_set import rectified_by_view
 
@@ -142,7 +151,7 @@ def _is_scene(a: str) -> bool:
     return a.lower().endswith((".yaml", ".yml")) or (not Path(a).exists() and a in names("scene"))
 
 
-def _pressed(name: str, truth: FrameSet, bundle: Path | None, overrides: list[str]) -> FrameSet:
+def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides: list[str]) -> FrameSet:
     """A's frames by the simulator."""
     from calibration.bundle import read_sensor_model
     from calibration.errors import BadFrames
@@ -155,18 +164,14 @@ def _pressed(name: str, truth: FrameSet, bundle: Path | None, overrides: list[st
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
     from robot.studies.matched_press import press_like
 
-    with progress() as bar:
-        row = bar.add_task("pressing", total=None)
-        made, said = press_like(
-            truth, scene, read_sensor_model(bundle), CanonicalGrid(),
-            lambda done, total: bar.update(row, completed=done, total=total),
-        )  # fmt: skip
-    for words in said:
-        notes.print(f"look at this: {words}", markup=False)
+    with counted("pressing") as on_press:
+        made, warnings = press_like(truth, scene, read_sensor_model(bundle), CanonicalGrid(), on_press)
+    for words in warnings:
+        warn(words)
     return made
 
 
-def _straight(
+def _rectify_corners(
     a: FrameSet, b: FrameSet, texts: tuple[str | None, str | None], bundles: list[Calibration | None]
 ) -> tuple[FrameSet, FrameSet]:
     """Both sides seen straight on, where the corners of the gel are given: B's size counts."""
@@ -197,12 +202,11 @@ def _corners(text: str) -> Corners:
     return tuple(points)  # type: ignore[return-value]
 
 
-def _invariance(result: Comparison, calibration: Calibration | None) -> Report:
+def _check_invariance(result: Comparison, calibration: Calibration | None) -> Report:
     from calibration.compare.invariance import invariance
 
-    with progress() as bar:
-        row = bar.add_task("invariance", total=None)
-        return invariance(result, calibration, on_step=lambda done, total: bar.update(row, completed=done, total=total))
+    with counted("invariance") as on_step:
+        return invariance(result, calibration, on_step=on_step)
 
 
 def _limits(texts: list[str] | None, option: str) -> list[Limit]:
@@ -225,7 +229,7 @@ def _limits(texts: list[str] | None, option: str) -> list[Limit]:
     return found
 
 
-def _refuse_unknown(limits: list[Limit], values: dict[str, float]) -> None:
+def _require_known(limits: list[Limit], values: dict[str, float]) -> None:
     """A limit of something that could not be told must not look like a pass."""
     unknown = [name for name, _, _ in limits if values[name] != values[name]]
     if unknown:
@@ -236,74 +240,57 @@ def _refuse_unknown(limits: list[Limit], values: dict[str, float]) -> None:
         )
 
 
-def _broken(limits: list[Limit], values: dict[str, float]) -> bool:
-    broken = [
+def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> bool:
+    beyond = [
         f"{name} is {values[name]:.4g}, {'above' if above else 'below'} {limit:g}"
         for name, limit, above in limits
         if (values[name] > limit if above else values[name] < limit)
     ]
-    for words in broken:
+    for words in beyond:
         complain(words)
-    return bool(broken)
+    return bool(beyond)
 
 
 def _show(result: Comparison, report: Report | None) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from calibration.compare.report import rows, shown, verdict
 
-    console = Console(width=None if results.is_terminal else 160, highlight=False)
-    table = Table(box=None, padding=(0, 1), title=f"{len(result.pairs)} pairs", title_justify="left")
-    table.add_column("metric")
-    for column in ("A against B", "95 % interval", "null", "floor", "than null"):
-        table.add_column(column, justify="right")
-    for metric, overall in rows(result):
-        table.add_row(
+    width = None if results.is_terminal else 160
+    overall_rows = (
+        (
             f"{metric.label} ({metric.unit})" if metric.unit else metric.label,
             shown(overall.mean, metric),
             f"{shown(overall.low, metric)} to {shown(overall.high, metric)}",
             shown(overall.null, metric), shown(overall.floor, metric), verdict(overall),
-        )  # fmt: skip
-    console.print(table)
+        )
+        for metric, overall in rows(result)
+    )  # fmt: skip
+    columns = ("metric", "A against B", "95 % interval", "null", "floor", "than null")
+    show_table(f"{len(result.pairs)} pairs", columns, overall_rows, left={0}, width=width)
     if report is not None:
-        _show_invariance(report, console)
+        _show_invariance(report, width)
     notes.print(result.alignment.said, markup=False)
     for words in result.notes:
-        notes.print(f"look at this: {words}", markup=False)
+        warn(words)
     flagged = [pair for pair in result.pairs if pair.flags]
     for pair in flagged[:10]:
-        notes.print(f"look at this: {pair.a.name} / {pair.b.name}: {'; '.join(pair.flags)}", markup=False)
+        warn(f"{pair.a.name} / {pair.b.name}: {'; '.join(pair.flags)}")
     if len(flagged) > 10:
         notes.print(f"... and {len(flagged) - 10} more flagged pairs, in the files")
 
 
-def _show_invariance(report: Report, console: object) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    assert isinstance(console, Console)
-    table = Table(
-        box=None, padding=(0, 1), title=f"Invariance, {report.presses} presses, patch {report.patch}",
-        title_justify="left",
-    )  # fmt: skip
-    for column in ("view", "rho", "95 %", "AUC", "95 %"):
-        table.add_column(column, justify="left" if column == "view" else "right")
-    for view in report.views:
-        table.add_row(
+def _show_invariance(report: Report, width: int | None) -> None:
+    views = (
+        (
             view.view, f"{view.rho:.2f}", f"{view.rho_low:.2f} to {view.rho_high:.2f}",
             f"{view.auc:.2f}", f"{view.auc_low:.2f} to {view.auc_high:.2f}",
-        )  # fmt: skip
-    console.print(table)
+        )
+        for view in report.views
+    )  # fmt: skip
+    title = f"Invariance, {report.presses} presses, patch {report.patch}"
+    show_table(title, ("view", "rho", "95 %", "AUC", "95 %"), views, left={0}, width=width)
     if report.drifts:
-        drift = Table(
-            box=None, padding=(0, 1), title=f"Extra gradient error under drift (°), beyond {report.angle:.1f}",
-            title_justify="left",
-        )  # fmt: skip
-        for column in ("change", "fresh reference", "stale"):
-            drift.add_column(column, justify="left" if column == "change" else "right")
-        for row in report.drifts:
-            drift.add_row(row.change.name, f"{row.fresh:.2f}", f"{row.stale:.2f}")
-        console.print(drift)
+        drifts = ((row.change.name, f"{row.fresh:.2f}", f"{row.stale:.2f}") for row in report.drifts)
+        title = f"Extra gradient error under drift (°), beyond {report.angle:.1f}"
+        show_table(title, ("change", "fresh reference", "stale"), drifts, left={0}, width=width)
     for words in report.notes:
-        notes.print(f"look at this: {words}", markup=False)
+        warn(words)

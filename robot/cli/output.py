@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -86,6 +86,14 @@ def progress() -> Iterator[Progress]:
 
 
 @contextmanager
+def counted(words: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar, as what takes (steps done, steps in all)."""
+    with progress() as bar:
+        row = bar.add_task(words, total=None)
+        yield lambda done, total: bar.update(row, completed=done, total=total)
+
+
+@contextmanager
 def busy(words: str) -> Iterator[None]:
     """Says what takes long; on a terminal with a spinner, else as one line."""
     if notes.is_terminal:
@@ -100,6 +108,11 @@ def say_files(*paths: Path) -> None:
     """Prints paths, one a line."""
     for path in paths:
         results.print(str(path), markup=False)
+
+
+def warn(words: str) -> None:
+    """What a person should look at before trusting the result."""
+    notes.print(f"look at this: {words}", markup=False)
 
 
 def ask(question: str) -> bool:
@@ -149,3 +162,13 @@ def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
         return tuple(quantity(kind)(part.strip()) for part in parts)
 
     return parse
+
+
+def length(help_: str) -> Any:
+    """An option that is a length."""
+    return typer.Option(parser=quantity("length"), metavar="LENGTH", help=help_)
+
+
+def angle(help_: str) -> Any:
+    """An option that is an angle."""
+    return typer.Option(parser=quantity("angle"), metavar="ANGLE", help=help_)

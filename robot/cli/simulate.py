@@ -13,13 +13,14 @@ from robot.cli.interrupt import Interrupt
 from robot.cli.output import (
     Out,
     Overrides,
+    angle,
     busy,
+    length,
     make,
     new_directory,
     notes,
     progress,
     quantities,
-    quantity,
     results,
     say_files,
     writing,
@@ -47,19 +48,13 @@ class Physics(StrEnum):
 
 def press(
     indenter: Annotated[str, typer.Argument(help="sphere, cylinder, box, or the path of an .stl file.")],
-    depth: Annotated[
-        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="How deep below the untouched gel.")
-    ] = "0.5 mm",
+    depth: Annotated[Any, length("How deep below the untouched gel.")] = "0.5 mm",
     slide: Annotated[
         Any, typer.Option(parser=quantities("length", 2), metavar="X,Y", help="Then slide by this much.")
     ] = "0,0",
-    twist: Annotated[
-        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Then turn about the vertical.")
-    ] = "0",
-    radius: Annotated[
-        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Of a sphere or cylinder.")
-    ] = "4 mm",
-    height: Annotated[Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help="Of a cylinder.")] = "5 mm",
+    twist: Annotated[Any, angle("Then turn about the vertical.")] = "0",
+    radius: Annotated[Any, length("Of a sphere or cylinder.")] = "4 mm",
+    height: Annotated[Any, length("Of a cylinder.")] = "5 mm",
     size: Annotated[
         Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
     ] = "5 mm, 5 mm, 5 mm",

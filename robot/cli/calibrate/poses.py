@@ -15,10 +15,11 @@ from robot.cli.calibrate.session import confirm_motion, led, tell_left_out
 from robot.cli.output import (
     Out,
     Overrides,
+    angle,
     busy,
+    length,
     made,
     new_directory,
-    quantity,
     results,
     say_files,
     show_table,
@@ -38,26 +39,20 @@ Rig = Annotated[
 ]
 
 
-def _length(help_: str) -> Any:
-    return typer.Option(parser=quantity("length"), metavar="LENGTH", help=help_)
-
-
 def touch(
     touches: Annotated[Path | None, typer.Argument(help="File of recorded touches (YAML); or give --rig.")] = None,
     rig: Rig = None,
     arm: Annotated[str, typer.Option("--arm", help="The arm that touches; with --rig.")] = "",
     sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries; with --rig.")] = "",
-    ball_radius: Annotated[Any, _length("Of the ball; with --rig.")] = None,
+    ball_radius: Annotated[Any, length("Of the ball; with --rig.")] = None,
     number: Annotated[int, typer.Option("--touches", min=6, max=200, help="How many; more make it surer.")] = 24,
-    tilt: Annotated[
-        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Largest tilt of the sensor.")
-    ] = "25 deg",
-    spread: Annotated[Any, _length("How far from the middle of the gel the ball is met.")] = "3 mm",
-    depth: Annotated[Any, _length("How deep the ball is pressed into the gel.")] = "0.4 mm",
-    lift: Annotated[Any, _length("How far back along the sensor's axis between touches.")] = "6 mm",
-    noise_centre: Annotated[Any, _length("Standard deviation of the contact's centre, each axis.")] = "0.03 mm",
-    noise_depth: Annotated[Any, _length("Standard deviation of the depth.")] = "0.05 mm",
-    noise_robot: Annotated[Any, _length("Standard deviation of the arm's position, each axis.")] = "0.05 mm",
+    tilt: Annotated[Any, angle("Largest tilt of the sensor.")] = "25 deg",
+    spread: Annotated[Any, length("How far from the middle of the gel the ball is met.")] = "3 mm",
+    depth: Annotated[Any, length("How deep the ball is pressed into the gel.")] = "0.4 mm",
+    lift: Annotated[Any, length("How far back along the sensor's axis between touches.")] = "6 mm",
+    noise_centre: Annotated[Any, length("Standard deviation of the contact's centre, each axis.")] = "0.03 mm",
+    noise_depth: Annotated[Any, length("Standard deviation of the depth.")] = "0.05 mm",
+    noise_robot: Annotated[Any, length("Standard deviation of the arm's position, each axis.")] = "0.05 mm",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -179,14 +174,10 @@ def hand_eye(
     board: Annotated[str, typer.Option(help="charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]; with --rig.")] = "",
     fixed: Annotated[bool, typer.Option("--fixed", help="The camera stands, the board rides; with --rig.")] = False,
     number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20,
-    tilt: Annotated[
-        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="Largest tilt about each axis.")
-    ] = "30 deg",
-    pivot: Annotated[Any, _length("How far before the sensor the point is that it turns about.")] = "0 mm",
-    noise_board: Annotated[Any, _length("Standard deviation of the board's place, each axis.")] = "0.5 mm",
-    noise_turn: Annotated[
-        Any, typer.Option(parser=quantity("angle"), metavar="ANGLE", help="The same of its direction.")
-    ] = "0.15 deg",
+    tilt: Annotated[Any, angle("Largest tilt about each axis.")] = "30 deg",
+    pivot: Annotated[Any, length("How far before the sensor the point is that it turns about.")] = "0 mm",
+    noise_board: Annotated[Any, length("Standard deviation of the board's place, each axis.")] = "0.5 mm",
+    noise_turn: Annotated[Any, angle("The same of its direction.")] = "0.15 deg",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:

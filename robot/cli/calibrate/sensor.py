@@ -13,13 +13,14 @@ from robot.cli.output import (
     Out,
     Overrides,
     busy,
+    length,
     made,
     new_directory,
     notes,
-    quantity,
     results,
     say_files,
     show_table,
+    warn,
     writing,
 )
 
@@ -47,9 +48,7 @@ def sensor(
     frames: Annotated[
         Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
     ] = None,
-    ball_radius: Annotated[
-        Any, typer.Option(parser=quantity("length"), metavar="LENGTH", help='Of the ball, for example "2.92 mm".')
-    ] = None,
+    ball_radius: Annotated[Any, length('Of the ball, for example "2.92 mm".')] = None,
     camera: Annotated[
         str | None,
         typer.Option(metavar="RIG/SENSOR", help="Press now, before this camera of a rig; no arm is connected."),
@@ -57,9 +56,7 @@ def sensor(
     presses: Annotated[int, typer.Option(min=1, max=100, help="How many; with --camera.")] = 8,
     pixel_pitch: Annotated[
         Any,
-        typer.Option(
-            parser=quantity("length"), metavar="LENGTH", help="Distance of two pixels on the gel; or give --view."
-        ),
+        length("Distance of two pixels on the gel; or give --view."),
     ] = None,
     view: Annotated[
         Path | None,
@@ -245,7 +242,7 @@ def _look_for_dots(fit: LightFit) -> None:
     try:
         require_no_markers(fit.reference)
     except UnusableReference:
-        notes.print("look at this: dots seem to be printed on the gel; give --markers, or each will pass for a dent")
+        warn("dots seem to be printed on the gel; give --markers, or each will pass for a dent")
 
 
 def _bundle(
@@ -319,4 +316,4 @@ def _show(fit: LightFit, pitch: float) -> None:
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)
     for warning in fit.warnings:
-        notes.print(f"look at this: {warning}", markup=False)
+        warn(warning)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -73,29 +73,40 @@ def run(
 def _run(
     loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, interrupt: Interrupt, dry_run: bool
 ) -> bool:
-    """Runs and reports the episode; True when it or its recording failed."""
+    """Runs and reports the episode; True when it or its recording failed. The folder is made when the episode starts: a
+    run that cannot start leaves none."""
     with busy("loading"):
         from robot.deploy.control_loop import EpisodeSetup
         from robot.deploy.policy import load_policy
         from robot.open import open_rig
         from tacsim.physics.failure.dump import dumps_in
+        from tacsim.record.writer import Recorder
         from tacsim.tasks import make_task
     if not notes.is_terminal:
         notes.print(STARTING)
     task = None if loaded.config.task is None else make_task(loaded.config.task)
-    config = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()})
+    setup = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()})
+    recorder: Recorder | None = None
     with dumps_in(folder / "diverged"), open_rig(loaded, confirm=ask, dry_run=dry_run) as rig:
         acting = load_policy(policy, task, rig.spec)
-        with Recording(folder, loaded.config.canonical.pitch) as recording:
-            episode, failure = _drive(rig, acting, task, steps, config, recording, interrupt)
-    for problem in (failure, recording.problem(len(episode.steps))):
-        if problem:
-            complain(problem)
-    if not recording.opened or not episode.steps:
+        with ExitStack() as stack:
+
+            def record(meta: EpisodeMeta) -> Recorder:
+                nonlocal recorder
+                with writing(make(folder)):
+                    file = Recorder(folder / "episode.mcap", meta, pitch=loaded.config.canonical.pitch)
+                    recorder = stack.enter_context(file)
+                return recorder
+
+            episode, failure = _drive(rig, acting, task, steps, setup, record, interrupt)
+    lost = "" if recorder is None else _lost_steps(recorder, len(episode.steps))
+    for problem in filter(None, (failure, lost)):
+        complain(problem)
+    if recorder is None or not episode.steps:
         return True
-    episode.dropped = recording.dropped
+    episode.dropped = recorder.dropped
     _report(episode, folder, [folder / "episode.mcap"])
-    return bool(failure or recording.problem(len(episode.steps)))
+    return bool(failure or lost)
 
 
 def _drive(
@@ -103,8 +114,8 @@ def _drive(
     policy: Policy,
     task: Task | None,
     steps: int,
-    config: EpisodeSetup,
-    recording: Recording,
+    setup: EpisodeSetup,
+    record: Callable[[EpisodeMeta], Recorder],
     interrupt: Interrupt,
 ) -> tuple[Episode, str]:
     """The episode, shown by a progress bar, and what ended it too early ("" when nothing did)."""
@@ -118,50 +129,18 @@ def _drive(
             bar.update(row, description=task.config.kind if task else rig.name, total=known, completed=step.index)
 
         try:
-            return run_episode(
-                rig, policy, task, steps, setup=config, recorder=recording.open, on_step=show, stop=interrupt
-            ), ""
+            episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=show, stop=interrupt)
         except EpisodeFailed as failed:
             return failed.episode, str(failed)
+    return episode, ""
 
 
-class Recording:
-    """The recorder of one run. Folder and file are made when the episode starts: a run that can't start leaves none."""
-
-    def __init__(self, folder: Path, pitch: float) -> None:
-        self._folder, self._pitch = folder, pitch
-        self._recorder: Recorder | None = None
-        self._stack = ExitStack()
-
-    def open(self, meta: EpisodeMeta) -> Recorder:
-        """Raises OSError."""
-        from tacsim.record.writer import Recorder
-
-        with writing(make(self._folder)):
-            self._recorder = self._stack.enter_context(Recorder(self._folder / "episode.mcap", meta, pitch=self._pitch))
-        return self._recorder
-
-    @property
-    def opened(self) -> bool:
-        return self._recorder is not None
-
-    @property
-    def dropped(self) -> int:
-        return 0 if self._recorder is None else self._recorder.dropped
-
-    def problem(self, steps: int) -> str:
-        """What went wrong with the recording, in words; "" when nothing did."""
-        recorder = self._recorder
-        if recorder is None or not (recorder.error or recorder.dropped):
-            return ""
-        why = str(recorder.error) if recorder.error else "the disk was too slow"
-        return f"{recorder.path} holds {recorder.written} of {steps} steps: {why}"
-
-    def __enter__(self) -> Recording:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._stack.close()
+def _lost_steps(recorder: Recorder, steps: int) -> str:
+    """What the recording lacks of `steps`, and why; "" when it lacks nothing."""
+    if not (recorder.error or recorder.dropped):
+        return ""
+    why = str(recorder.error) if recorder.error else "the disk was too slow"
+    return f"{recorder.path} holds {recorder.written} of {steps} steps: {why}"
 
 
 def replay(

@@ -31,7 +31,7 @@ from robot.procedures.session import (
     move_to,
 )
 from tacsim import pose as se3
-from tacsim.control.approach import NoTouch
+from tacsim.control.approach import NoTouch, approach
 from tacsim.interface import FloatArray, Pose, TactileObservation
 from tacsim.limits import ActionError
 from tacsim.models.hardware import CameraSensorConfig
@@ -153,21 +153,22 @@ class _BallProber:
     def _approach(self, begin: Pose, travel: float) -> tuple[tuple[float, float], float, Pose]:
         """From `begin`, where the arm stands, along the sensor's axis until the gel is pressed deep enough: the touch.
         Raises NoTouch, BadMeasurements."""
-        travelled = 0.0
-        while True:
+
+        def touches() -> bool:
             seen = self._observe(FRESH)
             assert seen.height is not None
-            if float(seen.height.max(where=seen.valid, initial=0.0)) >= self._plan.depth:
-                break
-            travelled += self._plan.step
-            if travelled > travel:
-                raise NoTouch(
-                    f"no touch after an approach of {1e3 * travel:.3g} mm; does the ball stand before the gel, and its "
-                    "start above it? (start.approach_way in the rig file bounds the first approach)"
-                )
+            return float(seen.height.max(where=seen.valid, initial=0.0)) >= self._plan.depth
+
+        def advance(distance: float) -> None:
             due = time.monotonic() + self._plan.step / self._speed
-            move_to(self._arm, self._name, along_z(begin, travelled), STEP_TIMEOUT)
+            move_to(self._arm, self._name, along_z(begin, distance), STEP_TIMEOUT)
             time.sleep(max(0.0, due - time.monotonic()))
+
+        advice = (
+            "does the ball stand before the gel, and its start above it? (start.approach_way in the rig file bounds "
+            "the first approach)"
+        )
+        approach(touches, advance, self._plan.step, travel, advice)
         seen = self._observe(SETTLE)
         assert seen.height is not None
         contact, depth = locate_ball(seen.height.astype(np.float64), seen.valid, self._pitch, self._plan.ball_radius)

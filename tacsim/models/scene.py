@@ -173,15 +173,13 @@ class Scene(Config):
     def _consistent(self) -> Self:
         if (self.body is None) == (self.indenter is None):
             raise ValueError("give a body (between two gels) or an indenter (on one gel), not both and not neither")
-        if self.physics == "seed" and self.indenter is not None:
-            raise ValueError("physics 'seed' has no rigid indenter; use physics 'hybrid'")
-        if self.physics == "seed" and self.body is not None and self.body.material.hardening_modulus > 0:
-            raise ValueError(
-                "physics 'seed' has no hardening; use physics 'hybrid', or leave out the material's hardening_modulus"
-            )
-        if any(self.gravity) and (self.physics == "seed" or self.body is None):
-            what = "physics 'seed' has no gravity" if self.physics == "seed" else "gravity has no body to act on"
-            raise ValueError(f"{what}; use physics 'hybrid' with a body, or set gravity to [0, 0, 0]")
+        hardens = self.body is not None and self.body.material.hardening_modulus > 0
+        asked = {"rigid indenter": self.indenter is not None, "hardening": hardens, "gravity": any(self.gravity)}
+        lacking = [what for what, wanted in asked.items() if wanted]
+        if self.physics == "seed" and lacking:
+            raise ValueError(f"physics 'seed' has no {lacking[0]}; use physics 'hybrid'")
+        if any(self.gravity) and self.body is None:
+            raise ValueError("gravity has no body to act on; give the scene a body, or set gravity to [0, 0, 0]")
         missing = [name for name in ("lower", "upper") if self.body is not None and name not in self.friction]
         if missing:
             raise ValueError(f"friction of the surface '{missing[0]}' is missing; give both lower and upper")

@@ -82,20 +82,12 @@ def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
 
 
 class SeedWorld(BaseWorld):
-    """World of a scene with a body, by the seed's scheme.
-
-    Raises ValueError without a body, or for one that hardens; RuntimeError on a device (TACSIM_DEVICE).
-    """
+    """World of a scene for physics 'seed' (Scene says what that lacks). Raises RuntimeError on a device."""
 
     sensors = ("lower", "upper")
 
     def __init__(self, scene: Scene) -> None:
-        if scene.body is None:
-            raise ValueError("physics 'seed' simulates a body between two gels; this scene has none (use 'hybrid')")
-        if scene.body.material.hardening_modulus > 0:
-            raise ValueError("physics 'seed' has no hardening (use 'hybrid', or leave out hardening_modulus)")
-        if any(scene.gravity):
-            raise ValueError("physics 'seed' has no gravity (use 'hybrid', or set gravity to [0, 0, 0])")
+        assert scene.body is not None
         start(cpu_only="physics 'seed'")
         self.scene = scene
         self._mach = scene.peak_mach
@@ -187,27 +179,25 @@ class SeedWorld(BaseWorld):
         *, flow: bool = False,
     ) -> MoveStats:  # fmt: skip
         """See World. Raises ValueError for a tilted target, one that would crush the gels, a duration, and flow."""
-        if duration is not None:
-            raise ValueError("physics 'seed' knows no true inertia; leave out the duration, or use physics 'hybrid'")
-        if flow:
-            raise ValueError("physics 'seed' settles every motion; leave out flow, or use physics 'hybrid'")
+        if duration is not None or flow:
+            raise ValueError("physics 'seed' settles every motion: leave out duration and flow, or use 'hybrid'")
         return run(self.motion(MoveCommand(targets, loads or {})), self._advance)
 
-    def _run_command(self, order: MoveCommand) -> Motion:
-        end = resolve_targets(self._poses, order.targets)
-        end.update((name, self._upright(name, end[name])) for name in order.targets)
+    def _run_command(self, command: MoveCommand) -> Motion:
+        end = resolve_targets(self._poses, command.targets)
+        end.update((name, self._upright(name, end[name])) for name in command.targets)
         self._check_room(end)
-        require_loads(order.loads, self.sensors)
+        require_loads(command.loads, self.sensors)
         begin, goals = dict(self._poses), dict(end)
 
-        def tried(refine: int) -> Motion:
-            if order.loads:
+        def attempt(refine: int) -> Motion:
+            if command.loads:
                 end.update(goals)
-                return keep_loads(self, begin, end, order.loads, refine, balanced=True)
+                return keep_loads(self, begin, end, command.loads, refine, balanced=True)
             path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = yield from retried(self, order, tried)
+        stats = yield from retried(self, command, attempt)
         self._poses = end
         return stats
 

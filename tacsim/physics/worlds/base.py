@@ -1,4 +1,4 @@
-"""What every world is besides its physics: one thing with numbers in place, which cannot be in two states at once."""
+"""What every world is besides its physics: arrays that kernels change in place, and one motion at a time."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tacsim.physics.move import MoveCommand
 
 
 class NotCopyable:
-    """What kernels change in place, through arrays that look into one another: a copy of it would be torn apart."""
+    """Its arrays are views of one another, and a copy would tear them apart."""
 
-    _instead = "make_world(scene) and restore(world.snapshot())"  # what to do, in words
+    _instead = "make_world(scene) and restore(world.snapshot())"  # what to do instead of copying
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Raises TypeError: both pickle and copy come here."""
@@ -26,11 +26,11 @@ class BaseWorld(NotCopyable, ABC):
 
     sensors: tuple[str, ...]
     _poses: dict[str, Pose]  # of the driven frames
-    _free: threading.Lock  # held while it moves
+    _lock: threading.Lock  # held while it moves
 
     def __new__(cls, *arguments: Any, **options: Any) -> Self:
         world = super().__new__(cls)
-        world._free = threading.Lock()
+        world._lock = threading.Lock()
         return world
 
     def pose(self, name: str) -> Pose:
@@ -39,20 +39,20 @@ class BaseWorld(NotCopyable, ABC):
         return self._poses[name]
 
     def _sensor(self, name: str) -> int:
-        """The number of a sensor. Raises KeyError for what is none."""
+        """The index of a sensor. Raises KeyError for a name that is none."""
         if name not in self.sensors:
             raise KeyError(f"no sensor '{name}'; this world has {', '.join(self.sensors)}")
         return self.sensors.index(name)
 
-    def motion(self, order: MoveCommand) -> Motion:
-        """`World.move`, a launch at a time. Raises RuntimeError, once begun, while another motion is not at its end."""
-        if not self._free.acquire(blocking=False):
+    def motion(self, command: MoveCommand) -> Motion:
+        """`World.move`, launch by launch. Raises RuntimeError, once begun, while another motion is on its way."""
+        if not self._lock.acquire(blocking=False):
             raise RuntimeError("this world is already moving: wait for that motion, or give each thread its own world")
         try:
-            return (yield from self._run_command(order))
+            return (yield from self._run_command(command))
         finally:
-            self._free.release()
+            self._lock.release()
 
     @abstractmethod
-    def _run_command(self, order: MoveCommand) -> Motion:
-        """What `motion` does while no other does."""
+    def _run_command(self, command: MoveCommand) -> Motion:
+        """What `motion` does while it holds the lock."""

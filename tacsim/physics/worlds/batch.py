@@ -1,7 +1,7 @@
-"""Many worlds in step: what they do next is each one's own business, the launch of kernels is common.
+"""Many worlds in one launch of kernels, each at its own phase of its own motion.
 
-Threads of one world meet twice a substep; in a batch each environment has a thread to itself and meets nobody. Every
-environment is at its own place of its own motion, and comes out as it would alone, to the bit.
+Threads of one world synchronise twice a substep; in a batch each environment has a thread to itself. Every environment
+ends as it would alone, to the bit.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Result = MoveStats | SimulationDiverged | LoadNotReached | None
 
 
 class Batch(NotCopyable):
-    """Worlds of several scenes, all round bodies or all with indenters, whose gels share one lattice.
+    """Worlds of several scenes, all with bodies or all with indenters, whose gels share one lattice.
 
-    All else is each scene's own: materials, friction, body or indenter, number of particles, settling. `worlds` are
-    whole: each moves alone, is read, kept and restored like any other, and no other changes.
+    All else is each scene's own: materials, friction, body or indenter, number of particles, settling. Each of `worlds`
+    can also move alone, be read and be restored like any other world, and no other changes.
     """
 
     _instead = "Batch(scenes) and restore each world's snapshot()"
@@ -53,14 +53,14 @@ class Batch(NotCopyable):
         flow: bool = False,
     ) -> list[Result]:
         """`World.move` of every environment at once; None in `targets`: this one rests, and nothing of it changes.
-        `duration` and `flow` are those of all motions.
+        `duration` and `flow` hold for all motions.
 
-        What became of each, in its place: a motion that fails is not raised but returned, with that world as it was
-        before. One that has to try again does so while the others go on.
+        Returns the outcome of each: the error of a motion that fails is not raised but returned, with that world as it
+        was before. One that is retried goes on while the others do.
 
         Raises ValueError for a wrong number of targets or loads, or a load of an environment that rests; what
-        `World.move` raises for an order that makes no sense, before anything moves. Interrupted, worlds that
-        are still on their way are taken back.
+        `World.move` raises for a command that makes no sense, before anything moves. On an interruption, worlds that
+        are still moving are restored.
         """
         if loads is None:
             loads = [None] * len(self.worlds)
@@ -79,8 +79,8 @@ class Batch(NotCopyable):
         ends: list[Result] = [None] * len(self.worlds)
         wanted: dict[int, Launch] = {}
 
-        def go_on(index: int, step: Callable[[], Launch]) -> None:
-            """Takes one motion to the next launch that it wants, or to its end."""
+        def resume(index: int, step: Callable[[], Launch]) -> None:
+            """Runs one motion up to the next launch that it wants, or to its end."""
             wanted.pop(index, None)
             try:
                 wanted[index] = step()
@@ -92,7 +92,7 @@ class Batch(NotCopyable):
         try:
             for index, motion in motions.items():
                 try:
-                    go_on(index, motion.__next__)
+                    resume(index, motion.__next__)
                 except Exception as error:
                     error.add_note(f"in the motion of environment {index}")
                     raise
@@ -102,9 +102,9 @@ class Batch(NotCopyable):
                 for index, result in results.items():
                     motion = motions[index]
                     if isinstance(result, SimulationDiverged):
-                        go_on(index, partial(motion.throw, result))
+                        resume(index, partial(motion.throw, result))
                     else:
-                        go_on(index, partial(motion.send, result))
+                        resume(index, partial(motion.send, result))
         finally:
             for motion in motions.values():
                 motion.close()

@@ -1,4 +1,4 @@
-"""What worlds of two kinds share, two gels round a body and an indenter on one: frames that are driven, and motions."""
+"""What worlds with finite-element gels share, two gels round a body and an indenter on one: motions and inertia."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ZETA_GEL_HELD = 1.0  # zeta in alpha = zeta c / thickness, the damping of a gel 
 
 
 class FemState(Protocol):
-    """Arrays of some environments (HybridState, PressState)."""
+    """Arrays of several environments (HybridState, PressState)."""
 
     gels: GelState
     params: NDArray[np.float32]
@@ -50,7 +50,7 @@ class FemState(Protocol):
 
 
 def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Drives (n, frames, 6, 3) of some environments in one array (E, longest, ...); writes all n into `counts`."""
+    """Drives (n, frames, 6, 3) of some environments in one array (E, longest, ...); writes each n into `counts`."""
     counts[:, STEPS] = 0
     first = next(iter(drives.values()))
     longest = max(len(drive) for drive in drives.values())
@@ -62,18 +62,18 @@ def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.i
 
 
 class FemWorld(BaseWorld):
-    """One environment of a state whose gels are layers of finite elements in their sensors' frames."""
+    """One environment of a FemState, whose gels are layers of finite elements in their sensors' frames."""
 
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
-    yields: bool  # what is pressed keeps what a hurried motion does to it
+    yields: bool  # what is pressed yields: it keeps what a hurried motion does to it
 
     scene: Scene
     _state: FemState
     _index: int
     _gel: GelParams
-    _rates: NDArray[np.float64]  # (frames, 6) at which a motion that flows has left them [-, rad/mm]
-    _scaled: Inertia  # for the way to rest
-    _true: Inertia
+    _rates: NDArray[np.float64]  # (frames, 6) velocities at which a flowing motion has left them [-, rad/mm]
+    _scaled: Inertia  # of quasi-static motions
+    _true: Inertia  # of motions in real time
     _inertia: Inertia  # of the last motion
 
     # ---------------------------------------------------- what a world adds
@@ -83,7 +83,7 @@ class FemWorld(BaseWorld):
         """Views of all that changes in a motion, by name."""
 
     def _scalars(self) -> dict[str, NDArray[Any]]:
-        """What a snapshot holds besides: of how the last motion has left this world."""
+        """What a snapshot holds besides arrays: how the last motion has left this world."""
         return {"rates": self._rates, "true_inertia": np.array(float(self._inertia.real_time))}
 
     @abstractmethod
@@ -92,11 +92,11 @@ class FemWorld(BaseWorld):
 
     @abstractmethod
     def prepare(self, launch: Launch) -> PreparedLaunch:
-        """Sets this environment's numbers for a launch. Raises SimulationDiverged if that cannot be done."""
+        """Sets this environment's parameters for a launch. Raises SimulationDiverged if that cannot be done."""
 
     @abstractmethod
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
 
     # ------------------------------------------------------------------ state
 
@@ -123,16 +123,16 @@ class FemWorld(BaseWorld):
     # ---------------------------------------------------------------- inertia
 
     def _use_inertia(self, inertia: Inertia) -> None:
-        """Answers to forces by `inertia` from now on."""
         self._inertia = inertia
-        self._write_inertia(None)
+        self._write_inertia()
 
-    def _write_inertia(self, launch: Launch | None) -> None:
+    def _write_inertia(self, launch: Launch | None = None) -> None:
+        """Into `params`, as it is in `launch`."""
         entries = self._inertia.entries(launch)
         self._state.params[self._index, list(entries)] = list(entries.values())
 
     def _switch_inertia(self, inertia: Inertia) -> None:
-        """Another inertia has another time: what moves is stopped, its speed has no meaning there."""
+        """Another inertia has another time scale, in which velocities have no meaning: what moves is stopped."""
         if inertia is not self._inertia:
             self._stop()
             self._use_inertia(inertia)
@@ -140,10 +140,10 @@ class FemWorld(BaseWorld):
     def _courant(self) -> float:
         """The time step over the time of the pressure wave through the most squeezed gel element [-].
 
-        Edges along their directions at rest are quickly looked at; only should they be too short, elements are.
+        Edges along their directions at rest are cheap to measure; elements are measured only if those are too short.
         """
         step = float(self._state.params[self._index, STEP])
-        with np.errstate(all="ignore"):  # what is not finite is told by others
+        with np.errstate(all="ignore"):  # check_launch reports what is not finite
             shortest = self._state.gels.shortest(self._index, self._gel.spacing)
             if shortest * LARGEST_COURANT < step:
                 shortest = float(element_lengths(self.arrays(), self._gel.thickness).min())
@@ -161,39 +161,38 @@ class FemWorld(BaseWorld):
     ) -> MoveStats:  # fmt: skip
         return run(self.motion(MoveCommand(targets, loads or {}, duration, flow)), self._advance)
 
-    def _run_command(self, order: MoveCommand) -> Motion:
-        end = resolve_targets(self._poses, order.targets)
-        require_loads(order.loads, self.sensors)
-        begin, goals, rest = dict(self._poses), dict(end), np.zeros_like(self._rates)
+    def _run_command(self, command: MoveCommand) -> Motion:
+        end = resolve_targets(self._poses, command.targets)
+        require_loads(command.loads, self.sensors)
+        begin, goals, settling = dict(self._poses), dict(end), self.scene.settling
         a, b = list(begin.values()), list(end.values())
-        timed = None
-        if order.duration is not None:
-            timed = plan_real_time(a, b, order.duration, self._true, max(self._gel.half))
-        onward = self._plan_flow(a, b if order.flow else a)  # or to where they are: a stop
-        if timed is None and not order.flow:
-            self.plan(a, b)  # raises ValueError for a way that is far too long, before a stop
+        path = None  # of a dynamic motion; others are planned anew for each attempt
+        if command.duration is not None:
+            path = plan_real_time(a, b, command.duration, self._true, max(self._gel.half))
+        elif not command.flow:
+            self.plan(a, b)  # raises ValueError for a path that is far too long, before a stop
+        flowing = self._plan_flow(a, b if command.flow else a)  # or to where the frames are: a stop
 
-        def after_stop(refine: int) -> Motion:
-            self._switch_inertia(self._scaled if timed is None else self._true)
-            settling, balanced = self.scene.settling, self.balanced
-            if timed is not None:
-                return (yield from move_real_time(replace(timed, refine=refine), settling, balanced=balanced))
-            if order.loads:
+        def from_rest(refine: int) -> Motion:
+            self._switch_inertia(self._scaled if path is None else self._true)
+            if path is not None:
+                return (yield from move_real_time(replace(path, refine=refine), settling, balanced=self.balanced))
+            if command.loads:
                 end.update(goals)
-                return (yield from keep_loads(self, begin, end, order.loads, refine, balanced=balanced))
-            return (yield from move_and_settle(replace(self.plan(a, b), refine=refine), settling, balanced=balanced))
+                return (yield from keep_loads(self, begin, end, command.loads, refine, balanced=self.balanced))
+            quasi_static = replace(self.plan(a, b), refine=refine)
+            return (yield from move_and_settle(quasi_static, settling, balanced=self.balanced))
 
-        def tried(refine: int) -> Motion:
-            if order.flow:
+        def attempt(refine: int) -> Motion:
+            flow = replace(flowing, refine=refine)
+            if command.flow:
                 self._switch_inertia(self._scaled)
-                return move_flowing(replace(onward, refine=refine), self.scene.settling, balanced=self.balanced)
-            if self._rates.any():
-                return come_to_rest(replace(onward, refine=refine), after_stop(refine))
-            return after_stop(refine)
+                return move_flowing(flow, settling, balanced=self.balanced)
+            return come_to_rest(flow, from_rest(refine)) if self._rates.any() else from_rest(refine)
 
-        stats = yield from retried(self, order, tried)
+        stats = yield from retried(self, command, attempt)
         self._poses = end
-        self._rates[...] = onward.rates[1] if order.flow and onward.rates is not None else rest
+        self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0
         return stats
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
@@ -205,7 +204,7 @@ class FemWorld(BaseWorld):
         mach, gel = self.scene.settling.flow_mach, self._gel
         return plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
 
-    @launching()  # whole: worlds of a batch share arrays, among them those that say who takes part
+    @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part
     def _advance(self, path: Path, first: int, last: int) -> ForceReading:
         prepared = self.prepare(Launch(path, first, last))
         self._state.advance({self._index: prepared.drive})

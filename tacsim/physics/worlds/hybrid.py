@@ -67,7 +67,7 @@ CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 class HybridState:
     """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
 
-    Environments share the gels' lattice; bodies, materials, friction and settling are each one's own.
+    Environments share the gels' lattice; each has its own body, materials, friction and settling.
     """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
@@ -87,7 +87,7 @@ class HybridState:
         self._device_arrays = DeviceArrays()
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
-        """One launch; drives: (n, 2, 6, 3) of the environments that go on, n each one's own."""
+        """One launch; drives: (n, 2, 6, 3) of the environments that move, each with its own n."""
         drive = stack_drives(drives, self.counts)
         self.gels.refresh()
         if ON_DEVICE:
@@ -101,7 +101,7 @@ class HybridState:
 
 
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
-    """A scene's body: facts; particles at construction (n, 3) [mm]; their tangent planes (n, 3) [1/mm]."""
+    """A scene's body: parameters, particles at construction (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
     assert scene.body is not None
     height = float(extent(scene.body.geometry)[2])
     points = body_points(scene.body, scene.spacing)
@@ -117,7 +117,7 @@ class HybridWorld(FemWorld):
     balanced = True
 
     def __init__(self, scene: Scene, state: HybridState | None = None, index: int = 0) -> None:
-        """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
+        """The environment of scene number `index` in a `state` of several scenes; without one, in a state of its own."""
         assert scene.body is not None
         self.scene = scene
         self._state: HybridState = HybridState([scene]) if state is None else state
@@ -149,12 +149,12 @@ class HybridWorld(FemWorld):
     # ---------------------------------------------------------------- inertia
 
     def _scaled_inertia(self, height: float) -> Inertia:
-        """For the way to rest; height: of the body [mm]."""
+        """Of quasi-static motions; height: of the body [mm]."""
         step = COURANT * min(self._body.cell, self._gel.spacing)
         damping = {
             GEL_DAMPING: ZETA_GEL / self._gel.thickness, BODY_DAMPING: ZETA_BODY / self._gel.thickness,
-            # The body's slowest mode is its rigid translation between two soft gels: let it answer as if it were
-            # lighter by the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
+            # The body's slowest mode is its rigid translation between two soft gels: there it counts as lighter by
+            # the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
             # the step limit.
             RIGID_MASS_SCALE: max(1.0, height / self._body.spacing),
         }  # fmt: skip
@@ -174,7 +174,7 @@ class HybridWorld(FemWorld):
         return Inertia({**self._masses(self._gel.density, density, step), **undamped}, step, second)
 
     def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
-        """Entries of `facts` that follow from the densities [MPa] and the substep [mm]."""
+        """Entries of `params` that follow from the densities [MPa] and the substep [mm]."""
         particle = body * self._body.volume
         # penalty of one particle against its share of a gel node: stable whichever of the two is lighter
         share = gel * self._gel.spacing * self._body.spacing**2 / 2
@@ -191,7 +191,7 @@ class HybridWorld(FemWorld):
             moving[...] = 0.0
 
     def _courant(self) -> float:
-        """Of gels and body; the body's grid does not shrink with it."""
+        """Of gels and body: the larger; the body's grid does not shrink with it."""
         params = self._state.params[self._index]
         wave = math.sqrt(self._body.particle_mass / params[BODY_MASS])  # the speed of the body's pressure wave
         return max(super()._courant(), float(params[STEP]) * wave / self._body.cell)
@@ -222,7 +222,7 @@ class HybridWorld(FemWorld):
     # ----------------------------------------------------------------- motion
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
-        """Lays the grid for a launch and sets this environment's numbers. Raises SimulationDiverged: no room."""
+        """Fits the grid and sets this environment's parameters. Raises SimulationDiverged for a grid too large."""
         state, index, path = self._state, self._index, launch.path
         span = (launch.last - launch.first) * path.dt
         weight = float(np.linalg.norm(state.params[index, GRAVITY : GRAVITY + 3]))
@@ -263,7 +263,7 @@ class HybridWorld(FemWorld):
         ]
 
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
         self._speed = health.fastest
@@ -277,15 +277,15 @@ class HybridWorld(FemWorld):
         centre = centre_of(self._state.particles.x(self._index))
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
-        meeting = self._gel_overlap(prepared)
+        gel_overlap = self._gel_overlap(prepared)
         return ForceReading(
-            contact, backing, self._floor, health.overlap, health.capped + (meeting > 0.0),
+            contact, backing, self._floor, health.overlap, health.capped + (gel_overlap > 0.0),
             moment / lever, self._weight, torque / lever,
-            StepNumbers(prepared.launch.path.step, self._damping(), health.courant), meeting,
+            StepNumbers(prepared.launch.path.step, self._damping(), health.courant), gel_overlap,
         )  # fmt: skip
 
     def _gel_overlap(self, prepared: PreparedLaunch) -> float:
-        """Of the two gels with one another, which they do not feel [mm]. Raises SimulationDiverged for too much."""
+        """How deep the two gels lie in one another, without feeling it [mm]. Raises SimulationDiverged if too deep."""
         last = prepared.drive[-1].astype(np.float64)
         found = gel_overlap(self._gel, self._state.gels.u[self._index, :, :, :, -1], last[:, :3], last[:, 3])
         most = GEL_OVERLAP * self._gel.thickness

@@ -77,9 +77,9 @@ from tacsim.physics.worlds.hybrid_kernels import Drive
 COURANT = 0.4
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
-UNSEEN = 0.5  # spacings of contact points that an indenter may dip between them; a ball that just does not fit: 0.35
-MARGIN = 2.0  # elements round a mesh, or the part of a gel that lies there: nothing else touches in the next launch
-TOO_MUCH = "cut off of mesh and gel what cannot touch; worlds of a smaller batch have more room each"
+UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35
+MARGIN = 2.0  # elements: what is further from a mesh does not touch it in the next launch
+TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller batch have more room each"
 
 
 @ti.kernel
@@ -126,7 +126,7 @@ def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
 class PressState:
     """Arrays of E environments that one launch of `press_substeps` advances; each environment is a PressWorld.
 
-    Environments share the gel's lattice; indenters, materials, friction and settling are each one's own.
+    Environments share the gel's lattice; each has its own indenter, materials, friction and settling.
     """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
@@ -144,15 +144,17 @@ class PressState:
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._device_arrays = DeviceArrays()
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
-        self._covered = 0  # how often these have changed: a device has its copy of them until they do
+        self._covered = 0  # how often they have changed: a device keeps its copy of them until they do
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
-        self._laid: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # tiles at hand, of environments with a mesh
+        self._tiles: dict[
+            int, tuple[np.ndarray, np.ndarray]
+        ] = {}  # first and end tile filled in, of environments with a mesh
 
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
-        """Writes one environment's indenter into facts and counts; returns the distances of a mesh."""
+        """Writes one environment's indenter into params and counts; returns the distances of a mesh."""
         assert scene.indenter is not None
         _require_resolved(scene.indenter.geometry, self.gel[index])
-        kind, size, mesh = _shape_facts(scene.indenter.geometry)
+        kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
         self.params[index, SHAPE_SPACING] = GRID_SPACING * MM
         if mesh is not None:
@@ -160,7 +162,7 @@ class PressState:
         return mesh
 
     def cover(self, index: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Has at hand the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
+        """Fills in the distances of an environment's mesh between two corners (3,) [mm], axes of the mesh.
 
         The memory of all environments grows if this one needs more. Raises ValueError for more nodes than one may have,
         MemoryError where there is no memory for them; nothing has changed then.
@@ -168,7 +170,7 @@ class PressState:
         mesh = self.meshes[index]
         assert mesh is not None
         first, end = mesh.around(low / MM, high / MM)
-        old = self._laid.get(index)
+        old = self._tiles.get(index)
         if old is not None:
             if (first >= old[0]).all() and (end <= old[1]).all():
                 return
@@ -186,11 +188,11 @@ class PressState:
         self._values[index, :nx, :ny, :nz] = values
         self.counts[index, SHAPE_FIRST : SHAPE_FIRST + 3] = TILE * first
         self.counts[index, SHAPE_NODES : SHAPE_NODES + 3] = values.shape
-        self._laid[index] = first, end
+        self._tiles[index] = first, end
         self._covered += 1
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
-        """One launch; drives: (n, 1, 6, 3) of the environments that go on, n each one's own."""
+        """One launch; drives: (n, 1, 6, 3) of the environments that move, each with its own n."""
         drive = stack_drives(drives, self.counts)
         self.gels.refresh()
         if ON_DEVICE:
@@ -213,14 +215,14 @@ class PressWorld(FemWorld):
     yields = False
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
-        """One environment of a `state` made of several scenes, that of scene number `index`; or of one of its own."""
+        """The environment of scene number `index` in a `state` of several scenes; without one, in a state of its own."""
         assert scene.indenter is not None
         self.scene = scene
         self._state: PressState = PressState([scene]) if state is None else state
         self._index = index
         self._gel = self._state.gel[index]
         step = COURANT * self._gel.spacing
-        # An elastic gel forgets its way, so it is damped on it as in the hold.
+        # An elastic gel has no memory of its path, so the damping on it is that of the hold.
         self._scaled = Inertia({GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness}, step)
         self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
@@ -249,7 +251,7 @@ class PressWorld(FemWorld):
         return None
 
     def prepare(self, launch: Launch) -> PreparedLaunch:
-        """Sets this environment's numbers for a launch. Raises SimulationDiverged: too much of a mesh to lay."""
+        """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
         path = launch.path
         where = path.span(self._poses, launch.first, launch.last)
         both = path.drive(launch.first, launch.last)
@@ -286,7 +288,7 @@ class PressWorld(FemWorld):
         return top.reshape(-1, 3)
 
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """What the launch came to. Raises SimulationDiverged if that is unphysical."""
+        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
         sums = partial.astype(np.float64).sum(axis=0)
@@ -339,7 +341,7 @@ def _require_resolved(geometry: Shape, gel: GelParams) -> None:
         )
 
 
-def _shape_facts(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistance | None]:
+def _shape_params(geometry: Shape) -> tuple[int, tuple[float, ...], TiledDistance | None]:
     """Kind and size [mm] for the kernels (`signed_distance`), and the distances of a mesh."""
     match geometry:
         case Sphere():

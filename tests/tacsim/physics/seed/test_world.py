@@ -225,19 +225,6 @@ def test_a_second_scene_compiles_nothing():
     assert len(advance._primal.compiled_kernels) == compiled == 1
 
 
-def test_a_body_that_hardens_is_refused() -> None:
-    """Also where nobody has validated the scene."""
-    hard = Body(material=BodyMaterial(yield_stress=30e3, hardening_modulus=1e5))
-    with pytest.raises(ValueError, match="physics 'seed' has no hardening"):
-        SeedWorld(scene().model_copy(update={"body": hard}))
-
-
-def test_gravity_is_refused() -> None:
-    """Also where nobody has validated the scene."""
-    with pytest.raises(ValueError, match="physics 'seed' has no gravity"):
-        SeedWorld(scene().model_copy(update={"gravity": (0.0, 0.0, -9.81)}))
-
-
 def test_a_body_that_is_gone_leaves_its_states_for_a_dump(pressed):
     pressed.arrays()["position"][-len(pressed._body_points()) :] += [1e3, 0.0, 0.0]
     with pytest.raises(SimulationDiverged, match="every particle of the body left the grid") as caught:

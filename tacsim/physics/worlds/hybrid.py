@@ -117,7 +117,7 @@ class HybridWorld(FemWorld):
     balanced = True
 
     def __init__(self, scene: Scene, state: HybridState | None = None, index: int = 0) -> None:
-        """The environment of scene number `index` in a `state` of several scenes; without one, in a state of its own."""
+        """The environment of scene number `index` in a `state` of several; or one alone in a state of its own."""
         assert scene.body is not None
         self.scene = scene
         self._state: HybridState = HybridState([scene]) if state is None else state

@@ -146,9 +146,7 @@ class PressState:
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
         self._covered = 0  # how often they have changed: a device keeps its copy of them until they do
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
-        self._tiles: dict[
-            int, tuple[np.ndarray, np.ndarray]
-        ] = {}  # first and end tile filled in, of environments with a mesh
+        self._tiles: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # first and end of those filled in
 
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
         """Writes one environment's indenter into params and counts; returns the distances of a mesh."""
@@ -215,7 +213,7 @@ class PressWorld(FemWorld):
     yields = False
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
-        """The environment of scene number `index` in a `state` of several scenes; without one, in a state of its own."""
+        """The environment of scene number `index` in a `state` of several; or one alone in a state of its own."""
         assert scene.indenter is not None
         self.scene = scene
         self._state: PressState = PressState([scene]) if state is None else state

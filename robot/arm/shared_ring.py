@@ -1,4 +1,4 @@
-"""What two processes tell each other through shared memory: a :class:`Ring` of records, one writer, many readers.
+"""Shared memory between two processes: a :class:`Ring` of records, one writer, many readers.
 
 A record is written into the next slot, and only then counted. A reader copies the newest counted slot and counts again:
 as long as the writer has not come round to that slot meanwhile, the copy is whole. It is a sequence lock whose writer

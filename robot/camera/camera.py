@@ -1,7 +1,7 @@
-"""The camera of a tactile sensor behind the contract: real, mock, or a folder or video as a stand-in.
+"""The camera of a tactile sensor: real, mock, or a folder or video in its place.
 
-A thread reads all frames as they come and keeps the newest; a consumer that pauses gets no old ones. What fails is
-closed and opened again, with back-off. A frame is never delivered beyond its age limit.
+A thread reads every frame as it comes and keeps the newest, so a consumer that pauses gets no old ones. A source that
+fails is closed and opened again, with back-off. A frame beyond its age limit is never delivered.
 """
 
 from __future__ import annotations
@@ -30,44 +30,43 @@ ClockSource = Literal["stamp", "device", "arrival"]
 
 
 class StaleFrame(StaleObservationError, TimeoutError):
-    """No frame within the age limit came in time. A TimeoutError, as the contract of TactileSource says."""
+    """No frame within the age limit came in time; a TimeoutError, as TactileSource demands."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraStatus:
-    """How a camera does."""
+    """The state of a camera."""
 
     open: bool  # frames may come; False while it is being reopened, and after the end
-    fps: float | None  # measured over the last frames since it was opened; None before the second [Hz]
+    fps: float | None  # measured over the last frames; None before the second since opening [Hz]
     age: float | None  # of the newest frame, since exposure; None before the first [s]
-    clock: ClockSource | None  # where its time of exposure is from; `arrival`: minus the calibrated latency
-    frames: int  # received whole
-    dropped: int  # lost on the way, as far as it can be known (see Camera); each is a gap in `index`
+    clock: ClockSource | None  # source of its exposure time; `arrival`: that minus the calibrated latency
+    frames: int  # complete frames received
+    dropped: int  # lost before arrival, as far as known (see Camera); each is a gap in `index`
     damaged: int  # received, but not readable
-    reopened: int  # times the source was opened again
+    reopened: int  # how often the source was opened again
     error: str | None  # why it is not open, or what ended the last opening
 
 
 class Camera:
-    """A `TactileSource` that reads the source its facts name.
+    """A `TactileSource` that reads the source its configuration names.
 
     `read` gives the newest frame, at once if it is within the age limit. Between two exposures that is the same frame
-    again, with the same `index`: compare it to tell a new one from one that was seen.
+    with the same `index`.
 
-    `index` grows by one a frame and by one more for each that was lost: by the numbers of the stamps; without them by
-    the device's clock; without that (arrival says too little) only damaged frames count. The time of an interruption
-    counts with all of them, at the rate of the facts.
-    Safe to use from several threads.
+    `index` grows by one for each frame and by one more for each lost frame: counted by the numbers of the stamps;
+    without stamps by the device's clock; without that, only damaged frames count as lost. An interruption counts with
+    all three, at the configured rate. Thread-safe.
     """
 
     def __init__(self, config: CameraSensorConfig, name: str, connect_timeout: float = 5.0) -> None:
         """Opens the source and waits for the first frame, at most `connect_timeout` [s].
 
-        Raises WrongSource (a DeviceError) when the source is not what the facts say, DeviceNotConnectedError when no
-        frame came.
+        Raises WrongSource (a DeviceError) when the source is not as configured, DeviceNotConnectedError when no frame
+        came.
         """
         source_kind(config, name)
-        self._facts, self._name = config, name
+        self._config, self._name = config, name
         self.spec = SensorSpec(image_shape=(config.height, config.width), height=False, flow=False, arm=config.arm)
         self._stop = threading.Event()
         self._changed = threading.Condition()  # guards all that follows
@@ -78,9 +77,9 @@ class Camera:
         self._arrivals: deque[float] = deque(maxlen=FPS_WINDOW)
         self._received = self._dropped = self._damaged = self._openings = 0
         self._unread = 0  # damaged since the last whole frame
-        self._refusal: str | None = None  # why the source is wrong at present
+        self._refusal: str | None = None  # why the source is wrong now
         self._error: str | None = None
-        self._over = False
+        self._ended = False
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
         # A thread that still runs when the interpreter goes would be cut in the middle of native code.
         atexit.register(self.close)
@@ -93,7 +92,7 @@ class Camera:
 
     def read(self, timeout: float) -> TactileFrame:
         """The newest frame, (height, width, 3) without the strip. Waits at most `timeout` [s] for one within the age
-        limit, else raises StaleFrame (a TimeoutError). Raises WrongSource while the source is not what the facts say,
+        limit, else raises StaleFrame (a TimeoutError). Raises WrongSource while the source is not as configured,
         EndOfEpisode when a video or folder is over, DeviceNotConnectedError after `close`."""
         return self._wait_until(timeout, image=None)
 
@@ -102,13 +101,13 @@ class Camera:
 
         Raises as `read`, and ValueError for a source without stamps.
         """
-        if not self._facts.stamped:
+        if not self._config.stamped:
             raise ValueError(f"sensor '{self._name}': wait_for needs a stamped source; this one has no picture numbers")
         return self._wait_until(timeout, image=image_number)
 
     @property
     def stamp(self) -> strip.Stamp | None:
-        """What the strip of the newest frame says; None without stamps."""
+        """The stamp of the newest frame; None without stamps."""
         with self._changed:
             return self._stamp
 
@@ -120,7 +119,7 @@ class Camera:
 
     @property
     def status(self) -> CameraStatus:
-        """How the camera does now."""
+        """The present state."""
         with self._changed:
             fps = None
             if len(self._arrivals) > 1 and self._arrivals[-1] > self._arrivals[0]:
@@ -138,7 +137,7 @@ class Camera:
             )
 
     def close(self) -> None:
-        """Ends the thread and gives the source back; harmless a second time."""
+        """Ends the thread and releases the source. A second call does nothing."""
         self._stop.set()
         with self._changed:
             if self._capture is not None:
@@ -158,12 +157,12 @@ class Camera:
 
     def _await_first(self, timeout: float) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: self._frame is not None or self._refusal is not None or self._over, timeout)
+            self._changed.wait_for(lambda: self._frame is not None or self._refusal is not None or self._ended, timeout)
             if self._refusal is not None:
                 raise WrongSource(self._refusal)
-            if self._frame is None and not self._over:
+            if self._frame is None and not self._ended:
                 raise DeviceNotConnectedError(
-                    f"sensor '{self._name}': no picture from {self._facts.source} within {timeout:.3g} s; "
+                    f"sensor '{self._name}': no picture from {self._config.source} within {timeout:.3g} s; "
                     f"{self._error or 'the source is silent'}"
                 )
 
@@ -176,17 +175,17 @@ class Camera:
                     raise DeviceNotConnectedError(f"sensor '{self._name}': the camera is closed")
                 if self._refusal is not None:
                     raise WrongSource(self._refusal)
-                if self._over:
+                if self._ended:
                     raise EndOfEpisode(self._error)
                 frame = self._frame
                 shown = image is None or (self._stamp is not None and self._stamp.image >= image)
-                if frame is not None and shown and now - frame.time <= self._facts.max_age:
+                if frame is not None and shown and now - frame.time <= self._config.max_age:
                     return frame
                 if now >= deadline:
-                    raise StaleFrame(self._late(now, timeout, image))
+                    raise StaleFrame(self._stale_text(now, timeout, image))
                 self._changed.wait(deadline - now)
 
-    def _late(self, now: float, timeout: float, image: int | None) -> str:
+    def _stale_text(self, now: float, timeout: float, image: int | None) -> str:
         what = (
             f"sensor '{self._name}': no frame {'' if image is None else f'of picture {image} '}within {timeout:.3g} s"
         )
@@ -194,44 +193,44 @@ class Camera:
             newest = "none came yet"
         else:
             newest = (
-                f"the newest is {1e3 * (now - self._frame.time):.0f} ms old, limit {1e3 * self._facts.max_age:.0f} ms"
+                f"the newest is {1e3 * (now - self._frame.time):.0f} ms old, limit {1e3 * self._config.max_age:.0f} ms"
             )
             if image is not None and self._stamp is not None:
                 newest += f", and shows picture {self._stamp.image}"
-        return f"{what}: {newest}; {self._error or 'the source is open'} ({self._facts.source})"
+        return f"{what}: {newest}; {self._error or 'the source is open'} ({self._config.source})"
 
-    # What the thread does
+    # -- in the thread ---------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
         wait = BACK_OFF[0]
         while not self._stop.is_set():
             received = self._received
-            live = self._attend()
+            live = self._read_source()
             if not live:
                 return
             wait = BACK_OFF[0] if self._received > received else min(2.0 * wait, BACK_OFF[1])
             self._stop.wait(wait)
 
-    def _attend(self) -> bool:
-        """Opens the source and takes its frames until it fails; False when there is nothing to open again."""
+    def _read_source(self) -> bool:
+        """Opens the source and reads frames until it fails; False when it is not to be opened again."""
         capture: Capture | None = None
         refused = False
         try:
-            capture = open_capture(self._facts, self._name, self._stop)
+            capture = open_capture(self._config, self._name, self._stop)
             with self._changed:
                 self._capture = capture
                 self._openings += 1
                 self._arrivals.clear()
             while not self._stop.is_set():
                 try:
-                    self._take(capture.read())
+                    self._accept(capture.read())
                 except DamagedFrame as damage:
                     self._count_damaged(str(damage))
         except EndOfEpisode as end:
-            return self._end(str(end))
-        except Exception as failure:  # OpenCV raises errors of its own; whatever it was, the thread must live
+            return self._set_ended(str(end))
+        except Exception as failure:  # OpenCV raises errors of its own; the thread must live
             refused = isinstance(failure, WrongSource)
-            self._lose(failure, refused)
+            self._set_failure(failure, refused)
         finally:
             with self._changed:
                 self._capture = None
@@ -239,13 +238,13 @@ class Camera:
                 capture.close()
         return capture is None or capture.live
 
-    def _take(self, picture: Picture) -> None:
+    def _accept(self, picture: Picture) -> None:
         image, mark = picture.image, None
-        if self._facts.stamped:
+        if self._config.stamped:
             image, mark = strip.split(image)
             if mark is None:
                 raise DamagedFrame(
-                    f"sensor '{self._name}': a frame of {self._facts.source} without a readable stamp; it is damaged, "
+                    f"sensor '{self._name}': a frame of {self._config.source} without a readable stamp; it is damaged, "
                     "or the source burns none in (stamped: false)"
                 )
         clock: ClockSource
@@ -259,12 +258,12 @@ class Camera:
         elif picture.exposure is not None:
             exposure, clock = picture.exposure, "device"
         else:
-            exposure, clock = picture.arrival - self._facts.latency, "arrival"
+            exposure, clock = picture.arrival - self._config.latency, "arrival"
         image.flags.writeable = False  # the same frame may be given to several readers
         with self._changed:
             if mark is not None and self._stamp is not None and mark.clock <= self._stamp.clock:
-                return  # seen already: sent again to who comes anew
-            lost = self._lost(mark, exposure, clock)
+                return  # an old frame that was sent again to a new client
+            lost = self._count_lost(mark, exposure, clock)
             index = 0 if self._frame is None else self._frame.index + 1 + lost
             self._frame, self._stamp, self._clock = TactileFrame(image=image, time=exposure, index=index), mark, clock
             self._received += 1
@@ -274,8 +273,8 @@ class Camera:
             self._refusal = self._error = None
             self._changed.notify_all()
 
-    def _lost(self, mark: strip.Stamp | None, exposure: float, clock: ClockSource) -> int:
-        """Frames that are missing before this one."""
+    def _count_lost(self, mark: strip.Stamp | None, exposure: float, clock: ClockSource) -> int:
+        """How many frames are missing before this one."""
         if self._frame is None:
             return 0
         numbered = -1
@@ -283,8 +282,8 @@ class Camera:
             numbered = mark.frame - self._stamp.frame - 1
         if self._arrivals and clock != "device":
             return max(numbered, 0) if mark is not None else self._unread
-        # After an interruption numbers may have begun anew: a restarted camera counts from 1.
-        return max(numbered, self._unread, round((exposure - self._frame.time) * self._facts.fps) - 1)
+        # After an interruption the numbers may have restarted: a restarted camera counts from 1.
+        return max(numbered, self._unread, round((exposure - self._frame.time) * self._config.fps) - 1)
 
     def _count_damaged(self, error: str) -> None:
         with self._changed:
@@ -292,17 +291,17 @@ class Camera:
             self._unread += 1
             self._error = error
 
-    def _lose(self, failure: Exception, refused: bool) -> None:
+    def _set_failure(self, failure: Exception, refused: bool) -> None:
         text = str(failure) or type(failure).__name__
         if not isinstance(failure, DeviceError) and self._name not in text:
-            text = f"sensor '{self._name}': {self._facts.source}: {text}"
+            text = f"sensor '{self._name}': {self._config.source}: {text}"
         with self._changed:
             self._error = text
             self._refusal = text if refused else None
             self._changed.notify_all()
 
-    def _end(self, text: str) -> bool:
+    def _set_ended(self, text: str) -> bool:
         with self._changed:
-            self._over, self._error = True, text
+            self._ended, self._error = True, text
             self._changed.notify_all()
         return False

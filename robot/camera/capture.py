@@ -1,7 +1,7 @@
-"""One opened source of pictures, as long as it lasts: an MJPEG stream, a UVC camera, a folder of pictures or a video.
+"""One opened source of pictures: an MJPEG stream, a UVC camera, a folder of pictures or a video.
 
-A capture never mends itself: when it fails, the driver (`robot.camera.camera`) closes it and opens another. No read of
-a live source waits much longer than `READ_TIMEOUT`.
+A capture does not recover by itself: when it fails, the driver (`robot.camera.camera`) closes it and opens another. A
+read of a live source waits little longer than `READ_TIMEOUT`.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from tacsim.models.hardware import CameraSensorConfig
 
 
 class Capture(Protocol):
-    """What the driver needs of a source."""
+    """An opened source, as the driver needs it."""
 
-    live: bool  # goes on in real time: worth reopening when it fails
+    live: bool  # goes on in real time, so it is reopened when it fails
 
     def read(self) -> Picture:
-        """The next frame, waited for. Raises DamagedFrame, WrongSource, EndOfEpisode, OSError (TimeoutError: stalled);
+        """Waits for the next frame. Raises DamagedFrame, WrongSource, EndOfEpisode, OSError (TimeoutError: stalled);
         all but the first end the capture."""
         ...
 
     def interrupt(self) -> None:
-        """Makes a `read` of another thread return soon."""
+        """Makes a `read` in another thread return soon."""
         ...
 
     def close(self) -> None: ...
@@ -48,8 +48,8 @@ def open_capture(config: CameraSensorConfig, name: str, stop: threading.Event) -
 
 
 def source_kind(config: CameraSensorConfig, name: str) -> str:
-    """ "stream", "uvc", "folder" or "video". Raises WrongSource for what none of them reads, or a setting that this
-    kind cannot keep."""
+    """ "stream", "uvc", "folder" or "video". Raises WrongSource for any other source, or a setting that this kind does
+    not have."""
     source, where = config.source, f"sensor '{name}': source '{config.source}'"
     if source.startswith("http://"):
         kind = "stream"
@@ -100,7 +100,7 @@ class UvcCapture:
             raise
 
     def _configure(self, config: CameraSensorConfig) -> None:
-        """Fourcc before the size: many cameras offer large sizes only compressed."""
+        """Sets the pixel format before the size: many cameras offer large sizes only compressed."""
         import cv2
 
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
@@ -130,13 +130,13 @@ class UvcCapture:
         ready, _ = cv2.VideoCapture.waitAny([self._capture], timeoutNs=int(1e9 * self._timeout))
         if not ready:
             raise TimeoutError(f"{self._what}: no frame for {self._timeout:.2g} s")
-        there, image = self._capture.retrieve()  # waitAny has grabbed it
+        there, image = self._capture.retrieve()  # waitAny has grabbed it already
         arrival = time.monotonic()
         if not there or image is None:
             raise ConnectionError(f"{self._what}: no frame; was it unplugged?")
         if image.shape != (*self._size, 3):
             raise wrong_size(self._what, image.shape[:2], self._size)
-        # The time V4L2 gives to the buffer, by the monotonic clock with nearly all drivers. Others say 0 or an epoch.
+        # The buffer's time stamp by V4L2: the monotonic clock with nearly all drivers, 0 or an epoch with others.
         exposure = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
         picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         return Picture(picture, arrival, exposure if 0.0 <= arrival - exposure < 1.0 else None)

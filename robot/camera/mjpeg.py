@@ -1,7 +1,7 @@
 """MJPEG over HTTP: one opened stream, read with the standard library and Pillow.
 
-Not with OpenCV's FFmpeg: here sizes are checked before anything is decoded, every wait has a deadline (FFmpeg's cover
-no header that never ends), no proxy is asked, and no native thread is left at exit.
+Not OpenCV's FFmpeg: here sizes are checked before anything is decoded, every wait has a deadline (FFmpeg has none for a
+header that never ends), no proxy is used, and no native thread is left at exit.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class MjpegCapture:
         self._what = f"sensor '{name}': {config.source}"
         self._size = frame_size(config)
         self._timeout = READ_TIMEOUT + 3.0 / config.fps
-        # Uncompressed pictures need less; a part that is longer is no picture of this size.
+        # An uncompressed picture is smaller; a longer part is not a picture of this size.
         self._limit = 3 * self._size[0] * self._size[1] + _CHUNK
         self._buffer = bytearray()
         self._socket = _connect(config.source, self._what)
@@ -158,7 +158,7 @@ class MjpegCapture:
             raise
         except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
             raise WrongSource(f"{self._what}: {error}; expected are {self._size[1]} x {self._size[0]} px") from error
-        except Exception as error:  # a decoder that is fed damaged bytes may raise anything
+        except Exception as error:  # a decoder may raise anything for damaged bytes
             raise DamagedFrame(f"{self._what}: no readable JPEG: {error}") from error
 
     def interrupt(self) -> None:
@@ -171,7 +171,7 @@ class MjpegCapture:
 
 
 class DeadlineSocket(socket.socket):
-    """A socket whose receiving ends at a deadline, however slowly bytes drip."""
+    """A socket whose receiving ends at a deadline, even while single bytes keep coming."""
 
     deadline = math.inf  # monotonic clock [s]
 
@@ -184,7 +184,7 @@ class DeadlineSocket(socket.socket):
 
 
 def _connect(url: str, what: str) -> DeadlineSocket:
-    """A connected socket; its deadline is set for the header. Raises OSError, WrongSource for no address."""
+    """A connected socket with the deadline for the header. Raises OSError, or WrongSource for a malformed address."""
     deadline = time.monotonic() + CONNECT_TIMEOUT
     try:
         parts = urlsplit(url)

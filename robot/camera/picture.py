@@ -1,4 +1,4 @@
-"""A picture as a camera's source gives it, and what can be wrong with it."""
+"""A picture as its source delivers it, and what can be wrong with it."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from robot.common import stamp
 from robot.errors import DeviceError
 from tacsim.models.hardware import CameraSensorConfig
 
-CONNECT_TIMEOUT = 1.0  # to connect and get the header of the answer [s]
-READ_TIMEOUT = 0.5  # a live source that sends no whole frame for so long, plus three periods, is reopened [s]
+CONNECT_TIMEOUT = 1.0  # to connect and to read the header of the answer [s]
+READ_TIMEOUT = 0.5  # a live source without a complete frame for this time plus three periods is reopened [s]
 
 
 class WrongSource(DeviceError):
-    """The source answers, but it is not what the rig file says: another size, no stream, a setting it does not take."""
+    """The source answers, but not as configured: another size, no stream, a setting it does not take."""
 
 
 class DamagedFrame(Exception):
-    """One picture that cannot be decoded; the next may be whole."""
+    """One picture that cannot be decoded; the next may be sound."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One frame as the source gave it."""
+    """One frame as the source delivered it."""
 
-    image: NDArray[np.uint8]  # (H, W, 3) RGB, with the strip if the source burns one in
-    arrival: float  # monotonic clock when the last of it was here [s]
-    exposure: float | None  # by the device's own stamp, on the monotonic clock; None: it gives none [s]
+    image: NDArray[np.uint8]  # (H, W, 3) RGB, with the strip of a stamped source
+    arrival: float  # when it was complete here, monotonic clock [s]
+    exposure: float | None  # by the device's own stamp, monotonic clock; None without one [s]
 
 
 def frame_size(config: CameraSensorConfig) -> tuple[int, int]:
-    """Rows and columns of the frames that are expected, the strip of a stamped source included [px]."""
+    """Rows and columns of the expected frames, including the strip of a stamped source [px]."""
     return config.height + (stamp.strip_rows(config.width) if config.stamped else 0), config.width
 
 
 def wrong_size(what: str, got: tuple[int, ...], expected: tuple[int, int]) -> WrongSource:
-    """Rows, columns [px]."""
+    """`got` and `expected` are rows, columns [px]."""
     return WrongSource(
         f"{what}: frames are {got[1]} x {got[0]} px, expected are {expected[1]} x {expected[0]}; correct width, height "
         "or stamped in the rig file (a stamped source has its strip below `height`), or the camera"

@@ -1,10 +1,10 @@
-"""Time-critical processes ask the system to be run first: workers of real arms, and mocks where timing is measured."""
+"""Real-time priority for time-critical processes: workers of real arms, and mocks where timing is measured."""
 
 from __future__ import annotations
 
 import os
 
-WORKER, CONTROLLER = 10, 11  # priorities: the stand-in for a controller's own hardware comes before who talks to it
+WORKER, CONTROLLER = 10, 11  # priorities: a mock controller, which stands in for hardware, comes before its worker
 
 
 def ask_for_realtime(priority: int) -> bool:

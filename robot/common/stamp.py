@@ -22,10 +22,10 @@ BITS = 8 * (_FIELDS.size + _CHECK.size)
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """What the strip says of its frame."""
+    """What the strip says about its frame."""
 
-    frame: int  # number of the frame, by one more each; a gap is a lost frame
-    image: int  # number of the picture that was pushed last, 0 before the first
+    frame: int  # number of the frame, counted by one; a gap is a lost frame
+    image: int  # number of the last pushed picture, 0 before the first
     clock: int  # monotonic clock of the camera's machine at exposure [us]
 
 

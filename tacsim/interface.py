@@ -1,4 +1,4 @@
-"""The contract: what a policy sees, what it gives, and what stands behind it.
+"""The contract between policies and rigs: observations, actions, and the parts of a rig.
 
 A policy sees one :class:`Observation` and gives one :class:`Action`. Whether sensors, arms and clock behind them
 are simulated, mock, real or replayed shows nowhere in this file. NumPy only.
@@ -51,7 +51,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMap:
-    """What a source knows of its gel surface by itself (the simulator's fast path), on the canonical grid."""
+    """The gel surface on the canonical grid, from a source that knows it by itself (the simulator)."""
 
     height: NDArray[np.float32]  # (h, w) displacement into the gel, positive where pressed [m]
     gradient: NDArray[np.float32]  # (h, w, 2) (d height/dx, d height/dy) [-]
@@ -66,7 +66,7 @@ class TactileFrame:
     time: float  # exposure time on the rig's monotonic clock [s]
     index: int  # frame counter; a gap = dropped frames
     surface: SurfaceMap | None = None  # only from sources that know it
-    stats: Mapping[str, float] = field(default_factory=dict)  # what a simulation reached (residual ...) for just this
+    stats: Mapping[str, float] = field(default_factory=dict)  # of the simulation for this frame: residual ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +218,7 @@ class Normaliser(Protocol):
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How far the last observation is to be trusted; see tacsim.report.trust. Empty where that is no question."""
+        """How trustworthy the last observation is (tacsim.report.trust). Empty for sources that know their surface."""
         ...
 
 

@@ -99,19 +99,19 @@ def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
 
 def difference(before: Pose, after: Pose) -> FloatArray:
     """(6,) motion from one pose to another, in the axes of the frame both are given in: shift of the origin [m], and
-    rotation vector [rad], the shorter way round."""
+    rotation vector [rad], the shorter rotation."""
     turn = rotation(after) * rotation(before).inv()
     return np.concatenate([after.position - before.position, turn.as_rotvec()])
 
 
 def distance(a: Pose, b: Pose) -> tuple[float, float]:
-    """How far apart two poses are: their origins [m], and their axes as one angle [rad]."""
+    """Distance between two poses: of their origins [m], and of their axes as one angle [rad]."""
     motion = difference(a, b)
     return float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
 
 
 def interpolate(a: Pose, b: Pose, s: float) -> Pose:
-    """The pose a fraction `s` of the way from a to b: straight line, rotation about one axis the shorter way (slerp).
+    """The pose at the fraction `s` of the path from a to b: straight line, shorter rotation (slerp).
 
     Raises ValueError outside 0 <= s <= 1.
     """

@@ -105,7 +105,7 @@ def record_ball_touches(
                 session.progress(done)
                 session.check()
                 lifted = begin = start
-                travel = config.start.approach_way
+                travel = config.start.approach_distance
                 if centres:
                     tilted = Pose(quaternion=(se3.rotation(start) * rotation).as_quat())
                     centre = se3.rotate(tilted, np.array([*place, plan.ball_radius]))
@@ -165,8 +165,8 @@ class _BallProber:
             time.sleep(max(0.0, due - time.monotonic()))
 
         advice = (
-            "does the ball stand before the gel, and its start above it? (start.approach_way in the rig file bounds "
-            "the first approach)"
+            "does the ball stand before the gel, and its start above it? (start.approach_distance in the rig file "
+            "bounds the first approach)"
         )
         approach(touches, advance, self._plan.step, travel, advice)
         seen = self._observe(SETTLE)

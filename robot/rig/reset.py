@@ -16,7 +16,7 @@ from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
 from tacsim import pose as se3
 from tacsim.control.approach import NoTouch, approach
 from tacsim.interface import Pose, TactileFrame, TactileSource
-from tacsim.models.hardware import HardwareStart
+from tacsim.models.hardware import ResetConfig
 
 RETREAT = 5e-3  # along the sensor's own axis, before anything else [m]
 TRAVEL = 60.0  # longest motion to the start [s]
@@ -54,7 +54,7 @@ class HardwareReset:
         sensors: Mapping[str, TactileSource],
         start: Mapping[str, Pose],
         clock: ResetClock,
-        config: HardwareStart,
+        config: ResetConfig,
         contact: Callable[[], float] | None,
         confirm: Callable[[], bool],
         placement: float = 0.0,
@@ -88,10 +88,10 @@ class HardwareReset:
         contact = self._contact
         if contact is not None and self._arms:
             advice = (
-                "is the body between the sensors? The arms are back at their start (start.approach_way in the rig "
+                "is the body between the sensors? The arms are back at their start (start.approach_distance in the rig "
                 "file bounds the approach)"
             )
-            step, longest = self._config.approach_step, self._config.approach_way
+            step, longest = self._config.approach_step, self._config.approach_distance
             try:
                 approach(lambda: not contact() < 1.0, self._advance, step, longest, advice)  # NaN ends it, too
             except NoTouch:

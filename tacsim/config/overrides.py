@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tacsim.config.annotation import allowed, child, default, keys
-from tacsim.config.document import Node, Reading, from_plain, parse_text
+from tacsim.config.document import FORMER_KEYS, Node, Reading, from_plain, parse_text
 from tacsim.config.errors import Place, did_you_mean, join
 from tacsim.config.references import drop_strangers, expand
 
@@ -26,7 +26,7 @@ def parse_override(text: str, reading: Reading) -> Override | None:
     """``key.sub=value``, the value read as YAML; None after a reported problem."""
     place = Place(f"--set {text}")
     key, equals, value = text.partition("=")
-    path = tuple(key.strip().split("."))
+    path = tuple(FORMER_KEYS.get(part, part) for part in key.strip().split("."))
     if not equals or not all(path):
         reading.report(place, "", "allowed: key.sub=value, for example scene.preset=standard")
         return None

@@ -1,4 +1,4 @@
-"""What counts as touch: thresholds of the contact mask, and one number for how much there is. NumPy only."""
+"""Thresholds of the contact mask, and one number for the amount of contact. NumPy only."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tacsim.interface import TactileObservation
 
-CONTACT_HEIGHT = 20e-6  # surface pressed deeper than this touches: ten times the usual gel texture of 2 um [m]
+CONTACT_HEIGHT = 20e-6  # deeper than this counts as contact: ten times the usual gel texture of 2 um [m]
 CONTACT_DIFFERENCE = 0.10  # relative change of colour that counts as contact; camera noise is 0.02 to 0.03 [-]
 
 

@@ -1,4 +1,4 @@
-"""Guards of the gels: what the sensors show, against the limits of the arms that carry them."""
+"""Guards of the gels: the depth and shear that the sensors show, against the limits of the arms that carry them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from tacsim.models.hardware import ArmLimits
 
 @dataclass(frozen=True, slots=True)
 class GelReading:
-    """What an arm is told of the tactile sensors."""
+    """The state of the gels, as reported to an arm."""
 
     seen: float  # when the oldest picture of the rig was exposed, on its clock [s]
-    depth: float = math.nan  # how deep the arm's own gels are pressed; NaN: they cannot tell [m]
-    shear: float = math.nan  # how far their surface is dragged; NaN: they cannot tell [m]
+    depth: float = math.nan  # of the arm's own gels, the deepest; NaN: not measured [m]
+    shear: float = math.nan  # of their surfaces, the largest; NaN: not measured [m]
 
 
 def depth_and_shear(touch: TactileObservation) -> tuple[float, float]:
-    """Depth and shear [m] that one sensor shows; NaN where it cannot tell."""
+    """Depth and shear [m] that one sensor shows; NaN where it does not measure them."""
     depth = shear = math.nan
     if touch.height is not None:
         depth = float(touch.height.max(where=touch.valid, initial=0.0))
@@ -34,26 +34,26 @@ def depth_and_shear(touch: TactileObservation) -> tuple[float, float]:
 
 
 class GelMonitor:
-    """Looks at every observation: tells each arm what its gels show, and raises LimitExceeded beyond its limits.
+    """Checks every observation: reports to each arm the state of its gels, and raises LimitExceeded beyond its limits.
 
     Args:
         sensors: what each sensor of the rig delivers.
         limits: of the arms that have any, by arm name.
-        tell: for arms that watch by themselves too (robot.arm.ur); by arm name.
+        report: for arms that also monitor their gels themselves (robot.arm.ur); by arm name.
         error: raised when a limit is exceeded.
 
-    Raises ValueError for a limit that cannot be watched, because no sensor of its arm delivers height or flow.
+    Raises ValueError for a limit that cannot be monitored, because no sensor of its arm delivers height or flow.
     """
 
     def __init__(
         self,
         sensors: Mapping[str, SensorSpec],
         limits: Mapping[str, ArmLimits],
-        tell: Mapping[str, Callable[[GelReading], None]],
+        report: Mapping[str, Callable[[GelReading], None]],
         error: type[LimitExceeded] = LimitExceeded,
     ) -> None:
         self._carried = {name: spec.arm for name, spec in sensors.items() if spec.arm is not None}
-        self._limits, self._tell, self._error = dict(limits), dict(tell), error
+        self._limits, self._report, self._error = dict(limits), dict(report), error
         for name, arm in self._carried.items():
             own = limits.get(arm)
             if own is None:
@@ -62,18 +62,18 @@ class GelMonitor:
             for what, limit, there in (("depth", own.depth, spec.height), ("shear", own.shear, spec.flow)):
                 if limit is not None and not there:
                     raise ValueError(
-                        f"arms.{arm}.limits.{what}: sensor '{name}' cannot tell it (no calibration, or no markers); "
+                        f"arms.{arm}.limits.{what}: sensor '{name}' does not measure it (no calibration, no markers): "
                         "leave it out, or calibrate the sensor"
                     )
 
     def __call__(self, tactile: Mapping[str, TactileObservation]) -> None:
-        """`tactile`: by sensor name. Every arm is told before anything is raised."""
+        """`tactile`: by sensor name. Every arm gets its report before anything is raised."""
         seen = min((touch.time for touch in tactile.values()), default=math.nan)
         shown = {name: depth_and_shear(tactile[name]) for name in self._carried if name in tactile}
-        for arm, tell in self._tell.items():
+        for arm, report in self._report.items():
             own = [shown[name] for name, carrier in self._carried.items() if carrier == arm and name in shown]
             depth, shear = _worst(depth for depth, _ in own), _worst(shear for _, shear in own)
-            tell(GelReading(seen, depth, shear))
+            report(GelReading(seen, depth, shear))
         for name, found in shown.items():
             arm = self._carried[name]
             limits = self._limits.get(arm)
@@ -90,6 +90,6 @@ class GelMonitor:
 
 
 def _worst(values: Iterable[float]) -> float:
-    """The greatest; NaN if there is none, or if any is: what cannot be seen is not safe."""
+    """The greatest; NaN if there is none, or if any is NaN: what is not measured is not safe."""
     found = list(values)
     return math.nan if not found or any(map(math.isnan, found)) else max(found)

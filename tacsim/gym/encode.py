@@ -34,7 +34,7 @@ from tacsim.tasks.task import Axis
 
 Flat = dict[str, NDArray[Any]]
 
-# Largest magnitude of each kind of float key: far beyond what is physical here, so that a value outside is an error.
+# Largest magnitude of each kind of float key: far beyond what is physical here, so a value outside is an error.
 BOUNDS = {
     "height": 0.05,  # [m]
     "gradient": 100.0,  # [-]

@@ -26,8 +26,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     """A rig with a task. Observations: `tacsim.gym.encode.flatten`. Actions: Box(-1, 1), one component for each free
     axis of the task, in units of its max_step from where the arm was last sent.
 
-    An episode never terminates; it is truncated after the task's steps, or at once when the simulation diverges
-    (then info["diverged"] says why, and the observation is the last good one).
+    An episode terminates only when a limit of an arm is exceeded (info["limit"] says which). It is truncated after the
+    task's steps, or when the simulation diverges (info["diverged"] says why; the observation is the last good one).
 
     info: distance [m], success, score, body_height [m], and the rig's diagnostics.
     Raises IncompatibleRig when the rig lacks what the task needs. Resets the rig once to learn the shapes.
@@ -53,21 +53,21 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._truth_at_start = self._truth()
         self._count = 0
         self._finished = False
-        self._see(observation)
+        self._encode(observation)
 
-    def _see(self, observation: Observation) -> None:
+    def _encode(self, observation: Observation) -> None:
         self._flat = encode.flatten(observation, self._start)
 
     def _truth(self) -> Truth:
         truth = self.rig.truth()
         if truth is None:
-            raise RuntimeError(f"rig '{self.rig.name}' promised ground truth in its spec and gave none")
+            raise RuntimeError(f"rig '{self.rig.name}' promises ground truth in its spec, but delivers none")
         return truth
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[encode.Flat, dict[str, Any]]:
-        """Same seed, same episode. There are no options."""
+        """The same seed gives the same episode. There are no options."""
         super().reset(seed=seed)
         if options:
             raise ValueError(f"reset knows no options, got {sorted(options)}")
@@ -75,9 +75,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         return self._flat, self._judged()[1]
 
     def step(self, action: NDArray[np.float32]) -> tuple[encode.Flat, float, bool, bool, dict[str, Any]]:
-        """An arm limit that is exceeded ends the episode (terminated; `info["limit"]` says which), a simulation that
-        diverges cuts it off (truncated; `info["diverged"]`). Raises ActionError for an action outside the space, and
-        ResetNeeded after either end."""
+        """One control period. Raises ActionError for an action outside the space, ResetNeeded after the end."""
         if self._finished:
             raise ResetNeeded("call reset() before step(): no episode is running")
         asked = encode.action_from(action, self.task.axes, self.task.config.max_step, self._targets)
@@ -91,7 +89,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             flat = {key: value.copy() for key, value in self._flat.items()}
             return flat, reward, exceeded, not exceeded, info | {"limit" if exceeded else "diverged": str(failure)}
         self._targets |= {name: pose for name, pose in sent.items() if pose is not None}
-        self._see(observation)
+        self._encode(observation)
         reward, info = self._judged()
         return self._flat, reward, False, self._count >= self.task.config.steps, info
 

@@ -24,7 +24,7 @@ ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposit
 
 
 def make_env(**options: Any) -> Any:
-    """An environment by robot.open.make_env. Raises ImportError where another `robot` stands before ours."""
+    """An environment by robot.open.make_env. Raises ImportError where Python finds another `robot` first."""
     name = "robot.open"  # not an import statement: tacsim stays below robot
     try:
         return import_module(name).make_env(**options)

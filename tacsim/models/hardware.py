@@ -1,4 +1,4 @@
-"""Facts of hardware, real or mock: UR arms and their limits, cameras. Plain data; the drivers live in `robot`."""
+"""Configuration of hardware, real or mock: UR arms, their limits, cameras, the reset. Drivers are in `robot`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Model = Literal["ur3e", "ur5e", "ur10e"]
 
 
 class Placement(Config):
-    """A rigid transform in a file: where a frame stands, and how it is turned, seen from another."""
+    """A rigid transform in a file: position and rotation of one frame in another."""
 
     position: Vector = (0.0, 0.0, 0.0)  # [m]
     rotation: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)  # rotation vector: axis times angle [rad], as UR writes it
@@ -48,9 +48,9 @@ class Workspace(Config):
 
 
 class Plane(Config):
-    """A wall: the origin of the sensor must stay on the side to which the normal points. World axes."""
+    """The origin of the sensor must stay on the side of this plane to which the normal points. World axes."""
 
-    point: Vector  # any point of the wall [m]
+    point: Vector  # any point of the plane [m]
     normal: tuple[float, float, float]  # of any length
 
     @model_validator(mode="after")
@@ -61,10 +61,10 @@ class Plane(Config):
 
 
 class ArmLimits(Config):
-    """What an arm may do. They guard the work, not people: they are no safety function.
+    """What an arm may do. These limits guard the work, not people: they are no safety function.
 
-    The workspace has no default; nor are there defaults that would suit any cell. `speed` and the rest speak of the
-    sensor's origin, forces of what the object does to the sensor.
+    The workspace has no default, because none suits every cell. Speeds and accelerations are those of the sensor's
+    origin; force and torque are what the object does to the sensor.
     """
 
     workspace: Workspace
@@ -76,17 +76,17 @@ class ArmLimits(Config):
     joint_speed: Annotated[float, Field(gt=0, le=3.14)] = 1.0  # of any joint; bounds the step of each period [rad/s]
     force: Annotated[Force, Field(gt=0, le=250.0)] = 30.0  # |force| beyond it stops the arm [N]
     torque: Annotated[float, Field(gt=0, le=50.0)] = 3.0  # |torque| about the sensor's origin [N m]
-    depth: Annotated[Length, Field(gt=0)] | None = None  # how deep the gel may be pressed; None: not watched [m]
-    shear: Annotated[Length, Field(gt=0)] | None = None  # how far its surface may be dragged; None: not watched [m]
+    depth: Annotated[Length, Field(gt=0)] | None = None  # deepest the gel may be pressed; None: not monitored [m]
+    shear: Annotated[Length, Field(gt=0)] | None = None  # farthest its surface may be dragged; None: not monitored [m]
 
     @property
     def region(self) -> Region:
         """Where the sensor's origin may be: the workspace, cut by the planes."""
-        return region(self.workspace.lower, self.workspace.upper, [(wall.point, wall.normal) for wall in self.planes])
+        return region(self.workspace.lower, self.workspace.upper, [(each.point, each.normal) for each in self.planes])
 
 
 class Payload(Config):
-    """What hangs on the flange, for the controller's gravity compensation."""
+    """The mass on the flange, for the controller's gravity compensation."""
 
     mass: Annotated[float, Field(ge=0, le=20)] = 0.0  # [kg]
     centre: Vector = (0.0, 0.0, 0.0)  # centre of gravity, flange axes [m]
@@ -113,18 +113,20 @@ class UrArmConfig(Config):
     payload: Payload = Payload()
     limits: ArmLimits
     start: Placement | None = None  # world_from_sensor, clear of everything; None: where the scene of a mock rig says
-    link_timeout: Annotated[Time, Field(ge=0.01, le=2.0)] = 50e-3  # no package for so long: the link is lost [s]
-    action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # no action for so long: the arm holds [s]
-    # The newest observation is older: the arm holds, whatever is asked of it [s].
+    link_timeout: Annotated[Time, Field(ge=0.01, le=2.0)] = 50e-3  # without a package, the link is lost [s]
+    action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # without an action, the arm holds [s]
+    # The arm holds, whatever is asked, when the newest observation is older [s].
     observation_timeout: Annotated[Time, Field(ge=0.02, le=600.0)] = 1.0
-    watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = 10.0  # the controller stops without commands for 1 / it [Hz]
+    watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = (
+        10.0  # the controller stops the arm after 1 / watchdog without a command [Hz]
+    )
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
     latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]
     mock: MockArmConfig | None = None
 
     @model_validator(mode="after")
-    def _real_arms_are_watched(self) -> Self:
+    def _real_arms_have_a_watchdog(self) -> Self:
         if self.mock is None and self.watchdog < SLOWEST_WATCHDOG:
             raise ValueError(
                 f"watchdog {self.watchdog:g} Hz: a real arm would go on for {1 / self.watchdog:.2g} s after its driver "
@@ -185,17 +187,17 @@ class KeepOut(Config):
         return self
 
 
-class HardwareStart(Config):
-    """How an episode begins on hardware: retreat to `start`, fresh references, a person confirms, slow approach."""
+class ResetConfig(Config):
+    """How an episode begins on hardware: retreat to `start`, references, a person's confirmation, slow approach."""
 
     approach_speed: Annotated[Speed, Field(gt=0, le=20e-3)] = 2e-3  # [m/s]
-    approach_step: Annotated[Length, Field(gt=0, le=1e-3)] = 20e-6  # between two looks at what is felt [m]
-    approach_way: Annotated[Length, Field(gt=0, le=0.1)] = 10e-3  # no contact after so far: NoTouch [m]
+    approach_step: Annotated[Length, Field(gt=0, le=1e-3)] = 20e-6  # between two measurements [m]
+    approach_distance: Annotated[Length, Field(gt=0, le=0.1)] = 10e-3  # no touch after that: NoTouch [m]
     touch_signal: Annotated[float, Field(gt=0)] | None = None  # contact signal that counts as touch; None: by force
 
 
 def weakened_limits(before: UrArmConfig, after: UrArmConfig) -> list[str]:
-    """What guards the arm less in `after` than in `before`, as "key: from -> to"."""
+    """The limits that `after` weakens, compared with `before`, as "key: from -> to"."""
     found = []
     for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed", "force", "torque"):
         old, new = getattr(before.limits, key), getattr(after.limits, key)

@@ -7,20 +7,20 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from tacsim.models.hardware import ArmLimits, CameraSensorConfig, HardwareStart, KeepOut, Name, UrArmConfig
+from tacsim.models.hardware import ArmLimits, CameraSensorConfig, KeepOut, Name, ResetConfig, UrArmConfig
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 
 
 class SimArmConfig(Config):
-    """A sensor carrier of the simulation: goes exactly where it is told, within the reach of one control period."""
+    """A simulated arm: reaches every commanded pose exactly, within the motion that one control period allows."""
 
     driver: Literal["sim"]
-    speed: Annotated[Speed, Field(gt=0)] = 20e-3  # longest way of a control period / period [m/s]
+    speed: Annotated[Speed, Field(gt=0)] = 20e-3  # longest motion of a control period / period [m/s]
     turn_rate: Annotated[float, Field(gt=0)] = 0.5  # the same for rotation [rad/s]
-    # Those of the real arm, for a policy that shall meet them in simulation too: workspace, planes, speed, turn_rate,
-    # force, torque, depth, shear. (Accelerations and joints are not simulated; the state is looked at once a period.)
+    # Those of the real arm, so that a policy meets them in simulation too: workspace, planes, speed, turn_rate, force,
+    # torque, depth, shear. Accelerations and joints are not simulated; limits are checked once a period.
     limits: ArmLimits | None = None
 
 
@@ -28,7 +28,7 @@ class ReplayArmConfig(Config):
     """Arm states of a recording: an episode (.mcap), or a CSV file with a row a frame."""
 
     driver: Literal["replay"]
-    source: str | None = None  # None: nothing was recorded of this arm, the rig is opened without it
+    source: str | None = None  # None: the recording has no such arm, the rig is opened without it
     force_column: str = "force_N"  # normal force, positive when pressed [N]
     width_column: str | None = "gripper_width_m"  # opening of a parallel gripper [m]
 
@@ -105,14 +105,14 @@ class RigConfig(Config):
     arms: dict[Name, ArmConfig] = {}
     sensors: dict[Name, SensorConfig] = Field(min_length=1)
     canonical: CanonicalGrid = CanonicalGrid()
-    motion: SimMotion = "settled"  # simulated: what a control period is; the reset is settled in any case
-    # Mock rigs: a control period ends when the arms rest and the twin has drawn the picture for just that pose.
+    motion: SimMotion = "settled"  # of simulated rigs, during a control period; a reset always settles
+    # Mock rigs: a control period ends when the arms rest and the picture of just that pose is rendered.
     lock_step: bool = True
-    # Mock rigs: what arms feel and cameras see is simulated; or it is a ball's contact in closed form, in real time but
-    # without a body, for tests of timing.
+    # Mock rigs: wrenches and pictures come from the simulator, or from a ball's contact in closed form: in real time,
+    # but without a body, for tests of timing.
     contact: Literal["simulated", "hertz"] = "simulated"
     keep_out: tuple[KeepOut, ...] = Field(default=(), max_length=16)
-    start: HardwareStart = HardwareStart()  # of rigs that go by the wall clock
+    start: ResetConfig = ResetConfig()  # reset of rigs of hardware, real or mock
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -121,7 +121,7 @@ class RigConfig(Config):
                 raise PydanticCustomError(
                     "no_such_arm",
                     "no arm '{arm}'; allowed: {arms}",
-                    # `at`: the entry to blame, as pydantic writes locations (tacsim.config shows its line)
+                    # `at`: the wrong entry, as pydantic writes locations (tacsim.config shows its line)
                     {
                         "arm": sensor.arm,
                         "arms": ", ".join(self.arms) or "(none)",
@@ -142,7 +142,7 @@ class RigConfig(Config):
         return self
 
     def _check_load(self, name: str, load: float) -> None:
-        """A load of the task is held by an arm of the rig, which must not stop at it."""
+        """The arm that holds a load of the task must exist, and must not stop at that force."""
         at = ("task", "reposition", "loads", name)
         arm = self.arms.get(name)
         if arm is None:

@@ -1,4 +1,4 @@
-"""Facts of a simulated scene: gels, body, indenter, friction, accuracy; and numbers derived from them."""
+"""Configuration of a simulated scene: gels, body, indenter, friction, accuracy; and numbers derived from it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class BodyMaterial(Config):
     yield_strain: Annotated[float, Field(gt=0, lt=1)] | None = None  # k = sigma_y / (2 mu), Frobenius norm
     # H: growth of the uniaxial yield stress by equivalent plastic strain [Pa]
     hardening_modulus: Annotated[Pressure, Field(ge=0, le=1e12)] = 0.0
-    # Weight and dynamic motions; inertia is scaled elsewhere. Plasticine: a guess within the 1.5 to 2 g/cm^3 told.
+    # Weight and dynamic motions; inertia is scaled elsewhere. Plasticine: a guess within the published 1.5 to 2 g/cm^3.
     density: MassDensity = 1700.0
     source: str = ""
 
@@ -209,7 +209,7 @@ class Scene(Config):
 
     @property
     def peak_mach(self) -> float:
-        """Peak speed of a motion between states of rest, over the wave speed; short ways go slower (physics.path).
+        """Peak speed of a motion between states of rest, over the wave speed; slower on short paths (physics.path).
 
         A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
         tolerance, and with the body's elastic strain at yield: its density is scaled with its stiffness, and so is what

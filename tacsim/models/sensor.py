@@ -1,4 +1,4 @@
-"""Facts of one tactile sensor: the one geometry of its image, its light, its markers, its texture and noise."""
+"""Configuration of one tactile sensor: the geometry of its image, its light, markers, texture and noise."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SensorGeometry(Config):
 
     Pixel centres are integers; (u0, v0) defaults to the image centre, so the sensor axis is in the middle.
 
-    A `camera_distance` H makes the camera a pinhole on the sensor axis, so far behind the untouched gel: a dot on a
+    A `camera_distance` H makes the camera a pinhole on the sensor axis, that far behind the untouched gel: a dot on a
     surface pressed in by h appears at ``x H / (H - h)``. Without one it looks along parallel rays, x stays x. Only
     dots are drawn so; the colour of the gel is always that of parallel rays.
     """
@@ -50,7 +50,7 @@ class SensorGeometry(Config):
 
 
 class Light(Config):
-    """One directional light. Like the camera it stands behind the gel, on the -z side (z points out of the gel)."""
+    """One directional light. Like the camera it is behind the gel, on the -z side (z points out of the gel)."""
 
     direction: tuple[float, float, float]  # from the surface towards the light, sensor axes, any length
     colour: Rgb

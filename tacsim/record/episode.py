@@ -9,7 +9,7 @@ from tacsim.interface import Action, ArmState, Pose, RigSpec, TactileFrame
 
 
 class EpisodeError(ValueError):
-    """A file is no episode, or what it holds is damaged or beyond the limits."""
+    """A recording that is missing, damaged, of another kind, or beyond the limits of size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeMeta:
-    """Facts of the whole episode."""
+    """What holds for the whole episode."""
 
     rig: str
     task: str | None
@@ -46,5 +46,5 @@ class EpisodeMeta:
 class Episode:
     meta: EpisodeMeta
     steps: list[Step] = field(default_factory=list)
-    complete: bool = True  # False: the recording ended without its footer (killed); what was flushed is here
-    dropped: int = 0  # steps the recorder had to drop
+    complete: bool = True  # False: the recorder was killed; the steps flushed until then are here
+    dropped: int = 0  # steps that the recorder had to drop

@@ -1,4 +1,4 @@
-"""A parallel gripper's record, a CSV row a frame, as states of the arm that carries a tactile finger."""
+"""The CSV record of a parallel gripper, one row for each frame, as states of the arm that carries a tactile finger."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MAX_CSV = 64 << 20  # [bytes]
 
 
 def read_columns(path: Path, names: list[str]) -> list[tuple[float, ...]]:
-    """The named columns of a CSV file with a header, a tuple a row.
+    """The named columns of a CSV file with a header, one tuple for each row.
 
-    Raises EpisodeError: no file, too large, a column missing (with those there are), a value that is no finite number,
-    or a column `frame` that does not count the rows from 0.
+    Raises EpisodeError for a file that is missing or too large, a missing column, a value that is not a finite number,
+    and a column `frame` that does not count the rows from 0.
     """
     try:
         if path.stat().st_size > MAX_CSV:
@@ -53,7 +53,7 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise EpisodeError(f"{path}:{line}: column '{column}': '{text or ''}' is no finite number")
+        raise EpisodeError(f"{path}:{line}: column '{column}': '{text or ''}' is not a finite number")
     return value
 
 
@@ -66,7 +66,7 @@ def finger_states(rows: list[tuple[float, ...]], period: float, lower: bool) -> 
     the other five components were not measured and are 0. Twist: difference to the row before over `period` [s].
     """
     side = -1.0 if lower else 1.0
-    facing = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x
+    quaternion = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x
     states: list[ArmState] = []
     before = None
     for number, (force, *opening) in enumerate(rows):
@@ -75,7 +75,7 @@ def finger_states(rows: list[tuple[float, ...]], period: float, lower: bool) -> 
         before = z
         states.append(
             ArmState(
-                pose=Pose(np.array([0.0, 0.0, z]), facing),
+                pose=Pose(np.array([0.0, 0.0, z]), quaternion),
                 twist=np.array([0.0, 0.0, speed, 0.0, 0.0, 0.0]),
                 wrench=np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0]),
                 joints=None,

@@ -51,7 +51,7 @@ def nanoseconds(seconds: float) -> int:
 
 
 def _stamp(seconds: float) -> int:
-    """Stamp for viewers of a time that may lie before the clock's start [ns]; /step and /{arm}/arm have it exactly."""
+    """Time for viewers [ns], never before the clock's start; /step and /{arm}/arm hold the exact time."""
     return nanoseconds(max(seconds, 0.0))
 
 
@@ -143,7 +143,7 @@ def _frame_message(frame: TactileFrame) -> FrameMessage:
 
 
 def _join(name: str, fields: tuple[str, ...], *arrays: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(h, w, fields) float32 from arrays that share (h, w). Refuses what could not be kept bit for bit."""
+    """(h, w, fields) float32 from arrays that share (h, w). Raises ValueError for any other type or shape."""
     shapes = ", ".join(f"{array.shape} {array.dtype}" for array in arrays)
     rows_columns = {array.shape[:2] for array in arrays}
     channels = sum(array.shape[-1] for array in arrays)

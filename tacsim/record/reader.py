@@ -1,4 +1,4 @@
-"""Episodes from files, finished or not: as a whole, or step by step."""
+"""Reads episodes, finished or cut off: as a whole, or step by step."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ MAX_MEMORY = 4 << 30  # [bytes] of arrays in one episode in memory
 
 
 def read_episode(path: Path | str, *, max_memory: int = MAX_MEMORY) -> Episode:
-    """The whole episode. Of an unfinished or damaged file: all steps before the end or damage, `complete` False.
+    """The whole episode. A file that is cut off or damaged gives the steps before that, and `complete` is False.
 
-    Raises EpisodeError: no such file, no episode, content beyond the limits (`max_memory` [bytes] of decoded arrays).
+    Raises EpisodeError when there is no such file, it is no episode, or it exceeds `max_memory` [bytes] when decoded.
     """
     with EpisodeFile(path) as file:
         episode = Episode(meta=file.meta)
@@ -42,11 +42,11 @@ def iter_steps(path: Path | str) -> Iterator[Step]:
 
 
 class EpisodeFile:
-    """An open episode file: facts at once, steps one by one.
+    """An open episode file: the metadata at once, the steps one by one.
 
     Args:
         path: of the file.
-        sensors: only their frames are decoded; None: all.
+        sensors: whose frames are decoded; None: all.
 
     Raises EpisodeError.
     """
@@ -71,7 +71,7 @@ class EpisodeFile:
             raise
 
     def _read_meta(self) -> EpisodeMeta:
-        """Facts and attachments stand before the first step."""
+        """Metadata and attachments, which precede the first step."""
         found: tuple[EpisodeMeta, tuple[str, ...]] | None = None
         attachments: dict[str, bytes] = {}
         for record in self._records:
@@ -84,12 +84,12 @@ class EpisodeFile:
             if found is not None and set(found[1]) <= set(attachments):
                 return replace(found[0], attachments=attachments)
         if found is None:
-            raise EpisodeError(f"{self.path}: no episode: its facts are missing or damaged (metadata '{META}')")
+            raise EpisodeError(f"{self.path}: no episode: its metadata are missing or damaged (record '{META}')")
         missing = sorted(set(found[1]) - set(attachments))
         raise EpisodeError(f"{self.path}: attachment '{missing[0]}' is missing or damaged")
 
     def steps(self) -> Iterator[Step]:
-        """The steps that follow, in order; ends at the end of the file or at the first damage."""
+        """The steps in order, up to the end of the file or the first damage."""
         topics: dict[int, str] = {}
         pending: dict[str, bytes] = {}
         count = 0
@@ -99,7 +99,7 @@ class EpisodeFile:
             elif isinstance(record, Metadata) and record.name == CLOSE:
                 self._closing = _closing(record)
             elif isinstance(record, Footer):
-                self._close_account(count)
+                self._finish(count)
             elif isinstance(record, Message):
                 if record.channel_id not in topics:
                     return
@@ -107,7 +107,7 @@ class EpisodeFile:
                 if topic != STEP_TOPIC:
                     pending[topic] = record.data
                     continue
-                if record.sequence != count % 2**32:  # a damaged record hid a step: what follows does not belong here
+                if record.sequence != count % 2**32:  # a damaged record hid a step
                     return
                 try:
                     yield decode_step(record.data, pending, self._sensors)
@@ -116,7 +116,7 @@ class EpisodeFile:
                 pending.clear()
                 count += 1
 
-    def _close_account(self, count: int) -> None:
+    def _finish(self, count: int) -> None:
         if self._closing is not None:
             self.complete = self._closing["steps"] == count
             self.dropped = self._closing["dropped"]

@@ -1,7 +1,7 @@
-"""MCAP records of a file that may be unfinished, damaged or hostile, one after the other up to the first bad one.
+"""The MCAP records of a file that may be cut off, damaged or hostile, up to the first bad one.
 
 The readers of the `mcap` package need a finished file and trust the lengths in it. Here each length is checked
-against what is there before anything is read; the records themselves are parsed by `mcap`.
+against the size of the file before anything is read; `mcap` parses the records themselves.
 Format: https://mcap.dev/spec
 """
 
@@ -35,17 +35,17 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 class _BadRecord(Exception):
-    """Here the readable part of the file ends."""
+    """The readable part of the file ends here."""
 
 
 def read_records(file: BinaryIO, size: int, what: str) -> Iterator[McapRecord]:
-    """Records in file order, those in chunks among the others; indexes and statistics are left out.
+    """Records in file order, chunks unpacked, without indexes and statistics.
 
     Ends without an exception at the first record that is cut off or damaged. The last record is a Footer only if the
-    file was finished. Raises EpisodeError for a file that is no MCAP file or has compressed chunks.
+    file was finished. Raises EpisodeError for a file that is not MCAP or has compressed chunks.
     """
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise EpisodeError(f"{what}: no MCAP file (it does not begin with the MCAP magic bytes)")
+        raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
     try:
         for record in _records(file, size - len(MCAP0_MAGIC)):
             if isinstance(record, Chunk):
@@ -82,7 +82,7 @@ def _records(stream: BinaryIO, size: int) -> Iterator[McapRecord]:
 
 
 def _parse(opcode: int, body: bytes) -> McapRecord | None:
-    """The record; None for kinds that an episode's reader has no use for. A body in memory bounds every read in it."""
+    """The record; None for kinds that episodes do not need. No read reaches beyond `body`."""
     stream = ReadDataStream(io.BytesIO(body))
     try:
         if opcode == Opcode.MESSAGE:

@@ -1,6 +1,6 @@
-"""Recorded sensors and arms behind the contract of a rig. Frame k of all sources belongs to tick k of one clock.
+"""Recorded sensors and arms as parts of a rig. Frame k of every source belongs to tick k of one clock.
 
-Times are given on the replay's clock: what was exposed 20 ms before its step then, is 20 ms old now.
+Times are those of the replay's clock: a picture that was exposed 20 ms before its step is 20 ms old in the replay.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from tacsim.record.sources import (
 
 
 class ReplayClock:
-    """One recorded frame a tick; `period` is what a frame stands for [s]. `index` starts at 0, the first frame."""
+    """One recorded frame for each tick. `period`: time between two frames [s]; `index`: number of the frame, from 0."""
 
     def __init__(self, period: float) -> None:
         if not period > 0.0:
@@ -61,15 +61,14 @@ class ReplayClock:
 class ReplaySensor:
     """Recorded frames as a TactileSource.
 
-    The source is an episode (frames of the sensor of this name, or of its only one), a folder of pictures of one size,
-    or a video. `spec` promises height and flow if the recorded frames carry them; who finds them in the pictures says
-    so there.
+    The source is an episode (the sensor of this name, or its only one), a folder of pictures of one size, or a video.
+    `spec` has height and flow if the recorded frames have them; robot.open adds what the normaliser finds in pictures.
 
     Raises EpisodeError when the source is missing, empty, unreadable, too large, or has no such sensor.
     """
 
     def __init__(self, config: ReplaySensorConfig, name: str, clock: ReplayClock) -> None:
-        self._facts, self._name, self._clock = config, name, clock
+        self._config, self._name, self._clock = config, name, clock
         self._path = _source(config.source, f"sensors.{name}")
         self._reference = None if config.reference is None else read_image(Path(config.reference))
         self._frames = Cursor(self._open(), str(self._path))
@@ -105,7 +104,7 @@ class ReplaySensor:
         self._frames.close()
 
     def _open(self) -> Callable[[], Iterator[tuple[TactileFrame, float]]]:
-        """What starts the frames, each with its age at its step [s]. Pictures and videos know none: 0."""
+        """A function that starts the frames, each with its age at its step [s]; 0 for pictures and videos."""
         path = self._path
         if path.is_dir():
             pictures = list_pictures(path)
@@ -124,15 +123,15 @@ class ReplaySensor:
 class ReplayArm:
     """Recorded states as an Arm that executes nothing.
 
-    The source is an episode (states of the arm of this name, or of its only one), or a CSV file of a parallel gripper
-    with a row a frame: see :func:`tacsim.record.gripper.finger_states` for the frames and signs. The arm called "lower"
-    is the lower finger, any other the upper one.
+    The source is an episode (the arm of this name, or its only one), or the CSV file of a parallel gripper with one row
+    for each frame (frames and signs: :func:`tacsim.record.gripper.finger_states`). The arm called "lower" is the lower
+    finger, any other the upper one.
 
     Raises EpisodeError when the source is missing, empty, unreadable, or has no such arm or column.
     """
 
     def __init__(self, config: ReplayArmConfig, name: str, clock: ReplayClock) -> None:
-        self._facts, self._name, self._clock = config, name, clock
+        self._config, self._name, self._clock = config, name, clock
         self._path = _source(config.source, f"arms.{name}")
         self._states = Cursor(self._open(), str(self._path))
         _first(self._states, self._path)
@@ -143,7 +142,7 @@ class ReplayArm:
         return replace(state, time=self._clock.now() - age)
 
     def command(self, target: Pose | None) -> Pose | None:
-        """Executes nothing, and says so: None."""
+        """Executes nothing, so it returns None."""
         return None
 
     def stop(self) -> None:
@@ -156,7 +155,7 @@ class ReplayArm:
         self._states.close()
 
     def _open(self) -> Callable[[], Iterator[tuple[ArmState, float]]]:
-        """What starts the states, each with its age at its step [s]."""
+        """A function that starts the states, each with its age at its step [s]."""
         path = self._path
         if path.suffix.lower() in EPISODES and path.is_file():
             arm = only_or_named(list(episode_meta(path).spec.arms), self._name, path, "arm")
@@ -165,16 +164,16 @@ class ReplayArm:
             raise EpisodeError(f"{path}: no such file")
         if path.suffix.lower() != ".csv":
             raise EpisodeError(f"{path}: no record of an arm; give an episode ({', '.join(EPISODES)}) or a .csv file")
-        columns = [self._facts.force_column]
-        columns += [] if self._facts.width_column is None else [self._facts.width_column]
+        columns = [self._config.force_column]
+        columns += [] if self._config.width_column is None else [self._config.width_column]
         states = finger_states(read_columns(path, columns), self._clock.period, lower=self._name == "lower")
         return lambda: ((state, 0.0) for state in states)
 
 
 def recorded_period(config: ReplaySensorConfig, name: str) -> float:
-    """Time between two frames of a recording [s]: what the rig's period should be. Raises EpisodeError.
+    """Time between two frames of a recording [s], by which the rig's period is set. Raises EpisodeError.
 
-    An episode knows it, most videos do; for the others `fps` of the rig file counts.
+    Episodes and most videos contain it; otherwise `fps` of the rig file holds.
     """
     path = _source(config.source, f"sensors.{name}")
     if path.suffix.lower() in EPISODES:

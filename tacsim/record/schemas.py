@@ -73,12 +73,12 @@ _GOAL: TypeAdapter[float | tuple[float, ...] | None] = TypeAdapter(
 
 
 def sealed(values: Mapping[str, str]) -> dict[str, str]:
-    """`values` with a checksum beside them: an MCAP metadata record has none of its own."""
+    """`values` with a checksum added: an MCAP metadata record has none of its own."""
     return {**values, "crc32": _checksum(values)}
 
 
 def unsealed(values: Mapping[str, str], what: str) -> dict[str, str]:
-    """The values without their checksum. Raises EpisodeError when they do not belong together."""
+    """The values without their checksum. Raises EpisodeError when it is wrong."""
     bare = {key: value for key, value in values.items() if key != "crc32"}
     if values.get("crc32") != _checksum(bare):
         raise EpisodeError(f"{what}: its metadata are damaged (checksum)")
@@ -86,7 +86,7 @@ def unsealed(values: Mapping[str, str], what: str) -> dict[str, str]:
 
 
 def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
-    """The metadata record of an episode. Attachments are records of their own; their names are here."""
+    """The metadata record of an episode, with the names of its attachments, which are records of their own."""
     values = {
         "format": FORMAT,
         "rig": meta.rig,
@@ -101,7 +101,7 @@ def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
 
 
 def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tuple[str, ...]]:
-    """The facts of an episode, still without attachments, and the names of those. Raises EpisodeError."""
+    """The metadata of an episode without its attachments, and their names. Raises EpisodeError."""
     values = unsealed(record, what)
     if values.get("format") != FORMAT:
         raise EpisodeError(f"{what}: episode format '{values.get('format')}', but this tacsim reads '{FORMAT}'")

@@ -1,4 +1,4 @@
-"""Recordings read frame by frame: episodes, folders of pictures, videos."""
+"""Reads recordings frame by frame: episodes, folders of pictures, videos."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ T = TypeVar("T")
 
 
 class Cursor(Generic[T]):
-    """Item number k of a recording that can only be read forwards; starts again for a smaller k."""
+    """Random access to a recording that can only be read forwards: a smaller number starts it again."""
 
     def __init__(self, start: Callable[[], Iterator[T]], what: str) -> None:
         self._start, self._what = start, what
         self._items: Iterator[T] | None = None
-        self._next = 0  # number of the item that comes next
+        self._next = 0  # number of the next item
         self._current: T | None = None
 
     def at(self, number: int) -> T:
@@ -46,14 +46,14 @@ class Cursor(Generic[T]):
             except StopIteration:
                 raise EndOfEpisode(f"{self._what} has {self._next} frames") from None
             except Exception:
-                self.close()  # a generator that has raised would next look like one that is over
+                self.close()  # otherwise the generator that raised would look finished
                 raise
             self._next += 1
         assert self._current is not None
         return self._current
 
     def close(self) -> None:
-        """Closes what is open; `at` opens it again."""
+        """Closes the recording; `at` opens it again."""
         close = getattr(self._items, "close", None)
         if close is not None:  # a generator: runs its `finally`
             close()
@@ -61,7 +61,7 @@ class Cursor(Generic[T]):
 
 
 def episode_meta(path: Path) -> EpisodeMeta:
-    """Facts of an episode. Raises EpisodeError."""
+    """The metadata of an episode. Raises EpisodeError."""
     with EpisodeFile(path, sensors=()) as file:
         return file.meta
 
@@ -85,7 +85,7 @@ def episode_states(path: Path, arm: str) -> Iterator[tuple[ArmState, float]]:
 
 
 def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
-    """`name` if the recording has it, else its only one. Raises EpisodeError with the names there are."""
+    """`name` if the recording has it, else its only one. Raises EpisodeError that lists the names."""
     if name in names:
         return name
     if len(names) == 1:
@@ -95,7 +95,7 @@ def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """Pictures of a folder, "2.png" before "10.png". Raises EpisodeError for none, unreadable ones and mixed sizes."""
+    """Pictures of a folder, "2.png" before "10.png". Raises EpisodeError for none, unreadable ones or several sizes."""
     paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=_natural)
     if not paths:
         raise EpisodeError(f"{folder}: no pictures in this folder ({', '.join(PICTURES)})")
@@ -116,7 +116,7 @@ def folder_images(paths: list[Path]) -> Iterator[NDArray[np.uint8]]:
 
 
 def video_rate(path: Path) -> float | None:
-    """Frames a second as the video says; None when it does not. Raises EpisodeError."""
+    """Frames per second of a video; None when it does not contain that. Raises EpisodeError."""
     import cv2
 
     capture = _open_video(path)
@@ -149,7 +149,7 @@ def video_images(path: Path) -> Iterator[NDArray[np.uint8]]:
 def _open_video(path: Path) -> cv2.VideoCapture:
     import cv2
 
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # no other backend: some take a name for a device or pipeline
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # other backends may take a name for a device or a pipeline
     if not capture.isOpened():
         raise EpisodeError(f"{path}: no readable video, or one without frames")
     columns, rows = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -165,7 +165,7 @@ def _natural(path: Path) -> list[str | int]:
 
 
 def unknown_source(path: Path) -> EpisodeError:
-    """The error for a path that no source of frames reads."""
+    """The error for a path that is no recording."""
     if not path.exists():
         return EpisodeError(f"{path}: no such file or folder")
     return EpisodeError(

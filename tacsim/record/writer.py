@@ -1,4 +1,4 @@
-"""The recorder: control steps go into an MCAP file as they happen, on a thread of their own."""
+"""The recorder: writes control steps to an MCAP file as they happen, on a thread of its own."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _ONE_CHUNK = 1 << 40  # [bytes] a chunk ends with its step, never by size
 
 
 class Recorder:
-    """Writes an episode. The control loop hands over steps and never waits; encoding and disk are on another thread.
+    """Writes an episode. The control loop hands over steps and never waits: another thread encodes and writes them.
 
-    Each step is one chunk, flushed to the operating system: what was flushed is readable after a kill. Facts and
-    attachments are written at once, so a killed recording has them too. When the disk fills up (or a step cannot be
-    encoded) the recording ends, the reason is in `error`, and what was flushed stays readable.
+    Each step is one chunk, flushed to the operating system, and stays readable when the process is killed. Metadata and
+    attachments are written first. When the disk fills up, or a step cannot be encoded, the recording ends; the reason
+    is in `error`, and the steps written before stay readable.
 
     The arrays of a step must not change after `write`: they are encoded later.
 
     Args:
         path: of the new file.
-        meta: facts and attachments of the episode.
+        meta: of the episode, with its attachments.
         capacity: steps that may wait; beyond it whole steps are dropped and counted.
         pitch: of the canonical grid [m]; viewers draw the surface maps with it.
 
@@ -169,10 +169,10 @@ class Recorder:
         return self._schemas[schema]
 
     def _finish(self) -> None:
-        config = {"steps": str(self._written), "dropped": str(self._dropped)}
+        account = {"steps": str(self._written), "dropped": str(self._dropped)}
         if self._error is not None:
-            config["error"] = str(self._error)
-        self._writer.add_metadata(CLOSE, sealed(config))
+            account["error"] = str(self._error)
+        self._writer.add_metadata(CLOSE, sealed(account))
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 

@@ -20,12 +20,11 @@ THUMBNAIL = 320  # [px]
 
 
 def summary(episode: Episode) -> dict[str, Any]:
-    """Facts and curves of an episode as JSON: an entry of each list a control step (the state after reset has none).
+    """An episode in numbers, as JSON; lists have one entry for each control step (none for the state after reset).
 
     `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
     `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.report.timing; null unless the rig is
-    live), `trust` (tacsim.report.trust; null where nothing is found in pictures). What is unknown or not finite is
-    null.
+    live), `trust` (tacsim.report.trust; null if sensors know their surface). Unknown and infinite values are null.
     """
     from tacsim.report.figure import contact_signals, normal_force, signal_against_force
     from tacsim.report.timing import timing
@@ -59,7 +58,7 @@ def summary(episode: Episode) -> dict[str, Any]:
 
 
 def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
-    """Writes `summary.json`, `report.png` and `report.html` below `directory`; their paths by those three names.
+    """Writes `summary.json`, `report.png` and `report.html` into `directory`; returns their paths by name.
 
     Raises OSError when the directory can't be written, ValueError for an episode without steps.
     """
@@ -80,7 +79,7 @@ def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
 
 
 def end_table(stats: Mapping[str, Any], paths: Iterable[Path]) -> Table:
-    """What a person wants to know at the end of a run, as a rich table. `stats` are those of :func:`summary`."""
+    """The summary of a run for the terminal. `stats` are those of :func:`summary`."""
     from rich.table import Table
     from rich.text import Text
 
@@ -154,8 +153,8 @@ def _number(value: float | None) -> float | None:
 
 
 def _settled(done: list[Step]) -> int | None:
-    told = [step.info["settled"] for step in done if "settled" in step.info]
-    return sum(bool(value) for value in told) if told else None
+    settled = [step.info["settled"] for step in done if "settled" in step.info]
+    return sum(bool(value) for value in settled) if settled else None
 
 
 def _inline(content: bytes) -> str:

@@ -1,4 +1,4 @@
-"""How an episode on live hardware kept time: period, age of what was seen, alignment, limits that were hit."""
+"""Timing of an episode on live hardware: period, age of pictures, alignment, limits that were hit."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from tacsim.record.episode import Episode
 
-ALIGNMENT, LIMITS = "alignment_", "limits_hit_"  # beginnings of the names in Step.info, before an arm's name
+ALIGNMENT, LIMITS = "alignment_", "limits_hit_"  # keys of Step.info, before an arm's name
 
 
 def timing(episode: Episode) -> dict[str, Any] | None:
     """Median, 99th percentile and largest of the period and each picture's age [s]; time from each arm's state to the
-    nearest package [s]; how often limits shortened or refused what each arm was asked; simulated time over wall time.
+    nearest package [s]; how often limits shortened or refused a target of each arm; simulated time over wall time.
 
-    None for an episode that was not live: in a simulation time passes as it is told.
+    None for an episode that was not live.
     """
     done = [step for step in episode.steps if step.index > 0]
     arms = [name.removeprefix(ALIGNMENT) for name in (done[0].info if done else {}) if name.startswith(ALIGNMENT)]
@@ -39,7 +39,7 @@ def _spread(values: Any) -> dict[str, float]:
 
 
 def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
-    """The same for a person."""
+    """:func:`timing` as rows of a table."""
     period = stats["period"]
     ages = "; ".join(
         f"{name} {1e3 * age['median']:.0f} (at most {1e3 * age['max']:.0f}) ms" for name, age in stats["age"].items()

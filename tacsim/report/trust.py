@@ -1,4 +1,4 @@
-"""How far an episode's observations are to be trusted, by what their sensors said of themselves at each step."""
+"""How trustworthy an episode's observations are, by the diagnostics of its normalisers at each step."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from typing import Any
 
 from tacsim.record.episode import Episode
 
-STALE = "stale_"  # 1: the reference does not fit any more; beginnings of names in Step.info, before a sensor's name
+# Keys of Step.info, before a sensor's name
+STALE = "stale_"  # 1: the reference does not fit any more
 DRIFT = "drift_"  # change of the untouched gel's colour since the reference [-]
-BACKGROUND = "background_"  # mean slope that the drift of the light would be taken for [degrees]
+BACKGROUND = "background_"  # mean slope that a drift of the light would look like [degrees]
 BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrated slopes
 KEPT = "kept_"  # share of the markers that were seen
-MUCH_BEYOND = 0.01  # worth a word
-FEW_KEPT = 0.8
+MUCH_BEYOND, FEW_KEPT = 0.01, 0.8  # a warning is given above, and below
 
 
 def trust(episode: Episode) -> dict[str, dict[str, Any]] | None:
-    """By sensor: in how many steps its reference was stale, and the worst of the rest (null where not told).
+    """By sensor: the number of steps with a stale reference, and the worst of the other values (None where unknown).
 
-    None for an episode whose sensors know their surface by themselves: nothing had to be found in pictures.
+    None for an episode whose sensors know their surface by themselves.
     """
     sensors = [
         key.removeprefix(STALE) for key in (episode.steps[0].info if episode.steps else {}) if key.startswith(STALE)
@@ -43,28 +43,28 @@ def trust(episode: Episode) -> dict[str, dict[str, Any]] | None:
 
 
 def trust_rows(stats: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
-    """What a person should look at; nothing where all is well."""
+    """Warnings for a person; none where all is well."""
     rows = []
-    for name, told in stats.items():
-        if told["stale"]:
-            most = "" if told["drift"] is None else f", colour of the untouched gel off by up to {told['drift']:.0%}"
+    for name, worst in stats.items():
+        if worst["stale"]:
+            most = "" if worst["drift"] is None else f", colour of the untouched gel off by up to {worst['drift']:.0%}"
             rows.append(
                 (
                     "look at this",
-                    f"{name}: stale reference in {told['stale']} of {told['steps']} observations{most}; the light has "
-                    "drifted, slopes are less sure: reset for a fresh one, and let the sensor warm up",
+                    f"{name}: stale reference in {worst['stale']} of {worst['steps']} observations{most}; the light "
+                    "has drifted, slopes are less sure: reset for a fresh one, and let the sensor warm up",
                 )
             )
-        if told["beyond"] is not None and told["beyond"] > MUCH_BEYOND:
+        if worst["beyond"] is not None and worst["beyond"] > MUCH_BEYOND:
             rows.append(
                 (
                     "look at this",
-                    f"{name}: up to {told['beyond']:.0%} of the picture beyond the calibrated slopes, height too low "
+                    f"{name}: up to {worst['beyond']:.0%} of the picture beyond the calibrated slopes, height too low "
                     "there; calibrate with a deeper press or a smaller ball",
                 )
             )
-        if told["kept"] is not None and told["kept"] < FEW_KEPT:
+        if worst["kept"] is not None and worst["kept"] < FEW_KEPT:
             rows.append(
-                ("look at this", f"{name}: only {told['kept']:.0%} of the markers seen at worst; flow is less sure")
+                ("look at this", f"{name}: only {worst['kept']:.0%} of the markers seen at worst; flow is less sure")
             )
     return rows

@@ -1,4 +1,4 @@
-"""Tasks: what the two sensors shall do with the body between them, and policies that need no task."""
+"""Tasks for two sensors with a body between them, and scripted policies."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ __all__ = ["Axis", "Outcome", "Reposition", "Squeeze", "Task", "judge", "make_ta
 
 
 def make_task(config: TaskConfig) -> Task:
-    """The task that the facts describe."""
+    """The task that `config` describes."""
     return Squeeze(config) if isinstance(config, SqueezeConfig) else Reposition(config)

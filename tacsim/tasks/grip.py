@@ -11,19 +11,19 @@ from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
 
 TARGET = 0.05  # contact signal of a firm grip: five times what camera noise of 2 % gives [-]
-CLOSE = 0.1e-3  # how far each sensor closes in a control period [m]
+CLOSE = 0.1e-3  # motion of each sensor in a control period [m]
 
 
 class Grip:
-    """Moves every sensor along its own z until the mean contact signal reaches the target, then holds for good.
+    """Moves every sensor along its own z until the mean contact signal reaches the target, then holds to the end.
 
-    The same code closes simulated sensors and says what it would do on recorded frames. A sensor that no arm carries is
-    addressed by its own name, with a target relative to where it is.
+    On a recording, its actions are what it would have done. A sensor that no arm carries is addressed by its own name,
+    with a target relative to where it is.
 
     Args:
         spec: of the rig; says which arm carries which sensor.
         target: contact signal (tacsim.control.contact_signal) that ends the closing [-].
-        step: how far each sensor closes in a control period [m].
+        step: motion of each sensor in a control period [m].
     """
 
     def __init__(self, spec: RigSpec, target: float = TARGET, step: float = CLOSE) -> None:
@@ -45,10 +45,9 @@ class Grip:
         self._holding = self._holding or float(np.mean(signals)) >= self._target
         if self._holding:
             return Action({arm or sensor: None for sensor, arm in self._carriers.items()})
-        forward = Pose(np.array([0.0, 0.0, self._step]))
         return Action(
             {
-                arm or sensor: se3.compose(Pose() if arm is None else observation.arms[arm].pose, forward)
+                arm or sensor: se3.along_z(Pose() if arm is None else observation.arms[arm].pose, self._step)
                 for sensor, arm in self._carriers.items()
             }
         )

@@ -12,8 +12,8 @@ from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, P
 from tacsim.models.rig import RepositionConfig
 from tacsim.tasks.task import Axis
 
-REACHED = 0.02e-3  # the scripted policy holds when its estimate is this near the goal [m]
-LEAST_FORCE = 0.01  # normal force below which there is no contact to speak of [N]
+REACHED = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
+LEAST_FORCE = 0.01  # a smaller normal force counts as no contact [N]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +39,10 @@ class Reposition:
 
 
 class ScriptedReposition:
-    """Moves the upper sensor at half of max_step towards the goal until the body, as felt, is there, then holds.
+    """Moves the upper sensor at half of max_step until the estimated position of the body is the goal, then holds.
 
-    Closed loop: it does not matter whether the body sticks to the sensor, slides under it, or tips. Where contact is
-    lost it feels nothing, and holds. With `through` it goes on beyond the goal, straight and at the full rate.
+    Closed loop: it does not matter whether the body sticks to the sensor, slides under it, or tips. Without contact it
+    holds. With `through` it moves on past the goal, straight and at the full rate.
     """
 
     def __init__(self, config: RepositionConfig, through: bool) -> None:
@@ -58,24 +58,24 @@ class ScriptedReposition:
         self._start, self._reached = None, False
 
     def __call__(self, observation: Observation) -> Action:
-        felt = felt_position(observation)
-        if felt is None:
+        position = estimated_position(observation)
+        if position is None:
             return Action({"upper": None})
         if self._start is None:
-            self._start = felt
-        left = self._goal - (felt - self._start)
+            self._start = position
+        left = self._goal - (position - self._start)
         self._reached = self._reached or float(np.linalg.norm(left)) <= REACHED
         if self._reached and not self._through:
             return Action({"upper": None})
-        way = self._goal if self._reached else left
-        longest = float(np.abs(way).max())
-        step = way * (self._rate / longest if self._reached or longest > self._rate else 1.0)
+        direction = self._goal if self._reached else left
+        longest = float(np.abs(direction).max())
+        step = direction * (self._rate / longest if self._reached or longest > self._rate else 1.0)
         now = observation.arms["upper"].pose
         return Action({"upper": Pose(now.position + np.append(step, 0.0), now.quaternion)})
 
 
-def felt_position(observation: Observation) -> FloatArray | None:
-    """(2,) where the body is, as the sensors feel it, world x and y [m]: midway between the centres of pressure on its
+def estimated_position(observation: Observation) -> FloatArray | None:
+    """(2,) position of the body, world x and y [m], estimated by touch: midway between the centres of pressure on its
     two faces. Friction tips the body, which moves the two centres apart but not their middle. None without contact."""
     centres = [centre_of_pressure(observation.arms[name]) for name in ("lower", "upper")]
     return None if centres[0] is None or centres[1] is None else 0.5 * (centres[0] + centres[1])[:2]

@@ -10,7 +10,7 @@ from tacsim.interface import Action, Needs, Observation, Policy, Pose, TactileOb
 from tacsim.models.rig import SqueezeConfig
 from tacsim.tasks.task import Axis
 
-REACHED = 0.01e-3  # the scripted policy holds when its estimate is this near the goal [m]
+REACHED = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class Squeeze:
 
 
 class ScriptedSqueeze:
-    """Closes both sensors alike at half of max_step until the height it feels is the goal, then holds.
+    """Closes both sensors alike at half of max_step until the estimated height of the body is the goal, then holds.
 
-    The last step is shortened to end at the goal. With `through` it then goes on at the full rate.
+    The last step is shortened to end at the goal. With `through` it then moves on at the full rate.
     """
 
     def __init__(self, config: SqueezeConfig, through: bool) -> None:
@@ -52,7 +52,7 @@ class ScriptedSqueeze:
         self._reached = False
 
     def __call__(self, observation: Observation) -> Action:
-        above = felt_height(observation) - self._goal
+        above = estimated_height(observation) - self._goal
         self._reached = self._reached or above <= REACHED
         if self._reached and not self._through:
             return Action({"lower": None, "upper": None})
@@ -64,8 +64,8 @@ class ScriptedSqueeze:
         )
 
 
-def felt_height(observation: Observation) -> float:
-    """Height of the body as the sensors feel it [m]: the gap between the gels' rest surfaces, and its depth in each."""
+def estimated_height(observation: Observation) -> float:
+    """Height of the body [m], estimated by touch: the gap between the gels' rest surfaces plus the depth in each."""
     gap = float(observation.arms["upper"].pose.position[2] - observation.arms["lower"].pose.position[2])
     return gap + indentation(observation.tactile["lower"]) + indentation(observation.tactile["upper"])
 

@@ -25,17 +25,17 @@ class Task(Protocol):
     def config(self) -> TaskConfig: ...
     @property
     def needs(self) -> Needs:
-        """What judging needs of a rig; a policy names its own needs."""
+        """What judging needs of a rig; the policy has needs of its own."""
         ...
 
     @property
     def axes(self) -> tuple[Axis, ...]: ...
     def distance(self, truth: Truth, start: Truth) -> float:
-        """How far the body is from the goal [m]; `start` is the truth just after reset."""
+        """Distance of the body from the goal [m]; `start` is the truth just after reset."""
         ...
 
     def scripted(self, *, through: bool = False) -> Policy:
-        """A policy that reaches the goal by touch alone, then holds; with `through` it goes on past the goal."""
+        """A policy that reaches the goal by touch alone, then holds; with `through` it moves on past the goal."""
         ...
 
 
@@ -45,7 +45,7 @@ class Outcome:
 
     distance: float  # [m]
     reward: float  # -distance / reward_scale
-    success: bool  # distance <= facts.success
+    success: bool  # distance <= config.success
     score: float  # 1 within success, 0.1 one reward_scale further out
 
 

@@ -570,7 +570,7 @@ def test_a_mock_rig_begins_in_gentle_touch_and_knows_the_truth(simulated: Opened
 def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
     reset = simulated.rig._reset
     config = reset._config  # type: ignore[attr-defined]
-    reset._config = config.model_copy(update={"approach_way": 0.1e-3})  # type: ignore[attr-defined]
+    reset._config = config.model_copy(update={"approach_distance": 0.1e-3})  # type: ignore[attr-defined]
     try:
         with pytest.raises(NoTouch, match=r"no touch after an approach of 0\.\d mm.*back at their start"):
             simulated.rig.reset()

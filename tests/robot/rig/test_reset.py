@@ -14,10 +14,10 @@ from robot.rig.reset import RETREAT, HardwareReset, NotConfirmed
 from tacsim import pose as se3
 from tacsim.control.approach import NoTouch
 from tacsim.interface import ArmState, Pose, SensorSpec, TactileFrame
-from tacsim.models.hardware import HardwareStart
+from tacsim.models.hardware import ResetConfig
 
 LOWER, UPPER = Pose(np.array([0.0, 0.0, -0.02])), Pose(np.array([0.0, 0.0, 0.03]), np.array([1.0, 0.0, 0.0, 0.0]))
-PARAMS = HardwareStart(approach_step=1e-3, approach_way=10e-3, approach_speed=20e-3)
+PARAMS = ResetConfig(approach_step=1e-3, approach_distance=10e-3, approach_speed=20e-3)
 
 
 class StubArm:
@@ -174,7 +174,7 @@ def test_no_touch_goes_back_to_the_start() -> None:
     assert scene.lower.pose.position == pytest.approx(LOWER.position)
     assert scene.upper.pose.position == pytest.approx(UPPER.position)
     farthest = max(pose.position[2] for name, pose in scene.motions() if name == "lower")
-    assert 8e-3 < farthest - LOWER.position[2] <= PARAMS.approach_way + 1e-9  # never beyond
+    assert 8e-3 < farthest - LOWER.position[2] <= PARAMS.approach_distance + 1e-9  # never beyond
 
 
 def test_an_arm_that_is_stopped_ends_it() -> None:

@@ -75,7 +75,7 @@ def test_every_shipped_material_loads_and_names_its_source(name: str) -> None:
     assert "guess" in source.lower()
 
 
-def test_facts_of_the_shipped_files() -> None:
+def test_values_of_the_shipped_files() -> None:
     clay = load(BodyMaterial, "modelling-clay")
     assert (clay.youngs_modulus, clay.poisson_ratio, clay.yield_stress) == (0.5e6, 0.45, 30e3)
     assert clay.elastic_limit == pytest.approx(0.071, abs=5e-4)
@@ -341,6 +341,13 @@ def test_the_loader_is_a_safe_one() -> None:
     assert issubclass(_Loader, yaml.SafeLoader)
     with pytest.raises(KeyError):
         names("robot")
+
+
+def test_a_key_of_version_0_1_0_is_read_under_its_present_name(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: ur5e\nstart: {approach_way: 7 mm}\n")
+    assert load_rig(path).config.start.approach_distance == 7e-3
+    assert load_rig("mock", overrides=["start.approach_way=3 mm"]).config.start.approach_distance == 3e-3
 
 
 def test_overrides_do_not_loosen_the_limits_of_a_real_arm() -> None:

@@ -69,7 +69,7 @@ def test_arms_are_told_before_anything_is_raised() -> None:
 
 
 def test_a_limit_that_no_sensor_can_tell_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"arms\.upper\.limits\.depth: sensor 'upper' cannot tell it"):
+    with pytest.raises(ValueError, match=r"arms\.upper\.limits\.depth: sensor 'upper' does not measure it"):
         GelMonitor(sensors(height=False), {"upper": limits(depth=1e-3)}, {})
     with pytest.raises(ValueError, match=r"arms\.lower\.limits\.shear"):
         GelMonitor(sensors(flow=False), {"lower": limits(shear=1e-3)}, {})

@@ -173,7 +173,7 @@ def test_what_is_no_episode_says_so(tmp_path: Path, meta: EpisodeMeta) -> None:
     for content, message in (
         (b"", "magic"),
         (b"hello world, this is text", "magic"),
-        (MCAP0_MAGIC, "facts are missing"),
+        (MCAP0_MAGIC, "metadata are missing"),
     ):
         (tmp_path / "x.mcap").write_bytes(content)
         with pytest.raises(EpisodeError, match=message):

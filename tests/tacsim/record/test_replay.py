@@ -281,7 +281,7 @@ def test_a_table_without_opening(tmp_path: Path) -> None:
         (b"frame,force,width\n0,1,2\n", "no column 'force_N'; it has: frame, force, width"),
         (b"force_N,gripper_width_m\n", "a header without rows"),
         (b"", r"no column 'force_N'; it has: \(nothing\)"),
-        (b"force_N,gripper_width_m\n1,2\nx,2\n", r":3: column 'force_N': 'x' is no finite number"),
+        (b"force_N,gripper_width_m\n1,2\nx,2\n", r":3: column 'force_N': 'x' is not a finite number"),
         (b"force_N,gripper_width_m\n1,nan\n", r":2: column 'gripper_width_m': 'nan'"),
         (b"force_N,gripper_width_m\n1\n", r":2: column 'gripper_width_m': ''"),
         (b"frame,force_N,gripper_width_m\n0,1,2\n2,1,2\n", r":3: frame 2 in row 1"),

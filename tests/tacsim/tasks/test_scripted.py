@@ -13,8 +13,8 @@ from tacsim.interface import Action, Observation
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.tasks import make_task
 from tacsim.tasks.grip import Grip
-from tacsim.tasks.reposition import centre_of_pressure, felt_position
-from tacsim.tasks.squeeze import felt_height
+from tacsim.tasks.reposition import centre_of_pressure, estimated_position
+from tacsim.tasks.squeeze import estimated_height
 
 SQUEEZE = SqueezeConfig(kind="squeeze", goal=9.7e-3, max_step=0.2e-3)
 REPOSITION = RepositionConfig(kind="reposition", goal=(2e-3, -1e-3), max_step=0.2e-3)
@@ -44,7 +44,7 @@ def test_squeeze_closes_alike_and_no_faster_than_half_of_max_step(open_springs: 
 
 def test_squeeze_shares_the_last_step_between_both_sensors(open_springs: Any) -> None:
     observation = open_springs().reset()
-    config = SqueezeConfig(kind="squeeze", goal=felt_height(observation) - 0.06e-3, max_step=0.2e-3)
+    config = SqueezeConfig(kind="squeeze", goal=estimated_height(observation) - 0.06e-3, max_step=0.2e-3)
     action = make_task(config).scripted()(observation)
     for name, way in (("lower", 0.03e-3), ("upper", -0.03e-3)):
         target = action.tool[name]
@@ -66,14 +66,14 @@ def test_through_passes_the_goal_at_the_goal(open_springs: Any) -> None:
     assert np.diff(lower) == pytest.approx(0.1e-3)
 
 
-def test_felt_height_is_the_true_height(open_springs: Any) -> None:
+def test_estimated_height_is_the_true_height(open_springs: Any) -> None:
     rig = open_springs()
     observation = rig.reset()
     for _ in range(3):
         down = observation.arms["upper"].pose
         target = type(down)(down.position - [0, 0, 1e-4], down.quaternion)
         observation, _ = rig.step(Action({"upper": target}))
-        assert felt_height(observation) == pytest.approx(rig.truth().height, abs=2e-6)
+        assert estimated_height(observation) == pytest.approx(rig.truth().height, abs=2e-6)
 
 
 def test_reposition_reaches_the_goal_although_the_body_lags(open_springs: Any) -> None:
@@ -103,7 +103,7 @@ def test_reposition_feels_the_body_and_nothing_without_contact(open_springs: Any
     observation = rig.reset()
     up = observation.arms["upper"].pose
     observation, _ = rig.step(Action({"upper": type(up)(up.position + [1e-3, -0.5e-3, 0], up.quaternion)}))
-    assert felt_position(observation) == pytest.approx(rig.truth().position[:2], abs=1e-9)
+    assert estimated_position(observation) == pytest.approx(rig.truth().position[:2], abs=1e-9)
     free = replace(observation.arms["upper"], wrench=np.array([0.1, 0.0, -0.005, 1.0, 1.0, 1.0]))
     assert centre_of_pressure(free) is None
     task = make_task(REPOSITION)

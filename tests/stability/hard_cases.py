@@ -35,7 +35,8 @@ from tacsim.models.scene import (
     Settling,
     Sphere,
 )
-from tacsim.physics.failure import diagnosis, health
+from tacsim.physics import snapshot
+from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.retry import RETRIES
 from tacsim.physics.move import MoveStats
@@ -282,7 +283,7 @@ def escape(world: World) -> Iterator[Targets]:
 
 
 def poisoned(name: str, times: int) -> Callable[..., Any]:
-    """The function `name` of health, which worlds call with their arrays before a launch, puts a NaN into a velocity.
+    """The function `name` of snapshot, which worlds call with their arrays before a launch, puts a NaN into a velocity.
 
     Before the 3rd launch, and before the ones after it: `times` in all.
     """
@@ -295,7 +296,7 @@ def poisoned(name: str, times: int) -> Callable[..., Any]:
             velocity = arrays.get("velocity", arrays.get("gel_velocity"))
             assert velocity is not None
             velocity[(0,) * velocity.ndim] = math.nan
-        return getattr(health, name)(arrays, *others)
+        return getattr(snapshot, name)(arrays, *others)
 
     return spoilt
 
@@ -398,7 +399,7 @@ def run(name: str, physics: str) -> Outcome:
     with ExitStack() as stack:
         for target, value in case.patch.items():
             module, _, attribute = target.partition(".")
-            if attribute in ("attempt", "copies"):
+            if attribute == "copies":
                 value = poisoned(attribute, value)
             stack.enter_context(mock.patch.object(modules[module], attribute, value))
         try:

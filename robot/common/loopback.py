@@ -18,7 +18,7 @@ def require_loopback(host: str, what: str, *, allow_network: bool) -> None:
     """Raises ValueError for an address that other machines reach, unless the network is allowed."""
     if not (allow_network or is_loopback(host)):
         raise ValueError(
-            f"{what}: '{host}' is not a loopback address, so the whole network could take the mock for a real device; "
+            f"{what}: {host} is not a loopback address, so the whole network could take the mock for a real device; "
             "use 127.x.y.z, or ask for it with --allow-network (allow_network=True)"
         )
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 CATCH_UP = 5  # control periods that may be made up for in a row; more are left out and counted
 
 
-def serve(all_facts: Sequence[ControllerConfig], fault_port: int, *, with_parent: bool) -> None:
+def serve(configs: Sequence[ControllerConfig], fault_port: int, *, with_parent: bool) -> None:
     """Runs controllers until the input ends (`with_parent`) or SIGTERM or SIGINT comes. Raises OSError for ports."""
     ended: list[str] = []
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -40,12 +40,12 @@ def serve(all_facts: Sequence[ControllerConfig], fault_port: int, *, with_parent
         controllers: list[Controller] = []
         fault_servers: list[FaultServer] = []
         try:
-            for config in all_facts:
+            for config in configs:
                 controllers.append(Controller(config, selector))
                 fault_servers.append(FaultServer(controllers[-1], selector, fault_port))
             if with_parent:
                 _watch_input(selector, lambda: ended.append("input"))
-            write_message(sys.stdout.buffer, {"ready": [config.host for config in all_facts]})
+            write_message(sys.stdout.buffer, {"ready": [config.host for config in configs]})
             _loop(selector, controllers, fault_servers, ended, os.getppid() if with_parent else None)
         finally:
             for server in fault_servers:

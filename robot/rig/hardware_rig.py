@@ -134,7 +134,7 @@ def _sensor(name: str, config: object, cell: MockCell) -> TactileSource:
 
 
 def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
-    starts = dict(cell.start)
+    starts = dict(cell.start_poses)
     for name, arm in config.arms.items():
         assert isinstance(arm, UrArmConfig)
         if arm.start is not None:

@@ -1,4 +1,4 @@
-"""A whole mock cell: controllers, cameras, and the simulated gels and body that they hold and look at.
+"""A whole mock cell: controllers, cameras, and the simulated gels and body that the arms hold and the cameras see.
 
 Poses of the mock arms go to the simulator, contact forces come back into the arms and tactile pictures into the
 cameras. Where nothing is simulated (a rig without scene), the controllers stand alone.
@@ -30,7 +30,7 @@ from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.models.sensor import SensorModel
 
 POSTURE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: elbow up [rad]
-FREE_RUN = 5e-3  # shortest time between two looks at the arms while running free [s]
+FREE_RUN = 5e-3  # shortest time between two steps while running free [s]
 
 
 class MockCell:
@@ -39,90 +39,90 @@ class MockCell:
     Attributes:
         faults: fault client of each controller, by arm.
         cameras: by sensor.
-        start: world_from_sensor of each mock arm where an episode begins.
+        start_poses: world_from_sensor of each mock arm where an episode begins.
     """
 
     def __init__(self, config: RigConfig) -> None:
         """Raises DeviceError (MockError, SimServerError) when a mock cannot be started."""
-        self._facts = config
+        self._config = config
+        self._arms = {
+            name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
+        }
+        self._frames = {name: ArmFrames.of(arm) for name, arm in self._arms.items()}
+        self._carried: dict[str, str] = {}  # by arm: the sensor on it
+        for name, sensor in config.sensors.items():
+            if sensor.arm in self._arms:
+                self._carried.setdefault(sensor.arm, name)
         self.faults: dict[str, FaultClient] = {}
-        self._controllers: MockArms | None = None
         self.cameras: dict[str, MockCamera] = {}
-        self.start: dict[str, Pose] = {}
         self._sim_server: SimServer | None = None
         self._scene_frame: SceneFrame | None = None
         self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
-        self._lock = threading.Lock()  # of the twin
+        self._lock = threading.Lock()  # of what follows from a step
         self._stop = threading.Event()
-        self._free: threading.Thread | None = None
-        self._failure: Exception | None = None
-        self._looks = 0  # while running free
-        self._mocked = {
-            name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
-        }
-        self._frames = {name: ArmFrames.of(arm) for name, arm in self._mocked.items()}
+        self._follower: threading.Thread | None = None  # while running free
+        self._failure: Exception | None = None  # of that thread
+        self._steps = 0  # of that thread
         with ExitStack() as stack:
-            stack.callback(self.close)
             models = self._models()
             if config.scene is not None and models:
-                self._sim_server = SimServer(config.scene, models, config.canonical, config.contact)
+                self._sim_server = stack.enter_context(
+                    SimServer(config.scene, models, config.canonical, config.contact)
+                )
             for name, sensor in config.sensors.items():
                 if isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-                    self.cameras[name] = _camera(name, sensor)
-            self.start = {name: self._start_of(name, arm) for name, arm in self._mocked.items()}
-            if self._mocked:
-                self._controllers = MockArms(
-                    [arm.host for arm in self._mocked.values()],
-                    model=[arm.model for arm in self._mocked.values()],
-                    joints=[self._joints(name, arm) for name, arm in self._mocked.items()],
-                    realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._mocked.values()),
+                    self.cameras[name] = stack.enter_context(_camera(name, sensor))
+            self.start_poses = {name: self._start_pose(name, arm) for name, arm in self._arms.items()}
+            if self._arms:
+                controllers = MockArms(
+                    [arm.host for arm in self._arms.values()],
+                    model=[arm.model for arm in self._arms.values()],
+                    joints=[self._joints(name, arm) for name, arm in self._arms.items()],
+                    realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._arms.values()),
                 )
-                self.faults = dict(zip(self._mocked, self._controllers.fault_clients, strict=True))
-            stack.pop_all()
+                self._controllers = stack.enter_context(controllers)
+                self.faults = dict(zip(self._arms, controllers.fault_clients, strict=True))
+            self._mocks = stack.pop_all()
 
     def _models(self) -> dict[str, SensorModel]:
-        """Of the sensors that are simulated: in front of a mock camera, or looked at without one."""
+        """Of the sensors that are simulated: before a mock camera, or read without one."""
         found: dict[str, SensorModel] = {}
-        for name, sensor in self._facts.sensors.items():
+        for name, sensor in self._config.sensors.items():
             if isinstance(sensor, SimSensorConfig):
                 found[name] = sensor.model
             elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-                assert sensor.model is not None  # a mock camera without one is refused with the file
+                assert sensor.model is not None  # the loader refuses a mock camera without one
                 found[name] = sensor.model
         return found
 
-    def _carried(self, arm: str) -> str | None:
-        """The sensor that an arm carries."""
-        return next((name for name, sensor in self._facts.sensors.items() if sensor.arm == arm), None)
-
-    def _start_of(self, name: str, arm: UrArmConfig) -> Pose:
-        """Where the rig file says; else where the scene has that sensor at its beginning."""
+    def _start_pose(self, name: str, arm: UrArmConfig) -> Pose:
+        """By the rig file; else where the scene has the arm's sensor at its beginning."""
         if arm.start is not None:
             return arm.start.pose
-        sensor = self._carried(name)
-        if self._sim_server is None or sensor is None or sensor not in self._sim_server.initial:
+        initial = {} if self._sim_server is None else self._sim_server.initial
+        if self._carried.get(name) not in initial:
             raise DeviceError(
                 f"arms.{name}.start: where does an episode begin? No scene says it; give the sensor's pose"
             )
-        return self._sim_server.initial[sensor]
+        return initial[self._carried[name]]
 
     def _joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
-        """Joints at power-on: those of the rig file, else such that the sensor is at its start: of all postures the one
+        """Joints at power-on [rad]: by the rig file, else such that the sensor is at its start; of all postures the one
         farthest from a singularity."""
         if arm.mock is not None and arm.mock.joints is not None:
             return arm.mock.joints
         kinematics = Kinematics(arm.model)
-        flange = self._frames[name].flange(se3.to_matrix(self.start[name]))
-        postures = kinematics.solutions(flange, np.array(POSTURE))
+        start = self.start_poses[name]
+        postures = kinematics.solutions(self._frames[name].flange(se3.to_matrix(start)), np.array(POSTURE))
         if not postures:
             raise DeviceError(
-                f"arms.{name}: its start {np.round(self.start[name].position, 4).tolist()} m is out of reach of a "
+                f"arms.{name}: its start {np.round(start.position, 4).tolist()} m is out of reach of a "
                 f"{arm.model} whose base stands at {list(arm.world_from_base.position)} m"
             )
         chosen: list[float] = max(postures, key=lambda q: round(kinematics.singularity(q), 6)).tolist()
         return chosen
 
-    # -------------------------------------------------------------- the cell
+    # -------------------------------------------------------------- the scene
 
     @property
     def simulated(self) -> bool:
@@ -131,63 +131,14 @@ class MockCell:
     @property
     def knows_truth(self) -> bool:
         """True if there is a simulated body."""
-        scene = self._facts.scene
-        simulated = self._sim_server is not None and self._facts.contact == "simulated"
-        return simulated and scene is not None and scene.body is not None
+        scene = self._config.scene
+        return self.simulated and self._config.contact == "simulated" and scene is not None and scene.body is not None
 
     @property
     def scene_frame(self) -> SceneFrame | None:
-        """What the cell looked like last; None before the first look. Raises DeviceError if it follows no more."""
+        """The scene after the last step; None before the first. Raises DeviceError if no more steps follow."""
         self.check()
         return self._scene_frame
-
-    def poses(self) -> dict[str, Pose]:
-        """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
-        found = {}
-        for name, faults in self.faults.items():
-            sensor = self._carried(name)
-            if sensor is not None:
-                tool = matrix(np.array(faults.state().pose))
-                frames = self._frames[name]
-                found[sensor] = pose_of(frames.world_from_base @ tool @ frames.tool_from_sensor)
-        return found
-
-    def place(self) -> None:
-        """A person's part: puts a fresh body between the sensors."""
-        if self._sim_server is not None:
-            with self._lock:
-                self._show(self._sim_server.place(self.poses()))
-
-    def step(self, pause: float = 0.0) -> Mapping[str, int]:
-        """Follows the arms once: forces into the controllers and, after a `pause` [s], pictures into the cameras.
-
-        Returns the number of each camera's newest picture. Raises SimServerError.
-        """
-        if self._sim_server is None:
-            return {}
-        with self._lock:
-            return self._show(self._sim_server.move(self.poses()), pause)
-
-    def _show(self, scene_frame: SceneFrame, pause: float = 0.0) -> Mapping[str, int]:
-        self._scene_frame = scene_frame
-        for name, faults in self.faults.items():
-            sensor = self._carried(name)
-            if sensor is not None and sensor in scene_frame.wrenches:
-                faults.wrench(self._at_tool(name, scene_frame.wrenches[sensor]).tolist())
-        time.sleep(pause)
-        for name, camera in self.cameras.items():  # which go on showing their last picture
-            picture = scene_frame.images[name]
-            if name not in self._pushed or not np.array_equal(self._pushed[name][0], picture):
-                self._pushed[name] = picture, camera.push(picture)
-        return {name: number for name, (_, number) in self._pushed.items()}
-
-    def _at_tool(self, name: str, wrench: FloatArray) -> FloatArray:
-        """A wrench (6,) about the sensor, in its axes, as the controller has it: about the TCP, in the base's axes."""
-        frames = self._frames[name]
-        tool = se3.from_matrix(frames.tool_from_sensor)
-        at_tool = se3.transform_wrench(tool, wrench)
-        turn = matrix(np.array(self.faults[name].state().pose))[:3, :3]
-        return np.concatenate([turn @ at_tool[:3], turn @ at_tool[3:]])
 
     def truth(self) -> Truth | None:
         return None if self._scene_frame is None else self._scene_frame.truth
@@ -198,22 +149,65 @@ class MockCell:
             return {}
         return {**self._scene_frame.stats, "twin_seconds": self._scene_frame.seconds}
 
+    def poses(self) -> dict[str, Pose]:
+        """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
+        found = {}
+        for arm, sensor in self._carried.items():
+            frames, tool = self._frames[arm], matrix(np.array(self.faults[arm].state().pose))
+            found[sensor] = pose_of(frames.world_from_base @ tool @ frames.tool_from_sensor)
+        return found
+
+    def place(self) -> None:
+        """A person's part: puts a fresh body between the sensors. Raises SimServerError."""
+        if self._sim_server is not None:
+            with self._lock:
+                self._distribute(self._sim_server.place(self.poses()))
+
+    def step(self, pause: float = 0.0) -> Mapping[str, int]:
+        """Moves the simulated sensors to where the arms are: forces go into the controllers and, after a `pause` [s],
+        pictures into the cameras.
+
+        Returns the number of each camera's newest picture. Raises SimServerError.
+        """
+        if self._sim_server is None:
+            return {}
+        with self._lock:
+            return self._distribute(self._sim_server.move(self.poses()), pause)
+
+    def _distribute(self, scene_frame: SceneFrame, pause: float = 0.0) -> Mapping[str, int]:
+        self._scene_frame = scene_frame
+        for arm, sensor in self._carried.items():
+            if sensor in scene_frame.wrenches:
+                self.faults[arm].wrench(self._at_tool(arm, scene_frame.wrenches[sensor]).tolist())
+        time.sleep(pause)
+        for name, camera in self.cameras.items():  # which go on showing their last picture
+            picture = scene_frame.images[name]
+            if name not in self._pushed or not np.array_equal(self._pushed[name][0], picture):
+                self._pushed[name] = picture, camera.push(picture)
+        return {name: number for name, (_, number) in self._pushed.items()}
+
+    def _at_tool(self, arm: str, wrench: FloatArray) -> FloatArray:
+        """A wrench (6,) about the sensor, in its axes, as the controller has it: about the TCP, in the base's axes."""
+        at_tool = se3.transform_wrench(se3.from_matrix(self._frames[arm].tool_from_sensor), wrench)
+        turn = matrix(np.array(self.faults[arm].state().pose))[:3, :3]
+        return np.concatenate([turn @ at_tool[:3], turn @ at_tool[3:]])
+
     # ---------------------------------------------------------- running free
 
     def run_free(self) -> None:
-        """From now on follows the arms as fast as it can, in a thread."""
-        if self._sim_server is not None and self._free is None:
-            self._free = threading.Thread(target=self._follow, name="mock cell", daemon=True)
-            self._free.start()
+        """From now on steps as fast as it can, in a thread."""
+        if self._sim_server is not None and self._follower is None:
+            self._follower = threading.Thread(target=self._follow, name="mock cell", daemon=True)
+            self._follower.start()
 
     def catch_up(self) -> None:
-        """While running free: waits until the cell has looked at the arms anew, from now on. An approach that did not
-        wait would go on while the simulator is still busy with the first touch.
+        """While running free: waits for a whole step that begins from now on. An approach that did not wait would go on
+        while the simulator is still busy with the first touch.
 
-        Raises DeviceError if it follows no more.
+        Raises DeviceError if no more steps follow.
         """
-        wanted = self._looks + 2  # the look under way may have begun before
-        while self._looks < wanted:
+        wanted = self._steps + 2  # the step under way may have begun before
+        while self._steps < wanted:
             self.check()
             time.sleep(FREE_RUN)
 
@@ -226,23 +220,17 @@ class MockCell:
         try:
             while not self._stop.wait(FREE_RUN):
                 self.step()
-                self._looks += 1
+                self._steps += 1
         except Exception as failure:
             if not self._stop.is_set():
                 self._failure = failure
 
     def close(self) -> None:
-        """Ends all mocks; again does nothing."""
+        """Ends all mocks; a second call does nothing."""
         self._stop.set()
-        if self._free is not None:
-            self._free.join(5.0)
-        with ExitStack() as stack:  # each is closed even when another fails
-            for camera in self.cameras.values():
-                stack.callback(camera.close)
-            if self._controllers is not None:
-                stack.callback(self._controllers.close)
-            if self._sim_server is not None:
-                stack.callback(self._sim_server.close)
+        if self._follower is not None:
+            self._follower.join(5.0)
+        self._mocks.close()  # each is closed even when another fails
 
     def __enter__(self) -> Self:
         return self

@@ -164,18 +164,18 @@ def test_a_look_waits_for_the_simulator_first() -> None:
     assert seen == ["caught up"]
 
 
-def test_catching_up_needs_a_look_that_began_afterwards_and_tells_of_a_failure() -> None:
+def test_catching_up_needs_a_step_that_began_afterwards_and_tells_of_a_failure() -> None:
     cell = object.__new__(MockCell)
-    cell._looks, cell._failure = 5, None
+    cell._steps, cell._failure = 5, None
 
-    def look() -> None:
-        cell._looks += 1
+    def step() -> None:
+        cell._steps += 1
 
-    timers = [threading.Timer(0.05 * k, look) for k in (1, 2)]
+    timers = [threading.Timer(0.05 * k, step) for k in (1, 2)]
     for timer in timers:
         timer.start()
     cell.catch_up()
-    assert cell._looks == 7
+    assert cell._steps == 7
     cell._failure = RuntimeError("no more")
     with pytest.raises(DeviceError, match="no more"):
         cell.catch_up()

@@ -576,7 +576,7 @@ def test_no_touch_on_all_the_way_ends_at_the_start(simulated: Opened) -> None:
             simulated.rig.reset()
     finally:
         reset._config = config  # type: ignore[attr-defined]
-    for name, pose in simulated.cell.start.items():
+    for name, pose in simulated.cell.start_poses.items():
         assert simulated.rig.arms[name].state().pose.position == pytest.approx(pose.position, abs=50e-6)
 
 

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from robot.open import check_sensors as check_sensors
     from robot.open import make_env as make_env
     from robot.open import open_rig as open_rig
-    from robot.studies.press import Press as Press
-    from robot.studies.press import Pressed as Pressed
+    from robot.studies.press import PressMotion as PressMotion
+    from robot.studies.press import PressResult as PressResult
     from robot.studies.press import press as press
 else:
     from tacsim.lazy import public_names

@@ -162,10 +162,10 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
         raise BadFrames("a scene is seen through the light of B: give B's calibration (--calibration-b)")
     scene = load_scene(name, ["preset=standard", *overrides])
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
-    from robot.studies.matched_press import press_like
+    from robot.studies.matched_press import match_presses
 
     with counted("pressing") as on_press:
-        made, warnings = press_like(truth, scene, read_sensor_model(bundle), CanonicalGrid(), on_press)
+        made, warnings = match_presses(truth, scene, read_sensor_model(bundle), CanonicalGrid(), on_press)
     for words in warnings:
         warn(words)
     return made

@@ -79,10 +79,10 @@ def press(
         from robot.studies import press as presses
         from tacsim.physics.failure.dump import dumps_in
 
-        motion = presses.Press(depth, slide, twist)
+        motion = presses.PressMotion(depth, slide, twist)
         with dumps_in(folder / "diverged"):
             pressed = presses.press(scene, sensor, motion)
-    config = presses.facts_of(scene, motion, pressed, sensor)
+    config = presses.press_report(scene, motion, pressed, sensor)
     with writing(make(folder)):
         presses.write(folder, pressed, config)
     results.print(f"force            {config['force']:.4f} N")
@@ -147,7 +147,7 @@ def reproduce(
         rows = {trial: bar.add_task(", ".join(trial), total=None) for trial in wanted}
         try:
             found = experiment.run_trials(wanted, lambda *trial: bar.advance(rows[trial]), interrupt)
-        except experiment.Stopped:
+        except experiment.TrialsStopped:
             complain("stopped by a signal; nothing is written")
             raise typer.Exit(interrupt.exit_code) from None
     trials = {task: {scheme: found[task, scheme] for scheme in schemes} for task in experiment.EXPERIMENTS}

@@ -1,4 +1,4 @@
-"""The seed paper's experiment anew: both tasks driven through their goal and beyond, by its scheme and by ours."""
+"""The seed paper's experiment repeated: both tasks driven through their goal and beyond, by its scheme and by ours."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from tacsim.report.figure4 import Moment, Trial
 from tacsim.rig import Rig
 from tacsim.tasks import Task, judge, make_task
 
-FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
-PEAK = 0.7  # share of a curve that lies before its peak: a trial goes on beyond the goal until this is so
-FINE = 0.25  # share of a step that is taken near the goal, so that the peak is not stepped over
-SEEN = 1.0  # mean difference from the image without contact that contact must make [grey levels]
+MIN_FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
+PEAK_AT = 0.7  # a trial goes on beyond the goal until its peak lies at this share of its curve
+FINE_STEP = 0.25  # share of a step that is taken near the goal, so that the peak is not stepped over
+MIN_IMAGE_CHANGE = 1.0  # mean difference from the image without contact that contact must make [grey levels]
 WHOLE_GEL = ("canonical.rows=80", "canonical.columns=80")  # heights from edge to edge of the gel, for the cut
 # The seed's scheme creeps: in reposition it takes some 1600 substeps after each motion until it counts as settled, ours
 # some 100. It gets a fixed time instead, faster than it settles; its body lags behind, the shape of its curve stays.
-SETTLING = {"seed": ("scene.settling.mach=0.15", "scene.settling.max_substeps=60"), "hybrid": ()}
+SETTLING_OVERRIDES = {"seed": ("scene.settling.mach=0.15", "scene.settling.max_substeps=60"), "hybrid": ()}
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
     """One task of the seed paper."""
 
-    best: float  # the closest distance to the goal must be at most this [m]
+    tolerance: float  # the closest distance to the goal must be at most this [m]
     overrides: tuple[str, ...]  # of the task
     steps: int = 60  # a trial that has not gone through the goal after so many control steps has failed
 
@@ -50,7 +50,7 @@ class TrialFailed(RuntimeError):
     """A trial could not be run to its end."""
 
 
-class Stopped(RuntimeError):
+class TrialsStopped(RuntimeError):
     """The trials were ended from outside."""
 
 
@@ -73,7 +73,7 @@ def run_trials(
             if stop():
                 for worker in multiprocessing.active_children():
                     worker.terminate()
-                raise Stopped("stopped before all trials were over")
+                raise TrialsStopped("stopped before all trials were done")
             try:
                 on_step(*steps.get(timeout=0.1))
             except queue.Empty:
@@ -81,7 +81,7 @@ def run_trials(
         return {trial: _result(trial, future) for trial, future in running.items()}
 
 
-_steps: multiprocessing.Queue[tuple[str, str]] | None = None  # of a worker: to the process that started it
+_steps: multiprocessing.Queue[tuple[str, str]] | None = None  # in a worker: to the process that started it
 
 
 def _start_worker(steps: multiprocessing.Queue[tuple[str, str]]) -> None:
@@ -91,7 +91,7 @@ def _start_worker(steps: multiprocessing.Queue[tuple[str, str]]) -> None:
 
 
 def _work(task: str, physics: str) -> Trial | str:
-    """The trial; what went wrong as text, for not every exception can be sent to another process."""
+    """The trial, or its error as text: not every exception can be sent to another process."""
     try:
         return run_trial(task, physics, lambda: _steps.put((task, physics)) if _steps is not None else None)
     except Exception as error:
@@ -115,7 +115,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
     from robot.open import open_rig
 
     planned = EXPERIMENTS[task]
-    overrides = [f"scene.physics={physics}", *SETTLING[physics], *planned.overrides, *WHOLE_GEL]
+    overrides = [f"scene.physics={physics}", *SETTLING_OVERRIDES[physics], *planned.overrides, *WHOLE_GEL]
     config = load_rig("sim", task=task, overrides=overrides).config
     if config.task is None:
         raise ValueError(f"rig 'sim' with task '{task}' has no task")
@@ -135,35 +135,35 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
             differences.append(image_difference(rig.frames, rig.references))
             moments.append(_moment(step, rig.frames, observation, truth))
             on_step()
-            if _is_over(distances, planned.best) or step == planned.steps:
+            if _is_beyond_goal(distances, planned.tolerance) or step == planned.steps:
                 break
-            share = FINE if _is_near(distances, planned.best) else 1.0
+            share = FINE_STEP if _is_near_goal(distances, planned.tolerance) else 1.0
             longest = share * config.task.max_step / 2  # half of max_step is the policy's own rate
-            observation, _ = rig.step(_shortened(policy(observation), observation, longest))
+            observation, _ = rig.step(_limited(policy(observation), observation, longest))
     return _trial(config, goal, distances, differences, moments)
 
 
-def _is_over(distances: list[float], best: float) -> bool:
-    """True when the goal lies behind: its peak at the share wanted, and the fall after it well beyond what must be."""
+def _is_beyond_goal(distances: list[float], tolerance: float) -> bool:
+    """True when the peak lies early enough in the curve, and the curve has fallen far enough after it."""
     peak, last = int(np.argmin(distances)), len(distances) - 1
-    return peak <= PEAK * last and distances[-1] - distances[peak] > 1.2 * FALL * best
+    return peak <= PEAK_AT * last and distances[-1] - distances[peak] > 1.2 * MIN_FALL * tolerance
 
 
-def _is_near(distances: list[float], best: float) -> bool:
-    """True before the goal where another whole step might jump over it."""
+def _is_near_goal(distances: list[float], tolerance: float) -> bool:
+    """True where another whole step might pass the goal."""
     longest = float(np.abs(np.diff(distances)).max(initial=0.0))
-    return min(distances) > best / 2 and distances[-1] < 1.2 * longest
+    return min(distances) > tolerance / 2 and distances[-1] < 1.2 * longest
 
 
-def _shortened(action: Action, observation: Observation, longest: float) -> Action:
-    """The same motion, but no arm goes further than `longest` [m]. Orientations are those of the action."""
+def _limited(action: Action, observation: Observation, longest: float) -> Action:
+    """The same motion, in which no arm moves farther than `longest` [m]. Orientations are those of the action."""
     tool: dict[str, Pose | None] = {}
     for arm, target in action.tool.items():
         if target is not None:
             now = observation.arms[arm].pose.position
-            way = target.position - now
-            share = min(1.0, longest / max(float(np.abs(way).max()), 1e-12))
-            target = Pose(now + share * way, target.quaternion)
+            displacement = target.position - now
+            share = min(1.0, longest / max(float(np.abs(displacement).max()), 1e-12))
+            target = Pose(now + share * displacement, target.quaternion)
         tool[arm] = target
     return Action(tool)
 
@@ -192,7 +192,7 @@ def _trial(
 ) -> Trial:
     if config.scene is None:
         raise ValueError(f"rig '{config.name}' simulates nothing")
-    shown = telling(len(moments), int(np.argmin(distances)))
+    shown = key_steps(len(moments), int(np.argmin(distances)))
     return Trial(
         step=list(range(len(distances))),
         reward=[-distance / task.config.reward_scale for distance in distances],
@@ -206,8 +206,8 @@ def _trial(
     )
 
 
-def telling(count: int, peak: int) -> list[int]:
-    """Steps worth showing: first, half-way to the peak, peak, half-way to the end, last."""
+def key_steps(count: int, peak: int) -> list[int]:
+    """Steps that the figure shows: first, half-way to the peak, peak, half-way to the end, last."""
     return sorted({0, peak // 2, peak, (peak + count - 1) // 2, count - 1})
 
 
@@ -238,18 +238,18 @@ def as_json(results: Mapping[str, Mapping[str, Trial]]) -> dict[str, Any]:
 
 
 def shortcomings(task: str, trial: Trial) -> list[str]:
-    """Where a curve is not the seed's, in words: it must rise to a peak at the goal, then fall. Empty when it does."""
-    allowed = EXPERIMENTS[task].best
+    """What a curve lacks, in words: it must rise to a peak at the goal, then fall. Empty when it does."""
+    allowed = EXPERIMENTS[task].tolerance
     peak, distance = trial.peak, trial.distance
     found = []
     if not distance[peak] <= allowed:
         found.append(f"closest distance {distance[peak] * 1e3:.3f} mm, at most {allowed * 1e3:.2f} mm is wanted")
     for name, end in (("start", distance[0]), ("end", distance[-1])):
-        if not end - distance[peak] > FALL * allowed:
+        if not end - distance[peak] > MIN_FALL * allowed:
             found.append(
-                f"at the {name} the distance is {end * 1e3:.3f} mm, not more than {FALL:g} x {allowed * 1e3:.2f} mm "
-                "worse than at the peak"
+                f"at the {name} the distance is {end * 1e3:.3f} mm, not more than {MIN_FALL:g} x "
+                f"{allowed * 1e3:.2f} mm worse than at the peak"
             )
-    if not max(trial.image_difference) > SEEN:
+    if not max(trial.image_difference) > MIN_IMAGE_CHANGE:
         found.append(f"contact changes the images by at most {max(trial.image_difference):.2f} grey levels")
     return found

@@ -1,7 +1,7 @@
-"""The simulator presses what real frames show: the same ball, in the same places, until the contact is as wide.
+"""Simulated presses that match real frames: the same ball, in the same places, until the contact is as wide.
 
-So a whole simulation, mechanics and light, is compared with frames of which nothing else is known. The depth is chosen
-by the width of the contact: the comparison judges shape and colour of a press, not the force or depth it took.
+A whole simulation, mechanics and light, can so be compared with frames of which nothing else is known. The depth is
+chosen by the width of the contact: the comparison judges shape and colour of a press, not its force or depth.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from tacsim.physics.world import World, make_world
 
 Image = NDArray[np.uint8]
 
-NEAR = 0.25  # the contact is as wide as the real one when its radius differs by no more [px]
-TRIES = 4  # presses that look for the depth
-DEEPEST = 0.8  # of the gel's thickness
+RADIUS_TOLERANCE = 0.25  # the contact is as wide as the real one when its radius differs by no more [px]
+MAX_ATTEMPTS = 4  # presses that look for the depth
+MAX_DEPTH = 0.8  # of the gel's thickness
 
 
-def press_like(
+def match_presses(
     real: FrameSet,
     scene: Scene,
     sensor: SensorModel,
@@ -55,27 +55,27 @@ def press_like(
         )
     ball = scene.indenter.geometry.radius
     circles, notes = _circles(real, ball / sensor.geometry.pixel_pitch)
-    bench = _Bench(scene, ball, sensor, grid)
+    gel = _PressedGel(scene, ball, sensor, grid)
     done: dict[str, Frame] = {}
-    # from the widest contact down to none would peel; upwards the gel is only ever pressed farther
+    # in the order of the depths the gel is only ever pressed farther: it does not peel off the ball
     for name, circle in sorted(circles.items(), key=lambda item: item[1].radius):
         on_press(len(done), len(circles))
-        image, surface, said = bench.press(circle)
+        image, surface, warning = gel.press(circle)
         done[name] = Frame(name, image, surface)
-        notes += [f"{name}: {said}"] if said else []
-    still = bench.untouched
-    frames = tuple(done.get(shot.name, Frame(shot.name, *still)) for shot in real.frames)
-    return FrameSet(f"scene {scene.name}", still[0], "the untouched simulated gel", frames), notes
+        notes += [f"{name}: {warning}"] if warning else []
+    untouched = gel.untouched
+    frames = tuple(done.get(shot.name, Frame(shot.name, *untouched)) for shot in real.frames)
+    return FrameSet(f"scene {scene.name}", untouched[0], "the untouched simulated gel", frames), notes
 
 
-class _Bench:
+class _PressedGel:
     """One gel under a ball. It is pressed in the middle and its surface moved under the camera: what happens near the
     border of a gel is not told."""
 
     def __init__(self, scene: Scene, ball: float, sensor: SensorModel, grid: CanonicalGrid) -> None:
         self.ball, self._sensor, self._grid = ball, sensor, grid
         self._world: World = make_world(scene)
-        self._deepest = DEEPEST * scene.gel.size[2]
+        self._deepest = MAX_DEPTH * scene.gel.size[2]
         self._render = Renderer(sensor, scene.gel.size[:2])
         self.untouched = self._seen(0.0, 0.0)
 
@@ -85,21 +85,21 @@ class _Bench:
         u0, v0 = self._sensor.geometry.principal
         x, y = (circle.x - u0) * pitch, (circle.y - v0) * pitch
         depth = (circle.radius * pitch) ** 2 / self.ball  # Hertz
-        for _ in range(TRIES):
-            stats = self._deeper(min(depth, self._deepest))
+        for _ in range(MAX_ATTEMPTS):
+            stats = self._press_to(min(depth, self._deepest))
             image, surface = self._seen(x, y)
             try:
                 radius = contact_circle(image, self.untouched[0], self.ball / pitch).radius
             except NoCircle as error:
                 return image, surface, f"our own picture: {error}"
-            if abs(radius - circle.radius) <= NEAR:
+            if abs(radius - circle.radius) <= RADIUS_TOLERANCE:
                 return image, surface, "" if stats else "not settled; raise settling.max_substeps"
             if depth > self._deepest:
                 break
             depth *= (circle.radius / radius) ** 2
         return image, surface, f"the contact is {radius - circle.radius:+.1f} px wider than the real one"
 
-    def _deeper(self, depth: float) -> bool:
+    def _press_to(self, depth: float) -> bool:
         """Moves the ball to this depth [m]; True if the gel came to rest."""
         pose = self._world.pose("indenter")
         target = Pose(np.array([*pose.position[:2], self.ball - depth]), pose.quaternion)

@@ -26,16 +26,16 @@ from tacsim.physics.world import World, make_world
 
 # A surface point nearer to the indenter than this share of a gel element is in contact: the gel surface is a spline on
 # its elements, which follows the indenter no closer. Enlarges the radius of a ball's contact by about 4 %.
-TOUCHING = 0.01
-QUARTER = math.pi / 2  # a motion turns the shorter way round, so a twist is cut into pieces of at most this [rad]
-MOST_TWIST = math.radians(3600.0)
-MOST_SLIDE = 3.0  # widths of the gel: beyond, it is long out of touch
-BRIDGED = 0.2  # under a flat face the spline swings about it by as much; counts within a contact
+CONTACT_GAP = 0.01
+QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
+MAX_TWIST = math.radians(3600.0)
+MAX_SLIDE = 3.0  # widths of the gel: beyond, it has left the gel
+SPLINE_RIPPLE = 0.2  # share of an element by which the spline ripples under a flat face; counts within a contact
 
 
 @dataclass(frozen=True, slots=True)
-class Press:
-    """What is done with the indenter, from touching the undeformed gel on."""
+class PressMotion:
+    """How the indenter moves, once it touches the undeformed gel."""
 
     depth: float = 0.5e-3  # of its lowest point below the undeformed surface [m]
     slide: tuple[float, float] = (0.0, 0.0)  # then sideways, world x, y [m]
@@ -43,7 +43,7 @@ class Press:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pressed:
+class PressResult:
     """The gel under the indenter at the end."""
 
     image: NDArray[np.uint8]  # (H, W, 3) RGB
@@ -54,15 +54,15 @@ class Pressed:
     moves: tuple[MoveStats, ...]
 
 
-def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
+def press(scene: Scene, sensor: SensorModel, motion: PressMotion) -> PressResult:
     """Presses the scene's indenter, then slides and twists it.
 
-    Raises ValueError for a scene without indenter, a depth that is not within the gel, or a slide or twist beyond all
-    measure; SimulationDiverged.
+    Raises ValueError for a scene without indenter, a depth that is not within the gel, or a slide or twist beyond its
+    limit; SimulationDiverged.
     """
     if scene.indenter is None:
         raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")
-    _require_sensible(scene.gel, motion)
+    _require_reachable(scene.gel, motion)
     world = make_world(scene)
     targets = _targets(world.pose("indenter"), scene.indenter.geometry, motion)
     moves = tuple(world.move({"indenter": target}) for target in targets)
@@ -70,7 +70,7 @@ def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
     seen = sample_surface(surface, image_grid(sensor.geometry))
     contact = _contact(world, scene, seen, sensor)
     area = float(contact.sum()) * sensor.geometry.pixel_pitch**2
-    return Pressed(
+    return PressResult(
         image=Renderer(sensor, scene.gel.size[:2])(surface),
         height=seen.height,
         contact=contact,
@@ -80,24 +80,24 @@ def press(scene: Scene, sensor: SensorModel, motion: Press) -> Pressed:
     )
 
 
-def _require_sensible(gel: Gel, motion: Press) -> None:
-    thickness, farthest, way = gel.size[2], MOST_SLIDE * max(gel.size[:2]), math.hypot(*motion.slide)
+def _require_reachable(gel: Gel, motion: PressMotion) -> None:
+    thickness, farthest, slide = gel.size[2], MAX_SLIDE * max(gel.size[:2]), math.hypot(*motion.slide)
     if not 0 < motion.depth < thickness:
         raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
-    if not way <= farthest:
-        raise ValueError(f"slide is {way:.4g} m long; at most {MOST_SLIDE:g} widths of the gel, {farthest:.4g} m")
-    if not abs(motion.twist) <= MOST_TWIST:
-        most = math.degrees(MOST_TWIST)
+    if not slide <= farthest:
+        raise ValueError(f"slide is {slide:.4g} m long; at most {MAX_SLIDE:g} widths of the gel, {farthest:.4g} m")
+    if not abs(motion.twist) <= MAX_TWIST:
+        most = math.degrees(MAX_TWIST)
         raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
 
 
-def _targets(start: Pose, geometry: Shape, motion: Press) -> list[Pose]:
-    """Poses of the indenter, one after the other. Its frame's origin is the centre of its bounding box."""
+def _targets(start: Pose, geometry: Shape, motion: PressMotion) -> list[Pose]:
+    """Poses of the indenter, in order. The origin of its frame is the centre of its bounding box."""
     down = np.array([start.position[0], start.position[1], float(extent(geometry)[2]) / 2 - motion.depth])
     targets = [Pose(down, start.quaternion)]
     if any(motion.slide):
         targets.append(Pose(down + np.append(motion.slide, 0.0), start.quaternion))
-    pieces = math.ceil(abs(motion.twist) / QUARTER)
+    pieces = math.ceil(abs(motion.twist) / QUARTER_TURN)
     for piece in range(1, pieces + 1):
         turned = Rotation.from_rotvec([0.0, 0.0, motion.twist * piece / pieces]) * se3.rotation(start)
         targets.append(Pose(targets[-1].position, turned.as_quat()))
@@ -112,18 +112,18 @@ def _contact(world: World, scene: Scene, seen: SurfaceSample, sensor: SensorMode
     gel = np.concatenate([grid.points(), -seen.height[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
     sensor_pose, indenter = world.pose("lower"), world.pose("indenter")
     at = se3.transform(se3.relative(indenter, sensor_pose), gel)
-    near = (np.abs(at) <= extent(geometry) / 2 + BRIDGED * scene.element).all(axis=1) & seen.valid.ravel()
+    near = (np.abs(at) <= extent(geometry) / 2 + SPLINE_RIPPLE * scene.element).all(axis=1) & seen.valid.ravel()
     gaps = np.full(len(at), np.inf)
     if near.any():
         gaps[near] = distance(geometry, at[near])
     gap = gaps.reshape(seen.valid.shape)
     reach = max(1, round(scene.element / sensor.geometry.pixel_pitch))
-    joined = binary_closing(gap <= TOUCHING * scene.element, iterations=reach)
+    joined = binary_closing(gap <= CONTACT_GAP * scene.element, iterations=reach)
     enclosed: NDArray[np.bool_] = binary_fill_holes(joined)
-    return enclosed & (gap <= BRIDGED * scene.element)
+    return enclosed & (gap <= SPLINE_RIPPLE * scene.element)
 
 
-def facts_of(scene: Scene, motion: Press, pressed: Pressed, sensor: SensorModel) -> dict[str, Any]:
+def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor: SensorModel) -> dict[str, Any]:
     """The result as JSON, SI units. residual: None where nothing was held, so that none was measured."""
     residual = max(move.residual for move in pressed.moves)
     return {
@@ -145,7 +145,7 @@ def facts_of(scene: Scene, motion: Press, pressed: Pressed, sensor: SensorModel)
     }
 
 
-def write(folder: Path, pressed: Pressed, config: dict[str, Any]) -> None:
+def write(folder: Path, pressed: PressResult, config: dict[str, Any]) -> None:
     """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png and press.json. Raises OSError."""
     from matplotlib.image import imsave
 
@@ -155,7 +155,7 @@ def write(folder: Path, pressed: Pressed, config: dict[str, Any]) -> None:
     (folder / "press.json").write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _write_height_picture(path: Path, pressed: Pressed, pitch: float) -> None:
+def _write_height_picture(path: Path, pressed: PressResult, pitch: float) -> None:
     """Height map in false colours with a scale, contact outlined, as PNG. Raises OSError."""
     from tacsim.report.figure import canvas, plain, save
 

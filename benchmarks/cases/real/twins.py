@@ -108,7 +108,7 @@ def _fold(
     from calibration.errors import BadFrames
     from calibration.frame_set import Frame, FrameSet
     from calibration.light.calibrator import calibrate_light
-    from robot.studies.matched_press import press_like
+    from robot.studies.matched_press import match_presses
 
     try:
         fit = calibrate_light(reference, train, of.ball_radius / of.pixel_pitch)
@@ -126,7 +126,7 @@ def _fold(
     wall, cpu = perf_counter(), process_time()
     with TemporaryDirectory() as place:
         write_bundle(Path(place), calibration, reference)
-        ours, said = press_like(real, scene, read_sensor_model(Path(place)), GRID)
+        ours, said = match_presses(real, scene, read_sensor_model(Path(place)), GRID)
     taken = perf_counter() - wall, process_time() - cpu
     both = {
         "pictures": compare_frames(ours, real, calibration, calibration),

@@ -26,11 +26,11 @@ from robot.studies.experiment import (
     TrialFailed,
     as_json,
     image_difference,
+    key_steps,
     run_trials,
     shortcomings,
-    telling,
 )
-from robot.studies.press import Press, _targets
+from robot.studies.press import PressMotion, _targets
 from tacsim.config import ConfigError
 from tacsim.interface import IncompatibleRig, Pose, TactileFrame
 from tacsim.models.scene import Sphere
@@ -209,7 +209,7 @@ def test_a_machine_that_is_not_there_ends_with_2(variable: str, value: str, said
 
 
 def test_a_twist_beyond_half_a_turn_goes_on_the_same_way() -> None:
-    start, motion = Pose(np.array([0.0, 0.0, 5e-3])), Press(twist=np.radians(-270.0))
+    start, motion = Pose(np.array([0.0, 0.0, 5e-3])), PressMotion(twist=np.radians(-270.0))
     targets = _targets(start, Sphere(radius=4e-3), motion)
     turns = [Rotation.from_quat(target.quaternion) for target in targets]
     steps = [np.degrees((b * a.inv()).as_rotvec()) for a, b in pairwise(turns)]
@@ -364,8 +364,8 @@ def test_a_curve_is_the_seeds_only_if_it_rises_to_the_goal_and_falls() -> None:
 
 
 def test_what_the_reproduction_tells() -> None:
-    assert telling(26, 15) == [0, 7, 15, 20, 25]
-    assert telling(3, 2) == [0, 1, 2]
+    assert key_steps(26, 15) == [0, 7, 15, 20, 25]
+    assert key_steps(3, 2) == [0, 1, 2]
     config = as_json({"squeeze": {"seed": made_up([1.0, 0.0, 1.0])}})
     assert set(config["squeeze"]["seed"]) >= {"step", "reward", "goal", "image_difference"}
     json.dumps(config, allow_nan=False)

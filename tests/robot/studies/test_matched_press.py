@@ -14,7 +14,7 @@ from calibration.bundle import write_bundle
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from robot.cli import app
-from robot.studies.matched_press import press_like
+from robot.studies.matched_press import match_presses
 from tacsim.config import load_scene
 from tacsim.models.sensor import CanonicalGrid, SensorGeometry, SensorModel
 from tests.calibration.presses import HiddenSensor
@@ -60,10 +60,10 @@ def test_what_cannot_be_pressed_is_refused(frames: FrameSet) -> None:
     sensor = SensorModel(geometry=SensorGeometry(width=260, height=200, pixel_pitch=0.08e-3))
     box = load_scene("press", ["indenter.geometry={shape: box, size: [5 mm, 5 mm, 5 mm]}"])
     with pytest.raises(BadFrames, match="'press' presses no ball"):
-        press_like(frames, box, sensor, CanonicalGrid())
+        match_presses(frames, box, sensor, CanonicalGrid())
     smaller = SensorModel(geometry=SensorGeometry(width=200, height=200, pixel_pitch=0.08e-3))
     with pytest.raises(BadFrames, match="real is 260 x 200 px, the calibration is of 200 x 200"):
-        press_like(frames, scene, smaller, CanonicalGrid())
+        match_presses(frames, scene, smaller, CanonicalGrid())
     still = replace(frames, frames=(Frame("still.png", np.array(frames.reference)),))
     with pytest.raises(BadFrames, match="no frame shows a ball's contact"):
-        press_like(still, scene, sensor, CanonicalGrid())
+        match_presses(still, scene, sensor, CanonicalGrid())

@@ -1,0 +1,7 @@
+"""Rigs of three kinds: simulated, recorded, and hardware (real or mock). `robot.open` chooses."""
+
+RIG_ATTACHMENT = "rig.yaml"  # of an episode: the resolved rig file it was recorded with
+
+
+class CannotOpen(ValueError):
+    """A rig file that is sound in itself describes no rig that can be opened."""

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from calibration.errors import error_context
+from calibration.normaliser import FrameNormaliser, normaliser_for_camera, normaliser_for_simulation
 from robot.arm.ur import URArm
 from robot.camera.camera import Camera
 from robot.errors import DeviceError, SafetyViolation
@@ -24,9 +24,6 @@ from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.report.timing import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
-
-if TYPE_CHECKING:
-    from calibration.normaliser import FrameNormaliser
 
 Confirm = Callable[[str], bool]
 QUESTION = "Is the body in its place between the sensors, and everybody out of reach of the arms?"
@@ -195,8 +192,6 @@ def _confirmation(config: RigConfig, cell: MockCell, confirm: Confirm | None, *,
 
 
 def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
-    from calibration.normaliser import normaliser_for_simulation
-
     if isinstance(config, CameraSensorConfig):
         return camera_normaliser(name, config, rig)
     assert isinstance(config, SimSensorConfig) and rig.scene is not None
@@ -206,8 +201,6 @@ def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
 def camera_normaliser(name: str, config: CameraSensorConfig, rig: RigConfig) -> FrameNormaliser:
     """The normaliser of one camera of a rig. Raises ValueError, and
     calibration.errors.CalibrationError, which names the sensor."""
-    from calibration.normaliser import normaliser_for_camera
-
     with error_context(f"sensors.{name}"):
         return normaliser_for_camera(
             config, config.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical

@@ -1,0 +1,107 @@
+"""Recorded rigs: episodes, folders of pictures and videos."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from calibration.errors import error_context
+from calibration.normaliser import FrameNormaliser, normaliser_for_recording, normaliser_for_simulation
+from robot.rig import RIG_ATTACHMENT, CannotOpen
+from tacsim.config import load_rig
+from tacsim.interface import Arm, Normaliser, TactileFrame
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
+from tacsim.record.sources import EPISODES, episode_meta
+from tacsim.rig import Rig
+
+
+class ReplayReset:
+    """The reset of a recorded rig: goes back to the first frame; nothing moves."""
+
+    def __init__(self, clock: ReplayClock, sensors: Mapping[str, ReplaySensor]) -> None:
+        self._clock, self._sensors = clock, sensors
+
+    def clear(self, seed: int) -> Mapping[str, TactileFrame]:
+        self._clock.rewind()
+        return {name: sensor.reference() for name, sensor in self._sensors.items()}
+
+    def touch(self) -> None:
+        """A recording is as it is."""
+
+
+def open_replay(config: RigConfig) -> Rig:
+    """Recorded sensors and arms. The control period is that of the recording. Raises CannotOpen, EpisodeError."""
+    there = {
+        name: arm for name, arm in config.arms.items() if isinstance(arm, ReplayArmConfig) and arm.source is not None
+    }
+    recorded = {
+        name: sensor if sensor.arm in there else sensor.model_copy(update={"arm": None})
+        for name, sensor in config.sensors.items()
+        if isinstance(sensor, ReplaySensorConfig)
+    }
+    clock = ReplayClock(_common_period(config.name, recorded))
+    with ExitStack() as stack:
+        sensors: dict[str, ReplaySensor] = {}
+        normalisers: dict[str, Normaliser] = {}
+        for name, sensor in recorded.items():
+            sensors[name] = source = ReplaySensor(sensor, name, clock)
+            stack.callback(source.close)
+            with error_context(f"sensors.{name}"):
+                normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, config.canonical)
+            if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
+                source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
+            normalisers[name] = normaliser
+        arms: dict[str, Arm] = {}
+        for name, arm in there.items():
+            arms[name] = ReplayArm(arm, name, clock)
+            stack.callback(arms[name].close)
+        rig = Rig(
+            name=config.name,
+            sensors=sensors,
+            arms=arms,
+            clock=clock,
+            normalisers=normalisers,
+            reset=ReplayReset(clock, sensors),
+        )
+        stack.pop_all()
+        return rig
+
+
+def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float:
+    periods = {name: recorded_period(sensor, name) for name, sensor in sensors.items()}
+    shortest, longest = min(periods, key=periods.__getitem__), max(periods, key=periods.__getitem__)
+    if periods[longest] > periods[shortest] * 1.01:
+        raise CannotOpen(
+            f"rig '{rig}': recordings go frame by frame, but sensors.{shortest} has one every "
+            f"{periods[shortest]:.4g} s and sensors.{longest} every {periods[longest]:.4g} s; give two of one rate"
+        )
+    return periods[shortest]
+
+
+def _replay_normaliser(
+    config: ReplaySensorConfig, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
+) -> FrameNormaliser:
+    """By the corners of the rig file; without them by what an episode says of its own sensor."""
+    original = None if config.corners is not None else _recorded_rig(Path(config.source or ""))
+    sensor = None if original is None else original.sensors.get(name)
+    if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
+        return normaliser_for_simulation(sensor.model, original.scene.gel.size[:2], grid)
+    return normaliser_for_recording(sensor if isinstance(sensor, ReplaySensorConfig) else config, image_shape, grid)
+
+
+def _recorded_rig(source: Path) -> RigConfig | None:
+    """The rig that an episode was recorded with; None where it is not known."""
+    if source.suffix.lower() not in EPISODES:
+        return None
+    text = episode_meta(source).attachments.get(RIG_ATTACHMENT)
+    if text is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:  # an empty folder: the text can refer to nothing beside it
+        path = Path(folder) / RIG_ATTACHMENT
+        path.write_bytes(text)
+        return load_rig(path).config

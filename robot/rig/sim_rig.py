@@ -1,0 +1,113 @@
+"""Simulated rigs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+from calibration.normaliser import normaliser_for_simulation
+from robot.rig import CannotOpen
+from tacsim.compute.threads import map_parallel
+from tacsim.control.admittance import held_loads
+from tacsim.control.gel_monitor import GelMonitor
+from tacsim.interface import Arm, SensorSpec
+from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
+from tacsim.models.scene import Scene
+from tacsim.optics.noise import noise_source
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import surface_map
+from tacsim.physics.world import World, make_world
+from tacsim.rig import Rig
+from tacsim.sim.arm import SimArm
+from tacsim.sim.clock import SimClock
+from tacsim.sim.reset import SimReset
+from tacsim.sim.sensor import SimSensor
+
+
+def open_sim(config: RigConfig) -> Rig:
+    """One world seen as sensors, arms and a clock. Raises CannotOpen."""
+    scene = config.scene
+    if scene is None:
+        raise CannotOpen(f"rig '{config.name}' simulates, but has no scene; give scene, or a task (which has one)")
+    if config.motion != "settled" and scene.physics == "seed":
+        raise CannotOpen(
+            f"rig '{config.name}': physics 'seed' settles every motion, so it can't go by motion '{config.motion}'; "
+            "use physics 'hybrid', or motion 'settled'"
+        )
+    frames = _driven_frames(config, scene)
+    models = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, SimSensorConfig)}
+    world = make_world(scene)
+    clock = SimClock(world, config.period, config.motion)
+    sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
+    arms: dict[str, Arm] = {}
+    for name, arm in config.arms.items():
+        assert isinstance(arm, SimArmConfig)
+        limits = arm.limits
+        speed = arm.speed if limits is None else min(arm.speed, limits.speed)
+        turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
+        apart = [(frames[other], distance) for other, distance in config.kept_out(name).items()]
+        arms[name] = SimArm(world, clock, frames[name], speed * config.period, turn_rate * config.period, limits, apart)
+    task = config.task
+    return Rig(
+        name=config.name,
+        sensors=sensors,
+        arms=arms,
+        clock=clock,
+        normalisers={
+            name: normaliser_for_simulation(sensor.model, scene.gel.size[:2], config.canonical)
+            for name, sensor in models.items()
+        },
+        reset=SimReset(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
+        truth=None if scene.body is None else world.truth,
+        diagnostics=clock.diagnostics,
+        gather=map_parallel,
+        on_tactile=_gel_monitor(config, sensors),
+        admittance=held_loads(config.task),
+    )
+
+
+def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
+    limits = {
+        name: arm.limits
+        for name, arm in config.arms.items()
+        if isinstance(arm, SimArmConfig) and arm.limits is not None
+    }
+    try:
+        return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
+    except ValueError as failure:
+        raise CannotOpen(f"rig '{config.name}': {failure}") from None
+
+
+def _driven_frames(config: RigConfig, scene: Scene) -> dict[str, str]:
+    """Which frame of the world each arm moves: the sensor it carries, or the indenter."""
+    there = ", ".join(scene.sensors)
+    for name in config.sensors:
+        if name not in scene.sensors:
+            raise CannotOpen(f"rig '{config.name}': scene '{scene.name}' has no sensor '{name}'; it has {there}")
+    frames = {sensor.arm: name for name, sensor in config.sensors.items() if sensor.arm is not None}
+    if scene.indenter is not None:
+        frames.setdefault("indenter", "indenter")
+    for name in config.arms:
+        if name not in frames:
+            raise CannotOpen(
+                f"rig '{config.name}': arms.{name} carries no sensor; name it in sensors.NAME.arm, or leave it out"
+            )
+    carried = [sensor.arm for sensor in config.sensors.values()]
+    doubled = sorted({arm for arm in carried if arm is not None and carried.count(arm) > 1})
+    if doubled:
+        raise CannotOpen(f"rig '{config.name}': arms.{doubled[0]} carries several sensors; a simulated arm carries one")
+    return frames
+
+
+def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfig, rig: RigConfig) -> SimSensor:
+    assert rig.scene is not None
+    model = config.model
+    spec = SensorSpec(
+        image_shape=(model.geometry.height, model.geometry.width),
+        height=True,
+        flow=model.markers is not None,
+        arm=config.arm,
+    )
+    sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
+    render = Renderer(model, rig.scene.gel.size[:2])
+    return SimSensor(world, clock, name, spec, render, sample, noise_source(model, name))

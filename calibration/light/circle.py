@@ -51,7 +51,7 @@ def dent_slope(r: Float64, contact: float, ball: float) -> Float64:
 def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_radius: float) -> Circle:
     """Finds the contact of a ball of known radius [px] in `image` (H, W, 3); `reference` is the same without contact.
 
-    Raises ValueError when the two images differ in size, NoCircle when no contact of a ball is seen.
+    Raises ValueError when the two images differ in size, NoCircle when no ball's contact is seen.
     """
     from scipy.optimize import minimize
 
@@ -84,7 +84,7 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
     explained = 1.0 - float(found.fun)
     if explained < MIN_EXPLAINED or found.x[2] < MIN_RADIUS:
         raise NoCircle(
-            f"no contact of a ball is seen: a dent explains {max(explained, 0.0):.0%} of the difference to the image "
+            f"no ball's contact is seen: a dent explains {max(explained, 0.0):.0%} of the difference to the image "
             f"without contact, {MIN_EXPLAINED:.0%} are needed"
         )
     return Circle(float(found.x[0]), float(found.x[1]), float(found.x[2]), explained)
@@ -103,7 +103,7 @@ def _patch(difference: Float64) -> tuple[float, float, float]:
 
     strength = np.sqrt((difference**2).sum(axis=2))
     if not strength.max() > 0:
-        raise NoCircle("no contact of a ball is seen: the image is the one without contact")
+        raise NoCircle("no ball's contact is seen: the image is the one without contact")
     _, patches = cv2.connectedComponents((strength > 0.5 * strength.max()).astype(np.uint8))
     weight = np.bincount(patches.ravel(), strength.ravel())
     weight[0] = 0.0  # what lies outside all patches

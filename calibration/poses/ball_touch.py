@@ -1,9 +1,9 @@
-"""Where a sensor sits on its arm, from touches of one ball that stands fixed, with the sensor tilted in many ways.
+"""Where a sensor sits on its arm, from touches of one fixed ball with the sensor tilted in many ways.
 
-Unknown are tool_from_sensor and the ball's place: 9 numbers. Each touch says where the ball's centre is in the sensor's
-frame, and the tool's pose where that is in the world: three equations. The ball is that of the photometric calibration.
+Unknown are tool_from_sensor and the ball's centre in the world: 9 numbers. Each touch gives the ball's centre in the
+sensor's frame, and the pose of the tool takes it to the world: three equations.
 
-A wrong ball radius, and whatever all depths have in common, moves the result along the sensor's z by just as much, and
+A wrong ball radius, or an error that all depths have in common, moves the result along the sensor's z by as much and
 leaves no trace in the residuals.
 """
 
@@ -20,17 +20,17 @@ from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spr
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
-FEWEST = 6  # touches: 18 equations for 9 numbers
-MIN_SPREAD = np.radians(5.0)  # of the tilts, see adjustment.swing [rad]
-LEAST_SPREAD = 0.5e-3  # of the contacts over the gel, in the direction in which they vary least [m]
-CAP = 0.5  # the ball is looked for where the dent is deeper than this part of its deepest: inside the contact circle
-LEAST_CELLS = 12  # of a cap
-MISFIT = 0.15  # root mean square of a cap's residuals, over its depth, at most
+MIN_TOUCHES = 6  # touches: 18 equations for 9 numbers
+MIN_SPREAD = np.radians(5.0)  # of the tilts, see angular_spread [rad]
+MIN_CONTACT_SPREAD = 0.5e-3  # of the contacts over the gel, in the direction in which they vary least [m]
+CAP = 0.5  # share of the deepest point beyond which the gel lies on the ball (Hertz)
+MIN_CELLS = 12  # of a cap
+MAX_MISFIT = 0.15  # root mean square of a cap's residuals, over its depth
 
 
 @dataclass(frozen=True, slots=True)
 class TouchNoise:
-    """Standard deviations that the touches are weighed by [m]."""
+    """Standard deviations by which touches are weighted [m]."""
 
     centre: float = 0.03e-3  # of the contact's centre, in x and y
     depth: float = 0.05e-3
@@ -41,37 +41,37 @@ class TouchNoise:
 class BallTouch:
     """One touch."""
 
-    tool: Pose  # world_from_tool; any frame that stands still will do for the world
+    tool: Pose  # world_from_tool; any fixed frame will do for the world
     contact: tuple[float, float]  # centre of the contact, x, y in the sensor's frame [m]
     depth: float  # how deep the ball is pressed into the gel [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TouchFit:
-    """Where the sensor sits, where the ball stands, and how sure that is."""
+    """Where the sensor sits and the ball stands, and how uncertain that is."""
 
     tool_from_sensor: Pose
     ball: FloatArray  # (3,) its centre in the world [m]
     covariance: FloatArray  # (6, 6) of tool_from_sensor: shift [m] and rotation vector [rad], along the tool's axes
-    bound: FloatArray  # (6, 6) the same, at best (Cramer, Rao)
-    misses: FloatArray  # (n, 3) where each touch puts the ball, off `ball`, along the sensor's axes [m]
+    bound: FloatArray  # (6, 6) Cramer-Rao bound of it
+    residuals: FloatArray  # (n, 3) from `ball` to where each touch puts it, along the sensor's axes [m]
     used: tuple[bool, ...]  # False: disagrees with the others, left out
     scatter: float  # of the used touches over what the noise allows
 
     @property
     def deviation(self) -> tuple[float, float]:
-        """Standard deviations: of the origin's place [m], and of the axes' direction [rad]."""
+        """Standard deviations of position [m] and orientation [rad]."""
         return deviation(self.covariance)
 
     @property
     def best_deviation(self) -> tuple[float, float]:
-        """The same, at best: what the Cramer-Rao bound leaves to any method at the stated noise."""
+        """The same by the Cramer-Rao bound: no method does better at the stated noise."""
         return deviation(self.bound)
 
 
 def deviation(covariance: FloatArray) -> tuple[float, float]:
-    """Standard deviations of place [m] and of direction [rad], each in all three axes together, of a covariance (6, 6)
-    of shift and rotation vector."""
+    """Standard deviations of position [m] and orientation [rad], each over all three axes, of a covariance (6, 6) of
+    shift and rotation vector."""
     variance = np.diag(covariance)
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:6].sum()))
 
@@ -82,8 +82,8 @@ def fit_touches(touches: Sequence[BallTouch], ball_radius: float, noise: TouchNo
     Maximum likelihood for independent normal noise; no first guess is needed. Raises BadMeasurements.
     """
     noise = TouchNoise() if noise is None else noise
-    if len(touches) < FEWEST:
-        raise BadMeasurements(f"{len(touches)} touches are too few; at least {FEWEST} are needed, 24 are good")
+    if len(touches) < MIN_TOUCHES:
+        raise BadMeasurements(f"{len(touches)} touches are too few; at least {MIN_TOUCHES} are needed, 24 are good")
     turn = np.stack([se3.rotation(touch.tool).as_matrix() for touch in touches])
     place = np.stack([touch.tool.position for touch in touches])
     seen = np.array([(*touch.contact, ball_radius - touch.depth) for touch in touches])
@@ -93,23 +93,22 @@ def fit_touches(touches: Sequence[BallTouch], ball_radius: float, noise: TouchNo
     def solve(base: FloatArray, starts: list[FloatArray]) -> RobustFit:
         def residuals(change: FloatArray) -> FloatArray:
             sensor = perturbed(base, change)
-            # the ball's centre in tool axes, then in the sensor's, less where it was seen
             in_tool = np.einsum("nji,nj->ni", turn, change[6:9] - place)
-            missed: FloatArray = ((in_tool - sensor[:3, 3]) @ sensor[:3, :3] - seen) / sigma
-            return missed
+            residual: FloatArray = ((in_tool - sensor[:3, 3]) @ sensor[:3, :3] - seen) / sigma
+            return residual
 
         return robust_fit(residuals, starts, "touches")
 
     identity = np.eye(4)
     rough = solve(identity, _starts(turn, place, seen))
     base, ball = perturbed(identity, rough.parameters[:6]), rough.parameters[6:9]
-    fit = solve(base, [np.concatenate([np.zeros(6), ball])])  # again, where a rotation vector is no long way round
+    fit = solve(base, [np.concatenate([np.zeros(6), ball])])  # again, where the rotation vector is small
     return TouchFit(
         tool_from_sensor=se3.from_matrix(perturbed(base, fit.parameters[:6])),
         ball=fit.parameters[6:9],
         covariance=fit.covariance[:6, :6],
         bound=fit.bound[:6, :6],
-        misses=fit.residuals * sigma,
+        residuals=fit.residuals * sigma,
         used=fit.used,
         scatter=fit.scatter,
     )
@@ -119,19 +118,19 @@ def _check_spread(turn: FloatArray, seen: FloatArray) -> None:
     tilts = angular_spread(turn)
     if tilts < MIN_SPREAD:
         raise BadMeasurements(
-            f"the tilts differ too little: one direction swings by only {np.degrees(tilts):.1f} degrees, "
+            f"the tilts differ too little: one direction turns by only {np.degrees(tilts):.1f} degrees, "
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Tilt the sensor about both axes of its gel, 20 degrees and more"
         )
     spread = float(np.sqrt(max(0.0, np.linalg.eigvalsh(np.cov(seen[:, :2].T))[0])))
-    if spread < LEAST_SPREAD:
+    if spread < MIN_CONTACT_SPREAD:
         raise BadMeasurements(
             f"the contacts lie too near to a point or a line on the gel: they spread by {1e3 * spread:.2f} mm in one "
-            f"direction, {1e3 * LEAST_SPREAD:g} mm are needed to tell how the sensor is turned"
+            f"direction, {1e3 * MIN_CONTACT_SPREAD:g} mm are needed to tell how the sensor is turned"
         )
 
 
 def _starts(turn: FloatArray, place: FloatArray, seen: FloatArray) -> list[FloatArray]:
-    """Where fits begin: the 24 ways to turn a cube; for each, the rest is a linear problem."""
+    """Starts of the fit: the 24 rotations of a cube; for each, the rest is a linear problem."""
     count = len(turn)
     matrix = np.zeros((count, 3, 6))
     matrix[:, :, :3] = turn
@@ -149,8 +148,8 @@ def locate_ball(
 ) -> tuple[tuple[float, float], float]:
     """Contact centre (x, y) [m] and depth [m] of a ball, in a surface `height` (h, w) [m] on the canonical grid.
 
-    Where the dent is deeper than half its deepest the gel lies on the ball (Hertz: just half at the circle itself), so
-    a ball of `ball_radius` is fitted there. Raises BadMeasurements where no ball is seen.
+    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (Hertz:
+    half of it at the contact circle). Raises BadMeasurements where no ball is seen.
     """
     from scipy.ndimage import label
 
@@ -162,27 +161,27 @@ def locate_ball(
         raise BadMeasurements("nothing is pressed into the gel")
     patches, _ = label((height > CAP * deepest) & valid)
     cap = patches == patches[np.unravel_index(np.where(valid, height, -np.inf).argmax(), height.shape)]
-    if cap.sum() < LEAST_CELLS:
-        raise BadMeasurements(f"the contact covers {int(cap.sum())} cells, {LEAST_CELLS} are needed; press deeper")
+    if cap.sum() < MIN_CELLS:
+        raise BadMeasurements(f"the contact covers {int(cap.sum())} cells, {MIN_CELLS} are needed; press deeper")
     inner = valid.copy()
     inner[[0, -1], :] = inner[:, [0, -1]] = False
     if (cap & ~inner).any():
         raise BadMeasurements("the contact reaches the rim of what is seen; press nearer to the middle")
     grid_x, grid_y = np.meshgrid(x, y)
     px, py, pz = grid_x[cap], grid_y[cap], height[cap].astype(np.float64)
-    # Gauss-Newton on z = depth - (R - sqrt(R^2 - r^2)); the cap's own middle is near enough to begin
+    # Gauss-Newton on z = depth - (R - sqrt(R^2 - r^2)), from the middle of the cap
     found = np.array([px.mean(), py.mean(), deepest])
-    missed = np.zeros(0)
+    residual = np.zeros(0)
     for _ in range(10):
         dx, dy = px - found[0], py - found[1]
         root = np.sqrt(np.maximum(ball_radius**2 - dx**2 - dy**2, (0.1 * ball_radius) ** 2))
-        missed = pz - (found[2] - ball_radius + root)
+        residual = pz - (found[2] - ball_radius + root)
         jacobian = np.stack([dx / root, dy / root, np.ones_like(root)], axis=1)
-        found = found + np.linalg.lstsq(jacobian, missed, rcond=None)[0]
-    misfit = float(np.sqrt((missed**2).mean())) / deepest
-    if not misfit < MISFIT:
+        found = found + np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+    misfit = float(np.sqrt((residual**2).mean())) / deepest
+    if not misfit < MAX_MISFIT:
         raise BadMeasurements(
             f"what is pressed is no ball of {1e3 * ball_radius:.3g} mm: it fits only to {misfit:.0%} of its depth "
-            f"({MISFIT:.0%} at most)"
+            f"({MAX_MISFIT:.0%} at most)"
         )
     return (float(found[0]), float(found[1])), float(found[2])

@@ -1,8 +1,8 @@
 """Where a camera sits, from pictures of one board while an arm stands in many poses.
 
-Two cases: the camera rides on the flange and the board is fixed, or the camera is fixed and the board rides. Closed
-forms (Park and Martin 1994) begin; least squares with the noise of board and robot end: a robot's error in rotation
-moves a far board by its lever arm, and no closed form knows.
+Two cases: the camera rides on the flange and the board is fixed, or the camera is fixed and the board rides. A closed
+form (Park and Martin 1994) starts least squares weighted by the noise of board and robot: an error of the robot's
+rotation moves a far board by its lever arm, which no closed form knows.
 """
 
 from __future__ import annotations
@@ -10,36 +10,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibration.poses.ball_touch import deviation
-from calibration.poses.robust_fit import (
-    BadMeasurements,
-    RobustFit,
-    angular_spread,
-    inverse,
-    perturbed,
-    robust_fit,
-)
+from calibration.poses.robust_fit import BadMeasurements, RobustFit, angular_spread, inverse, perturbed, robust_fit
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 
-FEWEST = 6  # poses: 36 equations for 12 numbers
-MIN_SPREAD = np.radians(15.0)  # of the flange, see adjustment.swing [rad]
-SUBSETS, SUBSET = 12, 5  # starts from a few poses each, lest one bad pose spoil them all
-RESETS = 2  # times that the weights are computed anew
+MIN_POSES = 6  # poses: 36 equations for 12 numbers
+MIN_SPREAD = np.radians(15.0)  # of the flange, see angular_spread [rad]
+SUBSETS, SUBSET_SIZE = 12, 5  # starts from a few poses each, so that one bad pose does not spoil them all
+REWEIGHTINGS = 2  # times that the weights are computed anew
 
 
 @dataclass(frozen=True, slots=True)
 class HandEyeNoise:
-    """Standard deviations in each axis that the poses are weighed by [m, rad]."""
+    """Standard deviations in each axis by which poses are weighted [m, rad]."""
 
-    board: float = 0.5e-3  # of the board's place in the camera
+    board: float = 0.5e-3  # of the board's position in the camera
     board_turn: float = np.radians(0.15)
-    robot: float = 0.05e-3  # of the flange's place
+    robot: float = 0.05e-3  # of the flange's position
     robot_turn: float = np.radians(0.02)
 
 
@@ -53,44 +45,42 @@ class BoardPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeFit:
-    """Where camera and board sit, and how sure that is."""
+    """Where camera and board sit, and how uncertain that is."""
 
     camera: Pose  # flange_from_camera; of a fixed camera base_from_camera
     board: Pose  # base_from_board; with a fixed camera flange_from_board
     covariance: FloatArray  # (6, 6) of `camera`: shift [m] and rotation vector [rad], axes of the frame it is given in
-    misses: FloatArray  # (n, 2) how far each board was seen from where it should be: place [m], direction [rad]
+    residuals: FloatArray  # (n, 2) of each board's pose in the camera: position [m], orientation [rad]
     used: tuple[bool, ...]  # False: disagrees with the others, left out
     scatter: float  # of the used poses over what the noise allows
-    spread: float  # of the flange's rotations, see adjustment.swing [rad]
+    spread: float  # of the flange's rotations, see angular_spread [rad]
 
     @property
     def deviation(self) -> tuple[float, float]:
-        """Standard deviations: of the camera's place [m], and of its direction [rad]."""
+        """Standard deviations of the camera's position [m] and orientation [rad]."""
         return deviation(self.covariance)
 
 
-def fit_hand_eye(
-    board_poses: Sequence[BoardPose], *, fixed: bool = False, noise: HandEyeNoise | None = None
-) -> HandEyeFit:
-    """Fits where the camera sits to what it saw. `fixed`: the camera is, and the board rides on the flange.
+def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: HandEyeNoise | None = None) -> HandEyeFit:
+    """Fits the pose of the camera. `fixed`: the camera is fixed, and the board rides on the flange.
 
     Raises BadMeasurements.
     """
     noise = HandEyeNoise() if noise is None else noise
-    if len(board_poses) < FEWEST:
-        raise BadMeasurements(f"{len(board_poses)} poses are too few; at least {FEWEST} are needed, 15 to 30 are good")
-    flange = np.stack([se3.to_matrix(sight.flange) for sight in board_poses])
-    board = np.stack([se3.to_matrix(sight.board) for sight in board_poses])
+    if len(poses) < MIN_POSES:
+        raise BadMeasurements(f"{len(poses)} poses are too few; at least {MIN_POSES} are needed, 15 to 30 are good")
+    flange = np.stack([se3.to_matrix(each.flange) for each in poses])
+    board = np.stack([se3.to_matrix(each.board) for each in poses])
     spread = angular_spread(flange[:, :3, :3])
     if spread < MIN_SPREAD:
         raise BadMeasurements(
-            f"the flange turns too little: one direction swings by only {np.degrees(spread):.1f} degrees, "
+            f"the flange turns too little: one direction turns by only {np.degrees(spread):.1f} degrees, "
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Turn it about all axes, 30 degrees and more"
         )
     arm = inverse(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
     camera, mount, fit = np.eye(4), np.eye(4), None
     starts = _starts(arm, board)
-    for _ in range(1 + RESETS):
+    for _ in range(1 + REWEIGHTINGS):
         if fit is not None:
             starts = [(camera, mount)]
         camera, mount, fit = min(
@@ -104,7 +94,7 @@ def fit_hand_eye(
         camera=se3.from_matrix(camera),
         board=se3.from_matrix(mount),
         covariance=fit.covariance[:6, :6],
-        misses=np.stack([missed, turn], axis=1),
+        residuals=np.stack([missed, turn], axis=1),
         used=fit.used,
         scatter=fit.scatter,
         spread=spread,
@@ -133,7 +123,7 @@ def _solved(
 def _whitening(
     camera: FloatArray, mount: FloatArray, arm: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> FloatArray:
-    """(n, 6, 6) what turns a pose's residuals into six independent ones of variance 1.
+    """(n, 6, 6) matrices that make a pose's residuals six independent ones of variance 1.
 
     The robot's error is a small motion (shift, turn) of the flange about its own origin, between `before` (flange to
     camera) and `after` (the board in the flange): it turns the board, and shifts it by turn x lever.
@@ -160,11 +150,11 @@ def _cross(vectors: FloatArray) -> FloatArray:
 
 
 def _starts(arm: FloatArray, board: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """The closed form's camera and mount: the one that most poses agree with, of all poses and of some subsets."""
+    """The closed form's camera and mount from all poses or a subset, whichever the poses agree with most."""
     random = np.random.default_rng(0)
     count = len(arm)
     chosen = [np.arange(count)]
-    chosen += [random.choice(count, min(SUBSET, count), replace=False) for _ in range(SUBSETS)]
+    chosen += [random.choice(count, min(SUBSET_SIZE, count), replace=False) for _ in range(SUBSETS)]
     candidates = []
     for some in chosen:
         if angular_spread(arm[some, :3, :3]) < MIN_SPREAD / 2:
@@ -180,24 +170,8 @@ def _starts(arm: FloatArray, board: FloatArray) -> list[tuple[FloatArray, FloatA
 
 
 def closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:
-    """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) is the same for all i, as near as Park's method gets."""
-    import cv2
-
-    solver: Any = getattr(cv2, "calibrateHandEye", None)
-    if solver is None:  # OpenCV 5.0 has none, though it has the names of its methods
-        return park(arm, board)
-    # method= by keyword: the next positional argument is an output, and a method there is not heeded
-    turn, shift = solver(
-        list(arm[:, :3, :3]), list(arm[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]),
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )  # fmt: skip
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = turn, np.ravel(shift)
-    return found if np.isfinite(found).all() else park(arm, board)
-
-
-def park(arm: FloatArray, board: FloatArray) -> FloatArray:
-    """The same without OpenCV: Park and Martin 1994, rotation first (Procrustes over all pairs), then the shift."""
+    """(4, 4) the X for which arm_i X board_i (each (n, 4, 4)) is most nearly the same for all i (Park and Martin 1994):
+    rotation first (Procrustes over all pairs), then the shift."""
     pairs = list(combinations(range(len(arm)), 2))
     a = np.stack([inverse(arm[j]) @ arm[i] for i, j in pairs])
     b = np.stack([board[j] @ inverse(board[i]) for i, j in pairs])

@@ -1,8 +1,7 @@
-"""Least squares for rigid transforms from measurements that should agree, and of which some do not.
+"""Robust least squares for rigid transforms, from measurements of which some are outliers.
 
-Parameters are poses and points. Each measurement gives a few residuals over their standard deviations. A fit that heeds
-strays little (Cauchy's loss) finds which measurements disagree; those are left out of the plain fit that follows, whose
-covariance is therefore that of the textbook.
+Parameters are poses and points. Each measurement gives a few residuals over their standard deviations. A robust fit
+(Cauchy's loss) finds the outliers; the plain fit that follows leaves them out, so its covariance is the textbook's.
 """
 
 from __future__ import annotations
@@ -19,56 +18,56 @@ from scipy.spatial.transform import Rotation
 from calibration.errors import CalibrationError
 from tacsim.interface import FloatArray
 
-STRAY = 5.0  # a measurement off by so many standard deviations, all its residuals together, is a stray
-MOST_STRAYS = 0.25  # of the measurements; with more, who is right?
-PROMISING = 4  # starts that are followed to their end
-ROUNDS = 4  # of leaving out and fitting again
-DISAGREE = 3.0  # scatter over what the noise allows: beyond it something other than noise is wrong
+OUTLIER_DISTANCE = 5.0  # of an outlier: norm of its residuals [standard deviations]
+MAX_OUTLIERS = 0.25  # share of the measurements
+MAX_STARTS = 4  # the most promising starts are fitted
+MAX_ROUNDS = 4  # of leaving outliers out and fitting again
+MAX_SCATTER = 3.0  # over what the noise allows; beyond, something other than noise is wrong
 
 Residuals = Callable[[FloatArray], FloatArray]
 
 
 class BadMeasurements(CalibrationError):
-    """Measurements that tell no transform: too few, too alike, or at odds with each other."""
+    """Measurements that determine no transform: too few, too alike, or contradictory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobustFit:
-    """A fit and how sure it is."""
+    """A fit and its uncertainty."""
 
-    parameters: FloatArray  # (p,) what is added to the start: for a pose, shift [m] and rotation vector [rad]
-    covariance: FloatArray  # (p, p) of it, for noise as it was stated, or as it is if that is larger
-    bound: FloatArray  # (p, p) least covariance that any unbiased estimate has at the stated noise (Cramer, Rao)
+    parameters: FloatArray  # (p,) added to the start: for a pose, shift [m] and rotation vector [rad]
+    covariance: FloatArray  # (p, p) of it, for the stated noise, or the observed one if that is larger
+    bound: FloatArray  # (p, p) Cramer-Rao bound of the covariance at the stated noise
     residuals: FloatArray  # (n, k) over their standard deviations, of all measurements
-    used: tuple[bool, ...]  # (n,) False: a stray, left out
+    used: tuple[bool, ...]  # (n,) False: an outlier, left out
     scatter: float  # root mean square of the used residuals, by degrees of freedom: 1 if the stated noise is right
 
 
 def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) -> RobustFit:
     """Fits parameters (p,) so that `residuals` (n, k), each over its standard deviation, become small.
 
-    starts: the best of the fits from each of them is taken. what: the measurements in a word, for messages.
+    starts: the best of the fits from each is taken. what: the measurements in a word, for messages.
     Raises BadMeasurements.
     """
 
     def flat(parameters: FloatArray) -> FloatArray:
         return residuals(parameters).ravel()
 
-    # Cauchy's loss hardly pulls from afar: sums of absolute values lead near, from the most promising starts.
-    promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:PROMISING]
+    # Cauchy's loss hardly pulls from afar; the soft L1 loss leads near.
+    promising = sorted(starts, key=lambda start: float(np.abs(flat(start)).sum()))[:MAX_STARTS]
     rough = [least_squares(flat, start, loss="soft_l1", x_scale="jac", ftol=1e-3, max_nfev=30) for start in promising]
     best = min(rough, key=lambda fit: float(fit.cost))
     found = least_squares(flat, best.x, loss="cauchy", x_scale="jac", max_nfev=60).x
     used = np.ones(len(residuals(found)), dtype=np.bool_)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         apart = np.sqrt((residuals(found) ** 2).sum(axis=1))
-        # noise may be larger than stated: strays are told from the others, not only from the statement
+        # noise may be larger than stated: outliers are far from the others, too
         usual = max(1.0, float(np.median(apart)) / np.sqrt(residuals(found).shape[1]))
-        keep = apart < STRAY * usual
-        if keep.sum() < max(1, (1 - MOST_STRAYS) * len(keep)):
+        keep = apart < OUTLIER_DISTANCE * usual
+        if keep.sum() < max(1, (1 - MAX_OUTLIERS) * len(keep)):
             raise BadMeasurements(
-                f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others; what is said to be fixed must "
-                "be so, the poses must be those of the pictures, and lengths in metres"
+                f"{int((~keep).sum())} of {len(keep)} {what} disagree with the others: is what should be fixed "
+                "really fixed, do the poses belong to the pictures, and are lengths in metres?"
             )
         found, before = _plain(residuals, found, keep).x, used
         used = keep
@@ -78,13 +77,13 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     jacobian = np.asarray(_plain(residuals, found, used).jac, dtype=np.float64)
     information: FloatArray = jacobian.T @ jacobian
     if np.linalg.matrix_rank(_scaled(information), tol=1e-10) < len(found):
-        raise BadMeasurements(f"{what} leave something free: vary places and tilts more")
+        raise BadMeasurements(f"{what} do not determine all of the transform: vary places and tilts more")
     bound: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
     free = everything[used].size - len(found)
     scatter = float(np.sqrt((everything[used] ** 2).sum() / free)) if free > 0 else 0.0
-    if scatter > DISAGREE:
+    if scatter > MAX_SCATTER:
         raise BadMeasurements(
-            f"{what} disagree: they scatter {scatter:.1f} times as much as the stated noise allows ({DISAGREE:g} at "
+            f"{what} disagree: they scatter {scatter:.1f} times as much as the stated noise allows ({MAX_SCATTER:g} at "
             "most); is something loose, a length or a frame wrong, or the noise larger than stated?"
         )
     return RobustFit(
@@ -105,15 +104,15 @@ def _plain(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> 
 
 
 def _scaled(information: FloatArray) -> FloatArray:
-    """The information matrix with ones on its diagonal: its rank then says nothing of units."""
+    """The information matrix with ones on its diagonal: its rank then does not depend on units."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled: FloatArray = information / np.outer(scale, scale)
     return scaled
 
 
 def angular_spread(rotations: FloatArray) -> float:
-    """How much `rotations` (n, 3, 3) differ [rad]: the direction that they turn least still swings by so much, as a
-    root mean square; 0 if all turn about one axis.
+    """How much `rotations` (n, 3, 3) differ [rad]: root mean square angle by which they turn the direction that they
+    turn least; 0 if all turn about one axis.
 
     With R the rotations and M their mean, it is the least singular value of the standard deviation of R over all
     directions: the least eigenvalue of I - M^T M is its square.

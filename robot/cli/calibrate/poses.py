@@ -141,7 +141,7 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
     _show_fit(
         "Where each touch puts the ball, off where it is, along the sensor's axes",
         ("touch", "x [mm]", "y [mm]", "z [mm]"),
-        [(str(i + 1), *(f"{1e3 * v:.3f}" for v in miss)) for i, miss in enumerate(fit.misses)],
+        [(str(i + 1), *(f"{1e3 * v:.3f}" for v in miss)) for i, miss in enumerate(fit.residuals)],
         fit.used,
     )
     (place, turn), (best, best_turn) = fit.deviation, fit.best_deviation
@@ -155,7 +155,7 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
         "bound": fit.bound.tolist(),
         "ball": fit.ball.tolist(),
         "ball_radius": record.ball_radius,
-        "residuals": fit.misses.tolist(),
+        "residuals": fit.residuals.tolist(),
         "used": list(fit.used),
         "scatter": fit.scatter,
         "units": "m, rad",
@@ -258,7 +258,7 @@ def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
     _show_fit(
         "How far each board was seen from where it should be",
         ("pose", "place [mm]", "direction [deg]"),
-        [(str(i + 1), f"{1e3 * m[0]:.3f}", f"{_degrees(m[1]):.3f}") for i, m in enumerate(fit.misses)],
+        [(str(i + 1), f"{1e3 * m[0]:.3f}", f"{_degrees(m[1]):.3f}") for i, m in enumerate(fit.residuals)],
         fit.used,
     )
     place, turn = fit.deviation
@@ -271,7 +271,7 @@ def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
     report = {
         name: pose_as_json(fit.camera, fit.covariance),
         board: pose_as_json(fit.board),
-        "residuals": fit.misses.tolist(),
+        "residuals": fit.residuals.tolist(),
         "used": list(fit.used),
         "scatter": fit.scatter,
         "units": "m, rad",

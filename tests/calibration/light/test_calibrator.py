@@ -219,7 +219,7 @@ def test_a_wrong_radius_scales_every_slope_and_nothing_gives_it_away(sensor: Hid
     """Why the ball must be measured: the docs say so."""
     right, wrong = (calibrate_light(sensor.empty(), named(sensor.presses(4)), k * BALL_PX) for k in (1.0, 1.3))
     assert wrong.warnings == right.warnings == ()
-    assert wrong.steepest < 0.85 * right.steepest
+    assert wrong.forward.steepest < 0.85 * right.forward.steepest
 
 
 def test_nothing_usable_is_refused_with_every_reason(sensor: HiddenSensor) -> None:

@@ -51,7 +51,7 @@ def test_one_bad_touch_is_found_and_left_out(off: float) -> None:
     assert [i for i, used in enumerate(fit.used) if not used] == [5]
     metres, radians = se3.distance(fit.tool_from_sensor, sensor)
     assert metres < 0.12e-3 and np.degrees(radians) < 1.2
-    assert abs(abs(fit.misses[5, 0]) - off) < 0.2e-3  # the table says by how much
+    assert abs(abs(fit.residuals[5, 0]) - off) < 0.2e-3  # the table says by how much
 
 
 def test_a_wrong_radius_goes_along_the_sensors_axis_and_nowhere_else() -> None:

@@ -148,8 +148,8 @@ def locate_ball(
 ) -> tuple[tuple[float, float], float]:
     """Contact centre (x, y) [m] and depth [m] of a ball, in a surface `height` (h, w) [m] on the canonical grid.
 
-    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (Hertz:
-    half of it at the contact circle). Raises BadMeasurements where no ball is seen.
+    Fits a ball of `ball_radius` to the cap deeper than half of the deepest point, where the gel lies on the ball (by
+    Hertz the contact circle is half as deep). Raises BadMeasurements where no ball is seen.
     """
     from scipy.ndimage import label
 

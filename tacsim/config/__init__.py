@@ -1,4 +1,4 @@
-"""Configuration: YAML files -> frozen models. Files refer to each other by name, ``key.sub=value`` overrides any value.
+"""Configuration: YAML files -> frozen models. Files refer to each other by name; ``key.sub=value`` overrides any value.
 
 A file may say ``scene: squeeze`` (the shipped file ``configs/scenes/squeeze.yaml``), ``scene: mine.yaml`` (a file below
 its own folder), ``scene: {extends: squeeze, preset: standard}`` (that file with changes), or write the mapping out.

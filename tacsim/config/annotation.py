@@ -1,4 +1,4 @@
-"""What a model's type annotations say of the node at some place: which model, which children, what is allowed."""
+"""What the type annotations of the models say about a node: its model, its children, the allowed values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def split(annotation: Any) -> tuple[Any, list[Any]]:
 
 
 def members(annotation: Any) -> list[Any]:
-    """The alternatives of a union, None left out; a single type is its own only member."""
+    """The alternatives of a union without None; any other type is its own only member."""
     bare, metadata = split(annotation)
     if get_origin(bare) in (Union, UnionType):
         return [member for part in get_args(bare) for member in members(part)]
@@ -43,7 +43,7 @@ def models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
-    """The field that tells this model from others of a union, and its value: ("shape", "box")."""
+    """The field that distinguishes this model from the others of a union, and its value: ("shape", "box")."""
     for name, field in model.model_fields.items():
         options = get_args(field.annotation)
         if get_origin(field.annotation) is Literal and len(options) == 1:
@@ -52,7 +52,7 @@ def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
 
 
 def variant(annotation: Any, node: Node | None) -> type[BaseModel] | None:
-    """The model of a mapping node: the only one there is, or the one of a union that the node's tag names."""
+    """The model of a mapping node: the only one, or the one of a union that the node's tag names."""
     options = models(annotation)
     if len(options) == 1:
         return options[0]
@@ -64,7 +64,7 @@ def variant(annotation: Any, node: Node | None) -> type[BaseModel] | None:
 
 
 def child(annotation: Any, node: Node | None, key: str | int) -> Any:
-    """The annotation of an entry of a mapping or a list; None where the models know nothing of it."""
+    """The annotation of an entry of a mapping or a list; None for an unknown one."""
     model = variant(annotation, node)
     if model is not None:
         field = model.model_fields.get(str(key))
@@ -96,7 +96,7 @@ def default(annotation: Any, node: Node | None, key: str) -> Any:
 
 
 def keys(annotation: Any, node: Node | None) -> list[str]:
-    """The keys that a mapping node may have; empty where any name will do."""
+    """The keys that a mapping node may have; empty where any name is allowed."""
     model = variant(annotation, node)
     if model is not None:
         return list(model.model_fields)
@@ -106,7 +106,7 @@ def keys(annotation: Any, node: Node | None) -> list[str]:
 
 
 def allowed(annotation: Any) -> str:
-    """What may stand here, as a phrase: "a length > 0 m, with unit (m, mm, cm, um), or null"."""
+    """The allowed values, as a phrase: "a length > 0 m, with unit (m, mm, cm, um), or null"."""
     phrases = [_allowed_member(member) for member in members(annotation)]
     if len(models(annotation)) > 1:
         phrases = [_allowed_models(annotation)]

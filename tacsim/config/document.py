@@ -1,6 +1,6 @@
-"""YAML text -> a tree of nodes that know where they were written. Nothing is executed, sizes are checked first.
+"""YAML text -> a tree of nodes that know their line. Nothing is executed, and sizes are checked first.
 
-A careful subset of YAML: numbers, booleans and null as in YAML 1.2 (so ``1e5`` is a number, ``no`` and ``12:30`` are
+A subset of YAML: numbers, booleans and null as in YAML 1.2 (so ``1e5`` is a number, ``no`` and ``12:30`` are
 texts); no anchors, aliases, merge keys, tags or duplicate keys; at most 1 MB, 32 levels and 20,000 values.
 """
 
@@ -38,13 +38,13 @@ _RESOLVERS = (  # tag, pattern, first characters: the core schema of YAML 1.2
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A value of a configuration file, and where it comes from."""
+    """A value of a configuration file, and where it was written."""
 
     value: bool | int | float | str | dict[str, Node] | list[Node] | None
     place: Place  # of the key, if it has one
-    folder: Path  # relative references written here start from this folder
+    folder: Path  # where relative references in this node start
     text: str = ""  # a scalar as it was written
-    broken: bool = False  # a problem of this node is already reported; say nothing more about it
+    broken: bool = False  # its problem is reported already: no further one is
 
     @property
     def items(self) -> dict[str, Node]:
@@ -68,8 +68,8 @@ class Node:
 
 
 @dataclass(slots=True)
-class Reading:
-    """What one load has met so far."""
+class LoadState:
+    """Problems found, files read and values counted by one load."""
 
     problems: list[Problem] = field(default_factory=list)
     sources: list[Path] = field(default_factory=list)
@@ -84,12 +84,12 @@ class Reading:
             raise ConfigError(self.problems)
 
 
-class _Refused(yaml.MarkedYAMLError):
-    """Valid YAML that a configuration must not use."""
+class _Forbidden(yaml.MarkedYAMLError):
+    """YAML that is valid, but not allowed in a configuration."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes within the limits; raises _Refused with the place of what is not allowed."""
+    """Composes nodes within the limits. Raises _Forbidden, with its place, for YAML that is not allowed."""
 
     yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # type: ignore[misc]  # PyYAML declares none, but has one
 
@@ -102,24 +102,24 @@ class _Loader(yaml.SafeLoader):
         event = self.peek_event()  # type: ignore[no-untyped-call]
         self.room -= 1
         self.depth += 1
-        fault = None
+        problem = None
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            fault = "anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name"
+            problem = "anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name"
         elif getattr(event, "tag", None) is not None:
-            fault = f"tags are not allowed ({event.tag}); leave it out"
+            problem = f"tags are not allowed ({event.tag}); leave it out"
         elif self.depth > MAX_DEPTH:
-            fault = f"nested too deeply; at most {MAX_DEPTH} levels are allowed"
+            problem = f"nested too deeply; at most {MAX_DEPTH} levels are allowed"
         elif self.room < 0:
-            fault = f"too many values; at most {MAX_NODES} are allowed, referenced files included"
-        if fault is not None:
-            raise _Refused(problem=fault, problem_mark=event.start_mark)
+            problem = f"too many values; at most {MAX_NODES} are allowed, referenced files included"
+        if problem is not None:
+            raise _Forbidden(problem=problem, problem_mark=event.start_mark)
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes plainly, and quotes every text that _Loader would read as a number."""
+    """Writes without aliases, and quotes every text that _Loader would read as a number."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -136,10 +136,10 @@ def dump(data: Any) -> str:
     return text
 
 
-def read_text(path: Path, refuse: Callable[[str], None], reading: Reading) -> str | None:
+def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> str | None:
     """The text of a file, checked before and while reading; None after a reported problem.
 
-    `refuse` reports what is wrong with the file as such, at the place that refers to it.
+    `refuse` reports a problem of the file itself, at the place that refers to it.
     """
     try:
         mode = path.stat()
@@ -153,12 +153,12 @@ def read_text(path: Path, refuse: Callable[[str], None], reading: Reading) -> st
             content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise _Unreadable(f"grew over {MAX_BYTES / 1e6:.0f} MB while it was read")
-        reading.sources.append(path)
+        state.sources.append(path)
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         what = f"byte 0x{content[error.start]:02x} is not UTF-8; save the file as UTF-8 text"
-        reading.report(Place(shown(path), line), "", what)
+        state.report(Place(shown(path), line), "", what)
     except _Unreadable as error:
         refuse(f"'{shown(path)}' {error}")
     except FileNotFoundError:
@@ -170,51 +170,51 @@ def read_text(path: Path, refuse: Callable[[str], None], reading: Reading) -> st
 
 
 class _Unreadable(Exception):
-    """Why a file is not opened at all."""
+    """Why a file is not opened."""
 
 
 def shown(path: Path) -> str:
-    """`path` as a person would write it: relative to the current folder where it lies below it."""
+    """`path` for a message: relative to the current folder if it is below it."""
     try:
         return str(path.relative_to(Path.cwd()))
     except (ValueError, OSError):
         return str(path)
 
 
-def parse_text(text: str, source: str, folder: Path, reading: Reading, place: Place | None = None) -> Node:
-    """The tree of a YAML text. Problems go to `reading`; what cannot be read becomes a broken node.
+def parse_text(text: str, source: str, folder: Path, state: LoadState, place: Place | None = None) -> Node:
+    """The tree of a YAML text. Problems are reported to `state`; an unreadable value becomes a broken node.
 
-    `place`: said of everything in the text (an override); without it each node has its own line in `source`.
+    `place`: of the whole text (an override); None: each node has its own line in `source`.
     """
     start = place or Place(source, 1)
     broken = Node(None, start, folder, broken=True)
     loader = None
     try:
-        loader = _Loader(text, MAX_NODES - reading.nodes)
+        loader = _Loader(text, MAX_NODES - state.nodes)
         root = loader.get_single_node()
     except yaml.reader.ReaderError as error:
         character = text[error.position : error.position + 1]
         what = f"not valid YAML: the character {character!a} is not allowed"
-        reading.report(place or Place(source, text.count("\n", 0, error.position) + 1), "", what)
+        state.report(place or Place(source, text.count("\n", 0, error.position) + 1), "", what)
         return broken
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         what = error.problem or error.context or "cannot be read"
-        if not isinstance(error, _Refused):
+        if not isinstance(error, _Forbidden):
             what = "not valid YAML: " + ", ".join(part for part in (error.context, error.problem) if part)
-        reading.report(place or Place(source, mark.line + 1 if mark else 1), "", what)
+        state.report(place or Place(source, mark.line + 1 if mark else 1), "", what)
         return broken
     except (ValueError, OverflowError) as error:  # PyYAML's own, for \U escapes and %YAML versions that are too large
         line = loader.line + 1 if loader is not None else 1
-        reading.report(place or Place(source, line), "", f"not valid YAML: {error}")
+        state.report(place or Place(source, line), "", f"not valid YAML: {error}")
         return broken
     finally:
         if loader is not None:
-            reading.nodes = MAX_NODES - loader.room
+            state.nodes = MAX_NODES - loader.room
             loader.dispose()
     if root is None:
         return Node(None, start, folder)
-    return _convert(root, _Origin(source, folder, place, reading), (), None)
+    return _convert(root, _Origin(source, folder, place, state), (), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +222,7 @@ class _Origin:
     source: str
     folder: Path
     place: Place | None
-    reading: Reading
+    state: LoadState
 
     def at(self, node: yaml.Node) -> Place:
         return self.place or Place(self.source, node.start_mark.line + 1)
@@ -237,35 +237,35 @@ def _convert(node: yaml.Node, origin: _Origin, path: tuple[str, ...], key_place:
         items = [_convert(child, origin, (*path, str(i)), None) for i, child in enumerate(node.value)]
         return Node(items, place, origin.folder)
     text = str(node.value)
-    value, fault = _scalar(node.tag.rpartition(":")[2], text)
-    if fault:
-        origin.reading.report(place, ".".join(path), fault)
-    return Node(None if fault else value, place, origin.folder, text=text, broken=bool(fault))
+    value, problem = _scalar(node.tag.rpartition(":")[2], text)
+    if problem:
+        origin.state.report(place, ".".join(path), problem)
+    return Node(None if problem else value, place, origin.folder, text=text, broken=bool(problem))
 
 
 def _entries(node: yaml.MappingNode, origin: _Origin, path: tuple[str, ...]) -> Iterator[tuple[str, yaml.Node, Place]]:
-    """Key, value and place of each entry that can be used; the others are reported."""
+    """Key, value and place of each valid entry; the others are reported."""
     first: dict[str, Place] = {}
     for key_node, child in node.value:
         place = origin.at(key_node)
         if not isinstance(key_node, yaml.ScalarNode):
-            origin.reading.report(place, ".".join(path), "a key must be a plain text, not a list or a mapping")
+            origin.state.report(place, ".".join(path), "a key must be a plain text, not a list or a mapping")
             continue
         key = FORMER_KEYS.get(str(key_node.value), str(key_node.value))
         dotted = ".".join((*path, key))
         if key == "<<":
-            origin.reading.report(place, dotted, "merge keys are not allowed; use 'extends: NAME' instead")
+            origin.state.report(place, dotted, "merge keys are not allowed; use 'extends: NAME' instead")
         elif _scalar("str", key)[1]:
-            origin.reading.report(place, ".".join(path), f"the key {key!a} is no Unicode text")
+            origin.state.report(place, ".".join(path), f"the key {key!a} is no Unicode text")
         elif key in first:
-            origin.reading.report(place, dotted, f"the key is there twice, first at {first[key]}; keep one")
+            origin.state.report(place, dotted, f"the key is there twice, first at {first[key]}; keep one")
         else:
             first[key] = place
             yield key, child, place
 
 
 def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
-    """Value of a scalar, and what is wrong with it (empty: nothing)."""
+    """Value of a scalar, and its problem (empty: none)."""
     if tag == "null":
         return None, ""
     if tag == "bool":
@@ -283,7 +283,7 @@ def _scalar(tag: str, text: str) -> tuple[bool | int | float | str | None, str]:
 
 
 def as_json(node: Node) -> str:
-    """The tree as JSON. Whole floats become integers: ``1e5`` is as good a count as ``100000``."""
+    """The tree as JSON. Whole floats become integers, so that ``1e5`` is a valid count."""
     return json.dumps(_plain(node))
 
 
@@ -299,7 +299,7 @@ def _plain(node: Node) -> Any:
 
 
 def from_plain(data: Any, place: Place, folder: Path) -> Node:
-    """A tree of plain data (a model's defaults) that counts as written at `place`."""
+    """A tree of plain data (a model's defaults), as if written at `place`."""
     if isinstance(data, dict):
         return Node({str(key): from_plain(value, place, folder) for key, value in data.items()}, place, folder)
     if isinstance(data, list):

@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, and where. All problems are collected, then raised as one ConfigError."""
+"""Problems of a configuration and their places. All are collected, then raised as one ConfigError."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-_SHOWN = 30  # a broken file can have thousands of problems; the first ones tell
+_SHOWN = 30  # a broken file can have thousands of problems
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong, at `place`, in the value with the dotted `key` (empty: the whole file)."""
+    """One problem, at `place`, of the value with the dotted `key` (empty: of the whole file)."""
 
     place: Place
     key: str
@@ -33,7 +33,7 @@ class Problem:
 
 
 class ConfigError(ValueError):
-    """The configuration cannot be used. ``str(error)`` is all to print: lines ``file:line: key: what``."""
+    """The configuration cannot be used. ``str(error)`` is the complete message: lines ``file:line: key: what``."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         sources = list(dict.fromkeys(problem.place.source for problem in problems))
@@ -47,7 +47,7 @@ class ConfigError(ValueError):
 
 
 def printable(text: str, limit: int = 600) -> str:
-    """`text` safe for any terminal: one line, control characters escaped, the middle of a very long one left out."""
+    """`text` for any terminal: one line, control characters escaped, the middle of a very long one left out."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
     if len(text) <= limit:
         return text
@@ -56,7 +56,7 @@ def printable(text: str, limit: int = 600) -> str:
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:
     """ "; did you mean 'x'?" when one of `allowed` is close to `word`, else an empty text."""
-    if len(word) > 100:  # comparing takes quadratic time, and nothing allowed is that long
+    if len(word) > 100:  # comparison takes quadratic time, and no allowed word is that long
         return ""
     by_lower = {name.lower(): name for name in allowed}
     close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)

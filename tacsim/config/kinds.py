@@ -1,4 +1,4 @@
-"""The kinds of configuration files, the folder where they live, and how a name becomes a path."""
+"""The kinds of configuration files, their folders, and the path that a name refers to."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ KINDS = {
 
 
 class NotFound(ValueError):
-    """A reference that leads to no file; the text says why, and what there is instead."""
+    """A reference to no file; the text says why, and lists the files that exist."""
 
 
 @cache
@@ -64,7 +64,7 @@ def names(kind: str) -> list[str]:
 
 
 def kind_of(models: Sequence[type[BaseModel]]) -> Kind | None:
-    """The kind of file that may stand for one of `models` by its name."""
+    """The kind of file whose name may be given instead of one of `models`."""
     for kind in KINDS.values():
         if models and set(models) <= set(kind.models):
             return kind
@@ -75,7 +75,7 @@ def is_name(text: str) -> bool:
     return _NAME.fullmatch(text) is not None
 
 
-def named(kind: Kind, name: str) -> Path:
+def shipped_file(kind: Kind, name: str) -> Path:
     """The shipped file of that name. Raises NotFound."""
     path = config_root() / kind.folder / f"{name}.yaml"
     if path.is_file():
@@ -84,14 +84,14 @@ def named(kind: Kind, name: str) -> Path:
     raise NotFound(f"no {kind.name} '{name}'; allowed: {', '.join(known) or '(none)'}{did_you_mean(name, known)}")
 
 
-def referred(kind: Kind, reference: str, folder: Path) -> Path:
-    """The file that `reference`, written in a file of `folder`, means. Raises NotFound.
+def resolve(kind: Kind, reference: str, folder: Path) -> Path:
+    """The file that `reference`, written in a file of `folder`, refers to. Raises NotFound.
 
-    A name is a shipped file of that kind; a path ends in .yaml and leads below `folder` or below the shipped
-    configuration, symbolic links followed.
+    A name refers to a shipped file of that kind. A path ends in .yaml and must be, symbolic links followed, below
+    `folder` or below the shipped configuration.
     """
     if is_name(reference):
-        return named(kind, reference)
+        return shipped_file(kind, reference)
     if not reference.endswith((".yaml", ".yml")) or "\0" in reference:
         known = ", ".join(names(kind.name))
         raise NotFound(f"{reference!r} is no {kind.name}; allowed: a name ({known}), or a path ending in .yaml")

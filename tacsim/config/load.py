@@ -1,4 +1,4 @@
-"""Loading: read, expand references, lay overrides over, validate; all problems of a load are raised together."""
+"""Loading: read, expand references, apply overrides, validate; all problems are raised together."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from tacsim.config.annotation import default, models
-from tacsim.config.document import Node, Reading, as_json, dump, from_plain
+from tacsim.config.document import LoadState, Node, as_json, dump, from_plain
 from tacsim.config.errors import ConfigError, Place, Problem
-from tacsim.config.kinds import NotFound, is_name, kind_of, named
+from tacsim.config.kinds import NotFound, is_name, kind_of, shipped_file
 from tacsim.config.messages import report_errors
 from tacsim.config.overrides import Override, apply, parse_override
 from tacsim.config.references import read_file
@@ -29,7 +29,7 @@ class LoadedRig:
     """A rig file, resolved."""
 
     config: RigConfig
-    text: str  # all of it in one YAML text, every default and reference written out; load_rig reads it back to `facts`
+    text: str  # as one YAML text, every default and reference written out; load_rig reads `config` back from it
     sources: tuple[Path, ...]  # the files it was read from
 
 
@@ -37,40 +37,40 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     """Reads a rig by its name ("sim") or path.
 
     `task` (a name or path) replaces the file's task. `overrides` are texts ``key.sub=value``; those of ``task`` are
-    applied first. If anything in the rig is simulated, ``scene`` then is the effective scene: the rig's own, else the
-    task's, so ``scene.preset=standard`` works either way. In a rig without a simulated part it is None.
+    applied first. If any part of the rig is simulated, ``scene`` is the rig's own, else the task's, so that
+    ``scene.preset=standard`` works in both cases. In a rig without a simulated part it is None.
 
-    Raises ConfigError with every problem found; overrides that loosen the limits of a real arm are one.
+    Raises ConfigError with every problem found; overrides must not weaken the limits of a real arm.
     """
-    reading = Reading()
-    root = _open(RigConfig, rig, reading)
+    state = LoadState()
+    root = _open(RigConfig, rig, state)
     if task is not None:
         place = Place(f"--task {task}")
-        root = apply(root, RigConfig, Override(("task",), Node(task, place, Path.cwd(), text=task)), reading)
-    given = [parsed for text in overrides if (parsed := parse_override(text, reading)) is not None]
+        root = apply(root, RigConfig, Override(("task",), Node(task, place, Path.cwd(), text=task)), state)
+    given = [parsed for text in overrides if (parsed := parse_override(text, state)) is not None]
     of_task = [override for override in given if override.path[0] == "task"]
     of_rest = [override for override in given if override.path[0] != "task"]
     for override in of_task:
-        root = apply(root, RigConfig, override, reading)
+        root = apply(root, RigConfig, override, state)
         if override.path[:2] == ("task", "scene") and _has(root, "scene"):
             what = f"this rig has a scene of its own, which is used; say {'.'.join(override.path[1:])}"
-            reading.report(override.place, ".".join(override.path), what)
+            state.report(override.place, ".".join(override.path), what)
     own_scene = _has(root, "scene") or any(override.path[0] == "scene" for override in of_rest)
-    root = _adopt_scene(root)
+    root = _scene_of_task(root)
     for override in of_rest:
-        root = apply(root, RigConfig, override, reading)
-    root = _anchored(_settle_scene(root, own_scene, reading))
-    config = _validate(RigConfig, root, reading)
+        root = apply(root, RigConfig, override, state)
+    root = _absolute_calibrations(_check_scene(root, own_scene, state))
+    config = _validate(RigConfig, root, state)
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
     text = "# A rig, resolved: every reference and default written out, SI units.\n" + dump(
         config.model_dump(mode="json")
     )
-    return LoadedRig(config, text, tuple(dict.fromkeys(reading.sources)))
+    return LoadedRig(config, text, tuple(dict.fromkeys(state.sources)))
 
 
 def _require_limits(config: RigConfig, file: RigConfig) -> None:
-    """The limits of real arms are those of the file, or narrower: a file is looked over, a command line is typed."""
+    """Overrides may narrow, not weaken, the limits of real arms: a file is reviewed, a command line is typed."""
     problems: list[str] = []
     for name, arm in config.arms.items():
         there = file.arms.get(name)
@@ -83,13 +83,13 @@ def _require_limits(config: RigConfig, file: RigConfig) -> None:
         if kept.get(frozenset(apart.arms), 0.0) < apart.distance
     ]
     if problems:
-        words = "would loosen the limits of a real arm; write it into the rig file"
+        words = "would weaken the limits of a real arm; write it into the rig file"
         raise ConfigError([Problem(Place("--set"), "", f"{what}: {words}") for what in problems])
 
 
-def _anchored(root: Node) -> Node:
-    """The paths of calibrations start from the folder of the file that they are written in (of an option: from the
-    current folder), as references do."""
+def _absolute_calibrations(root: Node) -> Node:
+    """Makes the paths of calibrations absolute: like references, they start from the folder of their file, those of
+    options from the current folder."""
     sensors = root.items.get("sensors")
     if sensors is None or not sensors.items:
         return root
@@ -108,7 +108,7 @@ def _has(root: Node, key: str) -> bool:
 
 
 def _simulated(root: Node) -> bool:
-    """A driver 'sim', or a mock sensor: what it sees is simulated."""
+    """True with a driver 'sim', or with a mock sensor, whose pictures are simulated."""
     parts = [*_entries(root, "arms"), *_entries(root, "sensors")]
     return any(part.items["driver"].value == "sim" for part in parts if "driver" in part.items) or any(
         _has(sensor, "mock") for sensor in _entries(root, "sensors")
@@ -119,7 +119,7 @@ def _entries(root: Node, key: str) -> list[Node]:
     return list(root.items[key].items.values()) if key in root.items else []
 
 
-def _adopt_scene(root: Node) -> Node:
+def _scene_of_task(root: Node) -> Node:
     """The task's scene becomes the rig's, where the rig has none."""
     task = root.items.get("task")
     if _has(root, "scene") or task is None or not task.items:
@@ -128,21 +128,21 @@ def _adopt_scene(root: Node) -> Node:
     return root if scene.is_empty else replace(root, value={**root.items, "scene": scene})
 
 
-def _settle_scene(root: Node, own_scene: bool, reading: Reading) -> Node:
+def _check_scene(root: Node, own_scene: bool, state: LoadState) -> Node:
     if root.broken or not isinstance(root.value, dict):
         return root
     if _simulated(root):
-        root = _adopt_scene(root)  # an override may have taken it away
+        root = _scene_of_task(root)  # an override may have taken it away
         if not _has(root, "scene") and not root.items.get("task", root).broken:
             what = (
                 "is missing: something here is simulated (driver 'sim', or a camera's `mock`); allowed: a scene, or a "
                 "task (which has one)"
             )
-            reading.report(root.place, "scene", what)
+            state.report(root.place, "scene", what)
         return root
     if own_scene and _has(root, "scene"):
         what = "no arm and no sensor of this rig has driver 'sim', so nothing is simulated; leave scene out"
-        reading.report(root.items["scene"].place, "scene", what)
+        state.report(root.items["scene"].place, "scene", what)
     return replace(root, value={name: entry for name, entry in root.items.items() if name != "scene"})
 
 
@@ -169,33 +169,37 @@ def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskConfig:
 
 
 def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
-    reading = Reading()
-    root = _open(annotation, source, reading)
+    state = LoadState()
+    root = _open(annotation, source, state)
     for text in overrides:
-        override = parse_override(text, reading)
+        override = parse_override(text, state)
         if override is not None:
-            root = apply(root, annotation, override, reading)
-    return _validate(annotation, root, reading)
+            root = apply(root, annotation, override, state)
+    return _validate(annotation, root, state)
 
 
-def _open(annotation: Any, source: str | Path, reading: Reading) -> Node:
-    """The expanded tree of the file that a person named on the command line: any path, or a shipped file's name."""
+def _open(annotation: Any, source: str | Path, state: LoadState) -> Node:
+    """The expanded tree of a file that was named by any path, or by the name of a shipped file."""
     place = Place(str(source) or "(no name)")
     kind = kind_of(models(annotation))
     try:
-        path = named(kind, source) if kind is not None and isinstance(source, str) and is_name(source) else Path(source)
+        path = (
+            shipped_file(kind, source)
+            if kind is not None and isinstance(source, str) and is_name(source)
+            else Path(source)
+        )
     except NotFound as error:
         raise ConfigError([Problem(place, "", str(error))]) from None
-    return read_file(path, annotation, reading, lambda what: reading.report(place, "", what))
+    return read_file(path, annotation, state, lambda what: state.report(place, "", what))
 
 
-def _validate(annotation: Any, root: Node, reading: Reading) -> Any:
-    """The model of a tree. Raises ConfigError with every problem, those of reading included."""
+def _validate(annotation: Any, root: Node, state: LoadState) -> Any:
+    """The model of a tree. Raises ConfigError with every problem, including those of reading the files."""
     config = None
     if not root.broken:
         try:
             config = TypeAdapter(annotation).validate_json(as_json(root), strict=True)
         except ValidationError as error:
-            report_errors(error, root, annotation, reading)
-    reading.raise_problems()
+            report_errors(error, root, annotation, state)
+    state.raise_problems()
     return config

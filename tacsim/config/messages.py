@@ -1,4 +1,4 @@
-"""pydantic's errors -> problems at a place, in words for the person who wrote the file."""
+"""pydantic's errors -> problems at a place, in words for the author of the file."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from tacsim.config.annotation import allowed, child, keys, members, models, split, tag_of, variant
-from tacsim.config.document import Node, Reading
+from tacsim.config.document import LoadState, Node
 from tacsim.config.errors import did_you_mean, join, printable
 
 _OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
-    """Where an error is: the nearest node, its annotation and key, and the key that it lacks, if that is the error."""
+class Location:
+    """Where an error is: the nearest node, its annotation and key, and the missing key, if that is the error."""
 
     node: Node
     annotation: Any
@@ -28,39 +28,36 @@ class Spot:
     holder: Node | None = None
 
 
-def report_errors(error: ValidationError, root: Node, annotation: Any, reading: Reading) -> None:
-    """Each error of a failed validation as a problem; what follows from a problem already reported is left out."""
+def report_errors(error: ValidationError, root: Node, annotation: Any, state: LoadState) -> None:
+    """Reports each error of a failed validation, except those that follow from a problem already reported."""
     for detail in error.errors(include_url=False):
         context = detail.get("ctx", {})
-        spot = find(root, annotation, (*detail["loc"], *context.get("at", ())))
-        if not spot.node.broken:
-            reading.report(spot.node.place, _key(spot), _text(detail, spot))
+        location = find(root, annotation, (*detail["loc"], *context.get("at", ())))
+        if not location.node.broken:
+            state.report(location.node.place, _key(location), _text(detail, location))
 
 
-def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Spot:
-    """Follows pydantic's location through the tree.
-
-    At a union pydantic's location names the variant ("box"), which is no key of the file.
-    """
-    spot = Spot(root, annotation, "")
+def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Location:
+    """Follows pydantic's location through the tree. At a union it names the variant ("box"), which is no key."""
+    location = Location(root, annotation, "")
     steps = list(loc)
     while steps:
-        node = spot.node
+        node = location.node
         step = steps.pop(0)
         if step == "[key]":
-            return replace(spot, of_key=True)
-        if len(members(spot.annotation)) > 1:
-            member = _member(spot.annotation, node)
+            return replace(location, of_key=True)
+        if len(members(location.annotation)) > 1:
+            member = _member(location.annotation, node)
             if member is None:
-                return spot
-            spot = replace(spot, annotation=member)
+                return location
+            location = replace(location, annotation=member)
             continue
         entry = _entry(node, step)
-        inner = child(spot.annotation, node, step)
+        inner = child(location.annotation, node, step)
         if entry is None:
-            return Spot(node, spot.annotation, spot.key, absent=step)
-        spot = Spot(entry, inner, join(spot.key, step), parent=spot.annotation, holder=node)
-    return spot
+            return Location(node, location.annotation, location.key, absent=step)
+        location = Location(entry, inner, join(location.key, step), parent=location.annotation, holder=node)
+    return location
 
 
 def _entry(node: Node, step: str | int) -> Node | None:
@@ -70,7 +67,7 @@ def _entry(node: Node, step: str | int) -> Node | None:
 
 
 def _member(annotation: Any, node: Node) -> Any:
-    """The alternative of a union that the node means."""
+    """The alternative of a union that fits the node."""
     model = variant(annotation, node)
     if model is not None:
         return model
@@ -81,39 +78,39 @@ def _member(annotation: Any, node: Node) -> Any:
     return fitting[0] if len(fitting) == 1 else None
 
 
-def _key(spot: Spot) -> str:
-    return join(spot.key, spot.absent) if isinstance(spot.absent, str) else spot.key
+def _key(location: Location) -> str:
+    return join(location.key, location.absent) if isinstance(location.absent, str) else location.key
 
 
-def _text(detail: ErrorDetails, spot: Spot) -> str:
+def _text(detail: ErrorDetails, location: Location) -> str:
     kind, context = detail["type"], detail.get("ctx", {})
-    if kind == "extra_forbidden" or spot.of_key:
-        return _unknown_key(detail, spot)
-    if kind == "missing" and isinstance(spot.absent, str):
-        what = allowed(child(spot.annotation, spot.node, spot.absent))
+    if kind == "extra_forbidden" or location.of_key:
+        return _unknown_key(detail, location)
+    if kind == "missing" and isinstance(location.absent, str):
+        what = allowed(child(location.annotation, location.node, location.absent))
         return f"is missing; allowed: {what}"
     if kind in ("missing", "too_long", "too_short"):
-        return _wrong_length(kind, context, spot)
+        return _wrong_length(kind, context, location)
     if kind in ("union_tag_not_found", "union_tag_invalid"):
-        return _wrong_variant(spot)
-    if kind == "value_error" and (isinstance(spot.node.value, (str, dict))):
+        return _wrong_variant(location)
+    if kind == "value_error" and (isinstance(location.node.value, (str, dict))):
         return str(context["error"])
     if "at" in context:  # a model's own message
         return detail["msg"]
-    if kind == "literal_error" and spot.node.text:
-        options = [str(option) for part in members(spot.annotation) for option in get_args(split(part)[0])]
-        hint = did_you_mean(spot.node.text, options)
-        return f"{spot.node.describe()} is unknown; allowed: {allowed(spot.annotation)}{hint}"
+    if kind == "literal_error" and location.node.text:
+        options = [str(option) for part in members(location.annotation) for option in get_args(split(part)[0])]
+        hint = did_you_mean(location.node.text, options)
+        return f"{location.node.describe()} is unknown; allowed: {allowed(location.annotation)}{hint}"
     if kind in _OUT_OF_RANGE:
-        return f"{spot.node.text} is out of range; allowed: {allowed(spot.annotation)}"
-    if spot.annotation is None or not members(spot.annotation):
+        return f"{location.node.text} is out of range; allowed: {allowed(location.annotation)}"
+    if location.annotation is None or not members(location.annotation):
         return printable(detail["msg"])
-    return f"{spot.node.describe()} does not fit; allowed: {allowed(spot.annotation)}"
+    return f"{location.node.describe()} does not fit; allowed: {allowed(location.annotation)}"
 
 
-def _unknown_key(detail: ErrorDetails, spot: Spot) -> str:
-    name = spot.key.rpartition(".")[2]
-    known = keys(spot.parent, spot.holder)
+def _unknown_key(detail: ErrorDetails, location: Location) -> str:
+    name = location.key.rpartition(".")[2]
+    known = keys(location.parent, location.holder)
     if known:
         return f"unknown key; allowed: {', '.join(known)}{did_you_mean(name, known)}"
     if detail["type"] == "string_pattern_mismatch":
@@ -121,22 +118,22 @@ def _unknown_key(detail: ErrorDetails, spot: Spot) -> str:
     return printable(f"unknown key; {detail['msg']}")
 
 
-def _wrong_length(kind: str, context: dict[str, Any], spot: Spot) -> str:
-    if isinstance(spot.node.value, list):
-        count = len(spot.node.value)
+def _wrong_length(kind: str, context: dict[str, Any], location: Location) -> str:
+    if isinstance(location.node.value, list):
+        count = len(location.node.value)
         what = f"has {count} {'entry' if count == 1 else 'entries'}"
         limit = f"at most {context['max_length']}" if kind == "too_long" and "max_length" in context else None
-        fixed = allowed(spot.annotation)
+        fixed = allowed(location.annotation)
         return f"{what}; allowed: {limit if limit and fixed == 'a list' else fixed}"
-    if isinstance(spot.node.value, dict):
-        return f"has {len(spot.node.value)} entries; allowed: at least {context.get('min_length', 1)}"
-    return f"{spot.node.describe()} does not fit; allowed: {allowed(spot.annotation)}"
+    if isinstance(location.node.value, dict):
+        return f"has {len(location.node.value)} entries; allowed: at least {context.get('min_length', 1)}"
+    return f"{location.node.describe()} does not fit; allowed: {allowed(location.annotation)}"
 
 
-def _wrong_variant(spot: Spot) -> str:
-    tags = [tag for model in models(spot.annotation) if (tag := tag_of(model)) is not None]
+def _wrong_variant(location: Location) -> str:
+    tags = [tag for model in models(location.annotation) if (tag := tag_of(model)) is not None]
     name, options = tags[0][0], [tag[1] for tag in tags]
-    said = spot.node.items.get(name)
+    said = location.node.items.get(name)
     if said is None:
         return f"'{name}' is missing; allowed: {name}: {' | '.join(options)}"
     hint = did_you_mean(said.text, options)

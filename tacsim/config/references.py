@@ -1,4 +1,4 @@
-"""References between files: a name, a path or ``extends: NAME`` becomes the mapping that it stands for."""
+"""References between files: a name, a path or ``extends: NAME`` is replaced by the mapping that it refers to."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from pathlib import Path
 from typing import Any
 
 from tacsim.config.annotation import child, models, variant
-from tacsim.config.document import MAX_NODES, Node, Reading, parse_text, read_text, shown
+from tacsim.config.document import MAX_NODES, LoadState, Node, parse_text, read_text, shown
 from tacsim.config.errors import Place, join
-from tacsim.config.kinds import Kind, NotFound, kind_of, referred
+from tacsim.config.kinds import Kind, NotFound, kind_of, resolve
 
 _MAX_CHAIN = 16  # files that refer to each other in a row
 
 
-def expand(node: Node, annotation: Any, reading: Reading, key: str = "", chain: tuple[Path, ...] = ()) -> Node:
-    """The tree with every reference replaced by what it refers to. Expanding twice changes nothing."""
+def expand(node: Node, annotation: Any, state: LoadState, key: str = "", chain: tuple[Path, ...] = ()) -> Node:
+    """The tree with every reference replaced by its target. Expanding twice changes nothing."""
     kind = kind_of(models(annotation))
     if kind is not None and isinstance(node.value, str):
-        return follow(node, kind, annotation, reading, key, chain)
+        return follow(node, kind, annotation, state, key, chain)
     if kind is not None and "extends" in node.items:
-        node = _extend(node, kind, annotation, reading, key, chain)
+        node = _extend(node, kind, annotation, state, key, chain)
     if isinstance(node.value, dict):
         return replace(
             node,
             value={
-                name: expand(entry, child(annotation, node, name), reading, join(key, name), chain)
+                name: expand(entry, child(annotation, node, name), state, join(key, name), chain)
                 for name, entry in node.value.items()
             },
         )
     if isinstance(node.value, list):
         entries = [
-            expand(entry, child(annotation, node, index), reading, join(key, index), chain)
+            expand(entry, child(annotation, node, index), state, join(key, index), chain)
             for index, entry in enumerate(node.value)
         ]
         return replace(node, value=entries)
@@ -41,32 +41,32 @@ def expand(node: Node, annotation: Any, reading: Reading, key: str = "", chain: 
 
 
 def follow(
-    node: Node, kind: Kind, annotation: Any, reading: Reading, key: str, chain: tuple[Path, ...], said: str = ""
+    node: Node, kind: Kind, annotation: Any, state: LoadState, key: str, chain: tuple[Path, ...], said: str = ""
 ) -> Node:
     """The expanded content of the file that a text node refers to; a broken node after a reported problem.
 
-    `key` is the place of the content in the tree, `said` that of the reference where it is another (``extends``).
+    `key`: of the content in the tree; `said`: of the reference, if that is another (``extends``).
     """
-    refuse = partial(reading.report, node.place, said or key)
+    refuse = partial(state.report, node.place, said or key)
     try:
-        path = referred(kind, str(node.value), node.folder)
+        path = resolve(kind, str(node.value), node.folder)
     except NotFound as error:
         refuse(str(error))
         return _broken(node)
-    return read_file(path, annotation, reading, refuse, key, chain)
+    return read_file(path, annotation, state, refuse, key, chain)
 
 
 def read_file(
     path: Path,
     annotation: Any,
-    reading: Reading,
+    state: LoadState,
     refuse: Callable[[str], None],
     key: str = "",
     chain: tuple[Path, ...] = (),
 ) -> Node:
     """The expanded content of a file. `refuse` reports that it cannot be read, at the place that refers to it."""
     broken = Node(None, Place(shown(path), 1), path.parent, broken=True)
-    path = path.absolute()  # not resolved: messages name the file as it was asked for
+    path = path.absolute()  # not resolved: messages name the file as the person did
     try:
         resolved = path.resolve()
     except (OSError, ValueError, RuntimeError) as error:  # a name with a null byte, a loop of symbolic links
@@ -74,56 +74,56 @@ def read_file(
         return broken
     if resolved in chain:
         circle = " -> ".join(shown(step) for step in (*chain[chain.index(resolved) :], resolved))
-        refuse(f"the reference goes round in a circle: {circle}; break it in one of them")
+        refuse(f"the references form a circle: {circle}; break it in one of them")
         return broken
     if len(chain) >= _MAX_CHAIN:
         refuse(f"more than {_MAX_CHAIN} files refer to each other in a row; shorten the chain")
         return broken
-    if reading.nodes > MAX_NODES:  # said already, and every further file would say it again
+    if state.nodes > MAX_NODES:  # reported already; every further file would report it again
         return broken
-    text = read_text(path, refuse, reading)
+    text = read_text(path, refuse, state)
     if text is None:
         return broken
-    root = parse_text(text, shown(path), path.parent, reading)
+    root = parse_text(text, shown(path), path.parent, state)
     if root.is_empty:
-        reading.report(root.place, key, "the file is empty; allowed: a mapping of keys to values")
+        state.report(root.place, key, "the file is empty; allowed: a mapping of keys to values")
         return broken
-    return expand(root, annotation, reading, key, (*chain, resolved))
+    return expand(root, annotation, state, key, (*chain, resolved))
 
 
-def _extend(node: Node, kind: Kind, annotation: Any, reading: Reading, key: str, chain: tuple[Path, ...]) -> Node:
+def _extend(node: Node, kind: Kind, annotation: Any, state: LoadState, key: str, chain: tuple[Path, ...]) -> Node:
     """``{extends: NAME, more: keys}``: the referenced mapping, the node's own entries merged over it."""
     entries = dict(node.items)
     reference = entries.pop("extends")
     if not isinstance(reference.value, str):
         if not reference.broken:
             what = f"{reference.describe()} does not fit; allowed: the name of a {kind.name}, or a path"
-            reading.report(reference.place, join(key, "extends"), what)
+            state.report(reference.place, join(key, "extends"), what)
         return _broken(node)
-    target = follow(reference, kind, annotation, reading, key, chain, said=join(key, "extends"))
+    target = follow(reference, kind, annotation, state, key, chain, said=join(key, "extends"))
     if target.broken:
         return target
     return merge(target, replace(node, value=entries), annotation)
 
 
 def merge(below: Node, above: Node, annotation: Any) -> Node:
-    """`above` laid over `below`: mappings entry by entry, anything else (and any other reference) replaces."""
+    """`above` merged over `below`: mappings entry by entry; anything else, another reference included, is replaced."""
     if not isinstance(below.value, dict) or not isinstance(above.value, dict) or "extends" in above.value:
         return above
     entries = dict(below.value)
     for name, entry in above.value.items():
         inner = child(annotation, above, name) or child(annotation, below, name)
         entries[name] = merge(entries[name], entry, inner) if name in entries else entry
-    return drop_strangers(below, replace(above, value=entries), annotation, keep=set(above.value))
+    return drop_foreign_keys(below, replace(above, value=entries), annotation, keep=set(above.value))
 
 
-def drop_strangers(old: Node, new: Node, annotation: Any, keep: set[str]) -> Node:
-    """A change of variant (``shape: sphere`` over a box) drops the keys that only the old one has (``size``)."""
+def drop_foreign_keys(old: Node, new: Node, annotation: Any, keep: set[str]) -> Node:
+    """After a change of variant (``shape: sphere`` over a box): without keys that only the old one has (``size``)."""
     before, after = variant(annotation, old), variant(annotation, new)
     if before is None or after is None or before is after:
         return new
-    strangers = set(before.model_fields) - set(after.model_fields) - keep
-    return replace(new, value={name: entry for name, entry in new.items.items() if name not in strangers})
+    foreign = set(before.model_fields) - set(after.model_fields) - keep
+    return replace(new, value={name: entry for name, entry in new.items.items() if name not in foreign})
 
 
 def _broken(node: Node) -> Node:

@@ -29,7 +29,7 @@ def json_schema(kind: str = "rig") -> dict[str, Any]:
 
 
 class _Generator(GenerateJsonSchema):
-    """Adds what the loader takes beside a written-out mapping: the name of a file, and ``extends``."""
+    """Adds what the loader accepts besides a mapping: the name of a file, and ``extends``."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:
         mapping = super().model_schema(schema)
@@ -51,6 +51,6 @@ class _Generator(GenerateJsonSchema):
 
     def tagged_union_schema(self, schema: core_schema.TaggedUnionSchema) -> JsonSchemaValue:
         union = super().tagged_union_schema(schema)
-        union.pop("discriminator", None)  # OpenAPI's keyword, JSON schema has no such
+        union.pop("discriminator", None)  # a keyword of OpenAPI, not of JSON schema
         union["anyOf"] = union.pop("oneOf")  # a reference by name fits every variant
         return union

@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 
 MAX_PARTICLES = 5_000_000
 MAX_NODES = 20_000_000
-MAX_MISFIT = 0.1  # how far the lattice of particles may miss the size or the volume of a shape, relative
+MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 BAND = 2  # grid spacings round a mesh in which the distance is exact
 REMEMBERED = 8  # distance grids of meshes in one process, the latest used; most have 1 to 10 MB

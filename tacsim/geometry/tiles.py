@@ -1,7 +1,7 @@
-"""Signed distance from a mesh on a grid that is laid tile by tile, where it is asked for; the mesh's own frame, metres.
+"""Signed distance from a mesh on a grid whose tiles are computed where they are asked for; in the mesh's frame, metres.
 
-A whole mesh may need a hundred million nodes, and what touches of it is seen only as it moves. What a tile holds does
-not depend on when, or beside which others, it is laid.
+A whole mesh may need a hundred million nodes, and which part touches is known only as it moves. The values of a tile
+do not depend on when, or with which others, it is computed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tacsim.models.scene import Mesh
 Index = NDArray[np.int64]
 
 TILE = 32  # nodes along an edge
-KEPT = 2_000  # tiles in one process, of all meshes, the latest used: 260 MB; one grid has 610 at most
+KEPT = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
 PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
 PIECES = (4_000, 100_000)  # at least, about at most
 

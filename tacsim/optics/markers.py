@@ -1,4 +1,4 @@
-"""Dots printed on the gel: where they are when the surface has moved, and how they are drawn."""
+"""Dots printed on the gel: their positions on the deformed surface, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Markers, SensorGeometry
 from tacsim.optics.spline import displacement_and_jacobian
 
-INK = 0.06  # what a dot leaves of the light [-]
+INK = 0.06  # fraction of the light that a dot lets through [-]
 
 
 def rest_positions(markers: Markers) -> NDArray[np.float64]:
@@ -72,7 +72,7 @@ def _displacement(surface: GelSurface, markers: Markers) -> NDArray[np.float64]:
 def marker_coverage(
     positions: NDArray[np.float64], radius: float | NDArray[np.float64], shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """(rows, columns) share of each pixel that dots cover, for centres (..., 2) u, v and radii (...) or one [px].
+    """(rows, columns) fraction of each pixel that dots cover, for centres (..., 2) u, v and radii (...) or one [px].
 
     Anti-aliased at sub-pixel accuracy: the edge is a ramp one pixel wide. Dots outside the image are left out.
     """
@@ -93,6 +93,6 @@ def marker_coverage(
 
 
 def marker_transmission(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> NDArray[np.float32]:
-    """(H, W) share of its light that each pixel keeps under the dots of the deformed surface."""
+    """(H, W) fraction of its light that each pixel keeps under the dots of the deformed surface."""
     coverage = marker_coverage(*marker_discs(surface, markers, geometry), (geometry.height, geometry.width))
     return np.float32(1.0) - np.float32(1.0 - INK) * coverage

@@ -1,6 +1,6 @@
-"""Noise of a sensor's camera: what changes from picture to picture though nothing moves.
+"""Noise of a sensor's camera: what changes between pictures of a scene at rest.
 
-Real cameras' noise is no white noise: demosaicing, scaling and codecs spread it over neighbouring pixels and, through
+The noise of real cameras is not white: demosaicing, scaling and codecs spread it over neighbouring pixels and, through
 the brightness, over all colours. The model is a normal distribution: a deviation for each colour, correlations of the
 colours, and from pixel to pixel along a row or a column a correlation that falls as a power of the distance (a Markov
 process). It is the same at every brightness: in four recordings of three real sensors the line of EMVA 1288, variance =
@@ -19,18 +19,18 @@ from tacsim.models.sensor import CameraNoise, SensorModel
 Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
-FIELDS = 4  # that are drawn once for a sensor
-SHIFTS = 64  # places, each way, at which a frame may take its part of one
+FIELDS = 4  # of noise, drawn once for a sensor
+SHIFTS = 64  # of a field, in rows and in columns
 HALVINGS = 20  # of the interval in which a field's scale is sought
 
 
 class NoiseSource:
-    """Lays a camera's noise on pictures of one sensor.
+    """Adds a camera's noise to the pictures of one sensor.
 
-    Noise is not drawn anew for each frame, which would cost more than the picture: FIELDS fields somewhat larger than
-    the image are drawn once, and a frame shows one of them, moved by up to SHIFTS pixels each way: FIELDS * SHIFTS^2
-    frames before one repeats, about. Which one follows from seed, sensor, episode and frame alone. Noise of single
-    frames and of pairs is that of the model; a mean over hundreds of frames is not as free of it as it should be.
+    Drawing noise anew for each frame would cost more than rendering it. Therefore FIELDS fields somewhat larger than
+    the image are drawn once, and each frame takes one of them, shifted by up to SHIFTS pixels in rows and columns. That
+    makes FIELDS * SHIFTS^2 patterns; which one follows from seed, sensor, episode and frame alone. Single frames and
+    pairs have the noise of the model; a mean over hundreds of frames keeps more of it than it should.
 
     Rounding is part of the noise, so that the fields are of whole grey levels. Below a deviation of about one that
     makes them a little less correlated than the model says.

@@ -35,16 +35,16 @@ Float32 = NDArray[np.float32]
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
 TEXTURE_PITCH = 0.12e-3
 WHITE = np.float32(255.0)
-STEEPEST = 2.0  # slope that the table of light reaches
-TABLE_POINTS = 256  # of that table, for each quarter's sides
-TABLE_ERROR = 0.5  # the most that it may err by [grey levels]; narrower highlights are not looked up
+STEEPEST = 2.0  # largest slope in the table of light
+TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
+TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
 
 
 class Renderer:
-    """Makes the images of one simulated sensor. All that does not change from frame to frame is computed once.
+    """Renders the images of one simulated sensor. Everything that is the same in all frames is computed once.
 
-    The texture stays where it is in the image: reference and contact frames share it, also under sideways motion. The
-    camera's noise is not part of it: sensors lay that on the pictures they deliver (tacsim.optics.noise).
+    The texture is fixed in the image: reference and contact frames share it, also under sideways motion. The noise of
+    the camera is added by the sensor (tacsim.optics.noise).
     Raises ValueError when markers do not fit on the gel or the background picture does not fit the image.
     """
 
@@ -59,7 +59,7 @@ class Renderer:
         self._beyond = 0.0
         self._light: PhotometricLight | None = None
         if model.photometric is None:
-            self._unlit = WHITE * unlit_image(model.lighting, self._grid.shape)  # what is seen beside the light
+            self._unlit = WHITE * unlit_image(model.lighting, self._grid.shape)  # of the image without the lights
         else:
             self._unlit = WHITE * untouched_image(model.lighting, self._grid.shape)
             red, green, blue = self._unlit.mean(axis=(0, 1)).tolist()
@@ -70,7 +70,7 @@ class Renderer:
 
     @property
     def beyond(self) -> float:
-        """Share of the last image's surface whose slope was clipped to the calibrated range; 0 for Phong lights."""
+        """Fraction of the last image's surface whose slope was clipped to the calibrated range; 0 for Phong lights."""
         return self._beyond
 
     def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
@@ -118,19 +118,19 @@ class Renderer:
 
 
 def shade(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:
-    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2), where `white` is white. Exactly the same
-    for lights in any order: they are summed in an order of their own."""
+    """(H, W, 3) diffuse and specular light from a surface of slopes (H, W, 2), with white at `white`. Lights in any
+    order give the same bits: they are sorted before they are summed."""
     import cv2
 
     slope_x, slope_y = cv2.split(gradient)
     square = np.asarray(cv2.accumulateSquare(slope_y, slope_x * slope_x), dtype=np.float32)
-    facing = np.float32(1.0) / np.sqrt(square + np.float32(1.0))  # n . v
+    cosine = np.float32(1.0) / np.sqrt(square + np.float32(1.0))  # n . v
     channels = np.zeros((3, *slope_x.shape), dtype=np.float32)
     for light in sorted(lighting.lights, key=_order):
         lx, ly, lz = (c / math.hypot(*light.direction) for c in light.direction)
-        lit = np.maximum(cv2.addWeighted(slope_x, -lx, slope_y, -ly, -lz) * facing, np.float32(0.0))  # n . l
+        lit = np.maximum(cv2.addWeighted(slope_x, -lx, slope_y, -ly, -lz) * cosine, np.float32(0.0))  # n . l
         if light.specular > 0:
-            mirrored = np.maximum(2.0 * lit * facing + np.float32(lz), np.float32(0.0))  # r . v, as l . v = -lz
+            mirrored = np.maximum(2.0 * lit * cosine + np.float32(lz), np.float32(0.0))  # r . v, as l . v = -lz
             shiny = cv2.pow(mirrored, lighting.shininess)
             brightness = cv2.addWeighted(lit, light.diffuse, shiny, light.specular, 0.0)
         else:
@@ -164,7 +164,7 @@ def light_at(table: Float32, gradient: Float32) -> Float32:
 
 
 def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
-    """(H, W, 3) what the picture shows beside the shaded lights: ambient, or background - shade(flat gel)."""
+    """(H, W, 3) the picture without the shaded lights: ambient, or background - shade(flat gel)."""
     if lighting.background is None:
         return np.full((*shape, 3), lighting.ambient, dtype=np.float32)
     if isinstance(lighting.background, str):
@@ -176,7 +176,7 @@ def unlit_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
 
 
 def untouched_image(lighting: Lighting, shape: tuple[int, int]) -> Float32:
-    """(H, W, 3) what the picture shows of the flat gel."""
+    """(H, W, 3) the picture of the flat gel."""
     flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
     untouched: Float32 = np.clip(unlit_image(lighting, shape) + flat, 0.0, 1.0)
     return untouched

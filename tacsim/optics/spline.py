@@ -2,7 +2,7 @@
 
 With s the position in lattice spacings, i the nearest node and f = s - i in [-1/2, 1/2], the weights of the nodes
 i-1, i, i+1 are (1/2 - f)^2 / 2, 3/4 - f^2, (1/2 + f)^2 / 2 (de Boor 1978). At the rim the outermost control value
-repeats; beyond it the surface goes on unchanged.
+repeats; beyond it the surface continues unchanged.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class SurfaceSample:
 def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
     """Height and gradient of the deformed surface at the points of `grid`.
 
-    Raises ValueError for a surface that is no surface (shape, NaN, more sideways motion than the gel is wide),
+    Raises ValueError for an invalid surface (shape, NaN, more sideways motion than the gel is wide),
     SurfaceFolded where it folds over.
     """
     table = SurfaceTable(surface)
@@ -88,7 +88,9 @@ class SurfaceTable:
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
-        block = max(1, int(self._pitch / (grid.pitch * (2 if fine else 1))))  # points for each coarse one, each way
+        block = max(
+            1, int(self._pitch / (grid.pitch * (2 if fine else 1)))
+        )  # fine points for a coarse one, along a side
         points = self._material_points(grid if block == 1 else _coarse(grid, block))
         inside = self._on_gel(points)
         if block > 1:
@@ -136,7 +138,7 @@ def surface_map(surface: GelSurface, grid: CanonicalGrid, markers: Markers | Non
 def material_points(surface: GelSurface, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 2) material points X with X + u(X) = x for image points x (n, 2) [m], by Newton on the spline itself.
 
-    Exact to 1 nm and slow; :func:`sample_surface` is the fast way on a grid. Raises SurfaceFolded where there is none.
+    Exact to 1 nm and slow; :func:`sample_surface` is fast on a grid. Raises SurfaceFolded where there is none.
     """
     found = np.array(points, dtype=np.float64)
     displacement, _ = displacement_and_jacobian(surface, found)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacsim.config import KINDS, ConfigError, config_root, json_schema, load, load_rig, load_scene, load_sensor, names
-from tacsim.config.document import Reading, _Loader, as_json, dump, parse_text
+from tacsim.config.document import LoadState, _Loader, as_json, dump, parse_text
 from tacsim.config.load import load_task
 from tacsim.models.hardware import UrArmConfig
 from tacsim.models.rig import ReplaySensorConfig, RepositionConfig, SimSensorConfig, SqueezeConfig
@@ -268,14 +268,14 @@ def test_overriding_the_tag_changes_the_variant() -> None:
 
 @pytest.mark.parametrize("text", ["1e5", "1E5", "+1e5", "100000", "1.e+5", "100000.0"])
 def test_numbers_are_numbers(text: str) -> None:
-    node = parse_text(f"a: {text}", "x", Path(), Reading())
+    node = parse_text(f"a: {text}", "x", Path(), LoadState())
     assert node.items["a"].value == 1e5
     assert as_json(node) == '{"a": 100000}'
 
 
 @pytest.mark.parametrize("text", ["no", "on", "y", "12:30", "2024-01-01", "0x10", "1_000", "1e", ".", "e5", "'1e5'"])
 def test_what_yaml_1_1_would_guess_stays_a_text(text: str) -> None:
-    assert parse_text(f"a: {text}", "x", Path(), Reading()).items["a"].value == text.strip("'")
+    assert parse_text(f"a: {text}", "x", Path(), LoadState()).items["a"].value == text.strip("'")
 
 
 plain = st.recursive(
@@ -296,9 +296,9 @@ def test_what_is_dumped_is_read_back(data: object) -> None:
             return {key: values(child) for key, child in node.value.items()}
         return [values(child) for child in node.value] if isinstance(node.value, list) else node.value
 
-    reading = Reading()
-    back = values(parse_text(dump({"data": data}), "x", Path(), reading))
-    assert reading.problems == []
+    state = LoadState()
+    back = values(parse_text(dump({"data": data}), "x", Path(), state))
+    assert state.problems == []
     assert back == {"data": data}
 
 

@@ -78,7 +78,7 @@ TEXTS = {
                 "modelling-clay, seed, silicone, soft-clay), or a path ending in .yaml"),
     "unknown base": ("name: x\nextends: sqeeze", "a.yaml:2: extends: no scene 'sqeeze'; allowed: press, reposition, squeeze; did you mean 'squeeze'?"),
     "base of a wrong type": ("extends: [squeeze]", "a.yaml:1: extends: a list of 1 does not fit; allowed: the name of a scene, or a path"),
-    "itself": ("a.yaml", "a.yaml:1: the reference goes round in a circle: a.yaml -> a.yaml; break it in one of them"),
+    "itself": ("a.yaml", "a.yaml:1: the references form a circle: a.yaml -> a.yaml; break it in one of them"),
     "duplicate": ("name: x\npreset: draft\nname: y", "a.yaml:3: name: the key is there twice, first at a.yaml:1; keep one"),
     "nested duplicate": ("gel:\n  housing: 1\n  housing: 2", "a.yaml:3: gel.housing: the key is there twice, first at a.yaml:2; keep one"),
     "anchor": ("gel:\n  size: &s [1, 1, 1]", "a.yaml:2: anchors (&) and aliases (*) are not allowed; write the value out, or refer to a file by its name"),
@@ -213,7 +213,7 @@ def test_cyclic_references(folder: Path) -> None:
     (folder / "b.yaml").write_text("name: b\nextends: c.yaml")
     (folder / "c.yaml").write_text("./b.yaml")
     assert complaint() == (
-        "c.yaml:1: the reference goes round in a circle: b.yaml -> c.yaml -> b.yaml; break it in one of them"
+        "c.yaml:1: the references form a circle: b.yaml -> c.yaml -> b.yaml; break it in one of them"
     )
 
 

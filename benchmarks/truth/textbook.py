@@ -50,7 +50,7 @@ class Cube:
 
         params = body_params(CLAY, spacing * 1e-3)
         self.dx, self.dt, self.side = params.cell, COURANT * params.cell, side
-        self.material = Material(
+        self.material = Material(  # type: ignore[call-arg]  # a Taichi dataclass
             mass=params.particle_mass, volume=params.spacing**3, mu=params.mu, lam=params.bulk - 2 * params.mu / 3,
             limit=params.limit,
         )  # fmt: skip

@@ -38,11 +38,11 @@ from tacsim.models.scene import (
 from tacsim.physics import snapshot
 from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.motion.retry import RETRIES
 from tacsim.physics.move import MoveStats
 from tacsim.physics.seed import world as seed_world
 from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds import hybrid, press
+from tacsim.physics.worlds.base import RETRIES
 
 Targets = Mapping[str, Pose]
 Motions = Callable[[World], Iterator[Targets]]

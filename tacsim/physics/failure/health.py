@@ -101,7 +101,7 @@ class SimulationDiverged(RuntimeError):
 def check_launch(arrays: State, good: State, health: Health, where: LaunchSpan) -> Health:
     """`health` of a launch that changed `arrays` from `good` to what they are.
 
-    Raises SimulationDiverged if that is unphysical; tacsim.physics.motion.retry rolls back and tries again.
+    Raises SimulationDiverged if that is unphysical; the world rolls back and tries again.
     """
     fault = _fault(arrays, health)
     if fault is not None:

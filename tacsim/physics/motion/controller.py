@@ -7,9 +7,8 @@ moves at its end.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,26 +105,6 @@ class PreparedLaunch:
     good: State  # copies of the environment's arrays before it
 
 
-class KernelState(Protocol):
-    """The arrays of some environments, and the kernel that advances them."""
-
-    def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
-        """One launch: every environment named is driven by its own drive (n, frames, 6, 3), n its own; others rest."""
-        ...
-
-
-class Environment(Protocol):
-    """A world as one environment of such arrays."""
-
-    def prepare(self, launch: Launch) -> PreparedLaunch:
-        """Sets everything of this environment for the launch. Raises SimulationDiverged if it cannot be done."""
-        ...
-
-    def outcome(self, prepared: PreparedLaunch) -> ForceReading:
-        """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
-        ...
-
-
 # The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the ForceReading at its end,
 # or thrown the SimulationDiverged that the launch ended in. So many worlds can advance in one launch of kernels, each
 # at its own phase of its own motion; `run` runs the motion of a single world.
@@ -148,28 +127,6 @@ def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> Mo
         return stats
     finally:
         motion.close()
-
-
-def advance_all(
-    kernels: KernelState, environments: Sequence[Environment], wanted: Mapping[int, Launch]
-) -> dict[int, ForceReading | SimulationDiverged]:
-    """One launch of kernels for all environments that want one; the outcome of each by its index. An environment that
-    fails does not touch the others."""
-    results: dict[int, ForceReading | SimulationDiverged] = {}
-    ready: dict[int, PreparedLaunch] = {}
-    for index, launch in wanted.items():
-        try:
-            ready[index] = environments[index].prepare(launch)
-        except SimulationDiverged as failure:
-            results[index] = failure
-    if ready:
-        kernels.advance({index: prepared.drive for index, prepared in ready.items()})
-    for index, prepared in ready.items():
-        try:
-            results[index] = environments[index].outcome(prepared)
-        except SimulationDiverged as failure:
-            results[index] = failure
-    return results
 
 
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:

@@ -21,12 +21,11 @@ from tacsim.interface import Pose, Truth
 from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
-from tacsim.physics.motion.controller import ForceReading, Motion, StepNumbers, move_and_settle, run
+from tacsim.physics.motion.controller import ForceReading, Motion, StepNumbers, move_and_settle
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import MM, Path, plan, resolve_targets
-from tacsim.physics.motion.retry import retried
-from tacsim.physics.move import MoveCommand, MoveStats
-from tacsim.physics.snapshot import copies, restore_arrays, snapshot_of
+from tacsim.physics.move import MoveCommand
+from tacsim.physics.snapshot import copies, restore_arrays
 from tacsim.physics.worlds.base import BaseWorld
 
 Float32 = NDArray[np.float32]
@@ -135,9 +134,6 @@ class SeedWorld(BaseWorld):
             "gel_momentum": self._momentum, "gel_gain": self._gain, "backing": self._backing, "layers": self._layers,
         }  # fmt: skip
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
-        return snapshot_of(self.arrays(), self._poses)
-
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See World."""
         self._poses = restore_arrays(self.arrays(), self.sensors, state)
@@ -174,16 +170,10 @@ class SeedWorld(BaseWorld):
 
     # ----------------------------------------------------------------- motion
 
-    def move(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
-        *, flow: bool = False,
-    ) -> MoveStats:  # fmt: skip
-        """See World. Raises ValueError for a tilted target, one that would crush the gels, a duration, and flow."""
-        if duration is not None or flow:
-            raise ValueError("physics 'seed' settles every motion: leave out duration and flow, or use 'hybrid'")
-        return run(self.motion(MoveCommand(targets, loads or {})), self._advance)
-
     def _run_command(self, command: MoveCommand) -> Motion:
+        """Raises ValueError for a tilted target, one that would crush the gels, a duration, and flow."""
+        if command.duration is not None or command.flow:
+            raise ValueError("physics 'seed' settles every motion: leave out duration and flow, or use 'hybrid'")
         end = resolve_targets(self._poses, command.targets)
         end.update((name, self._upright(name, end[name])) for name in command.targets)
         self._check_room(end)
@@ -197,7 +187,7 @@ class SeedWorld(BaseWorld):
             path = replace(self.plan(list(begin.values()), list(end.values())), refine=refine)
             return move_and_settle(path, self.scene.settling, balanced=True)
 
-        stats = yield from retried(self, command, attempt)
+        stats = yield from self._retried(command, attempt)
         self._poses = end
         return stats
 

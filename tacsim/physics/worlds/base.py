@@ -1,14 +1,27 @@
-"""What every world is besides its physics: arrays that kernels change in place, and one motion at a time."""
+"""What every world is besides its physics: one motion at a time, started again with a smaller time step if it fails."""
 
 from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NoReturn, Self
 
+from numpy.typing import NDArray
+
 from tacsim.interface import Pose
-from tacsim.physics.motion.controller import Motion
-from tacsim.physics.move import MoveCommand
+from tacsim.models.scene import Scene
+from tacsim.physics.failure import diagnosis, dump
+from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
+from tacsim.physics.motion.controller import ForceReading, Motion, run
+from tacsim.physics.motion.path import Path
+from tacsim.physics.move import MoveCommand, MoveStats
+from tacsim.physics.snapshot import State, snapshot_of
+
+RETRIES = 2  # each halves the time step
+SMALLEST_CORNER = 0.0  # det F of a gel element at a corner: below, it is turned inside out
+NEW_WORLD = "restore a snapshot, or make a new world"
 
 
 class NotCopyable:
@@ -24,6 +37,7 @@ class NotCopyable:
 class BaseWorld(NotCopyable, ABC):
     """One environment with driven frames, some of which are sensors; its motions come one after the other."""
 
+    scene: Scene
     sensors: tuple[str, ...]
     _poses: dict[str, Pose]  # of the driven frames
     _lock: threading.Lock  # held while it moves
@@ -32,6 +46,17 @@ class BaseWorld(NotCopyable, ABC):
         world = super().__new__(cls)
         world._lock = threading.Lock()
         return world
+
+    @abstractmethod
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Views of all that changes in a motion, by name."""
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        return snapshot_of(self.arrays(), self._poses)
+
+    @abstractmethod
+    def restore(self, state: State) -> None:
+        """See World."""
 
     def pose(self, name: str) -> Pose:
         if name not in self._poses:
@@ -44,8 +69,19 @@ class BaseWorld(NotCopyable, ABC):
             raise KeyError(f"no sensor '{name}'; this world has {', '.join(self.sensors)}")
         return self.sensors.index(name)
 
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
+        *, flow: bool = False,
+    ) -> MoveStats:  # fmt: skip
+        """See World."""
+        return run(self.motion(MoveCommand(targets, loads or {}, duration, flow)), self._advance)
+
+    @abstractmethod
+    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
+        """Substeps first..last of a path in one launch. Raises SimulationDiverged if its state is unphysical."""
+
     def motion(self, command: MoveCommand) -> Motion:
-        """`World.move`, launch by launch. Raises RuntimeError, once begun, while another motion is on its way."""
+        """`move`, launch by launch. Raises RuntimeError, once begun, while another motion is on its way."""
         if not self._lock.acquire(blocking=False):
             raise RuntimeError("this world is already moving: wait for that motion, or give each thread its own world")
         try:
@@ -56,3 +92,46 @@ class BaseWorld(NotCopyable, ABC):
     @abstractmethod
     def _run_command(self, command: MoveCommand) -> Motion:
         """What `motion` does while it holds the lock."""
+
+    def _retried(self, command: MoveCommand, attempt: Callable[[int], Motion]) -> Motion:
+        """`attempt(refine)`, which carries out `command` with 1/refine of the time step; refine = 1, 2, 4 until it
+        succeeds.
+
+        The whole motion starts again, from the state before it: an instability grows for many launches before it shows,
+        so the state at the start of the bad launch is not to be trusted. After every failure, an interruption included,
+        the world is as it was before. Raises SimulationDiverged when all attempts fail or the state was broken already,
+        after writing a dump if one is asked for (tacsim.physics.failure.dump).
+        """
+        before = self.snapshot()
+        broken = diagnosis.not_finite(before)
+        if broken is not None:
+            where = LaunchSpan("before the motion began")
+            failure = SimulationDiverged(broken, where, NEW_WORLD, good=before, failed=before)
+        else:
+            for retry in range(RETRIES + 1):
+                try:
+                    stats = yield from attempt(2**retry)
+                    self._require_upright(command)
+                    return replace(stats, retries=retry)
+                except SimulationDiverged as diverged:
+                    failure, failure.refine = diverged, 2**retry
+                    self.restore(before)
+                    if not diverged.retry:
+                        break
+                except BaseException:
+                    self.restore(before)
+                    raise
+        failure.place = diagnosis.place_of_worst(failure.quantity, failure.good, failure.failed, self.scene.gel.size)
+        dump.write_if_asked(self.scene, self._poses, command, before, failure)
+        raise failure
+
+    def _require_upright(self, command: MoveCommand) -> None:
+        """Raises SimulationDiverged if a motion ended with a gel element inside out."""
+        state, thickness = self.arrays(), self.scene.gel.size[2] * 1e3
+        if "gel_displacement" not in state or diagnosis.nearly_at_rest(state, thickness):
+            return
+        corners = diagnosis.corner_volumes(state, thickness)
+        if corners is not None and not corners.min() > SMALLEST_CORNER:
+            words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
+            end = LaunchSpan("at the end of the motion and its hold", {**self._poses, **command.targets})
+            raise SimulationDiverged(words, end, quantity="corner", failed=state)

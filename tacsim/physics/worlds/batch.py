@@ -13,7 +13,7 @@ from tacsim.compute.runtime import launching
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.motion.controller import Launch, Motion, advance_all
+from tacsim.physics.motion.controller import ForceReading, Launch, Motion
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.worlds.base import NotCopyable
@@ -97,9 +97,7 @@ class Batch(NotCopyable):
                     error.add_note(f"in the motion of environment {index}")
                     raise
             while wanted:
-                with launching():
-                    results = advance_all(self._state, self.worlds, wanted)
-                for index, result in results.items():
+                for index, result in self._advance(wanted).items():
                     motion = motions[index]
                     if isinstance(result, SimulationDiverged):
                         resume(index, partial(motion.throw, result))
@@ -109,6 +107,25 @@ class Batch(NotCopyable):
             for motion in motions.values():
                 motion.close()
         return ends
+
+    @launching()
+    def _advance(self, wanted: Mapping[int, Launch]) -> dict[int, ForceReading | SimulationDiverged]:
+        """One launch for all environments that want one; an environment that fails does not touch the others."""
+        results: dict[int, ForceReading | SimulationDiverged] = {}
+        ready = {}
+        for index, launch in wanted.items():
+            try:
+                ready[index] = self.worlds[index].prepare(launch)
+            except SimulationDiverged as failure:
+                results[index] = failure
+        if ready:
+            self._state.advance({index: prepared.drive for index, prepared in ready.items()})
+        for index, prepared in ready.items():
+            try:
+                results[index] = self.worlds[index].outcome(prepared)
+            except SimulationDiverged as failure:
+                results[index] = failure
+        return results
 
 
 def _require_one_kind(scenes: Sequence[Scene]) -> None:

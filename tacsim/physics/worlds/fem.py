@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tacsim.compute.runtime import launching
 from tacsim.interface import Pose
-from tacsim.models.scene import GelSurface, Scene
+from tacsim.models.scene import GelSurface
 from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
 from tacsim.physics.failure.health import LARGEST_COURANT
@@ -26,13 +26,11 @@ from tacsim.physics.motion.controller import (
     move_and_settle,
     move_flowing,
     move_real_time,
-    run,
 )
 from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, plan, plan_flow, resolve_targets
-from tacsim.physics.motion.retry import retried
-from tacsim.physics.move import MoveCommand, MoveStats
+from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import restore_arrays, snapshot_of
 from tacsim.physics.worlds.base import BaseWorld
 
@@ -67,7 +65,6 @@ class FemWorld(BaseWorld):
     balanced: ClassVar[bool]  # contact forces on all gels add up to the weight of a free body
     yields: bool  # what is pressed yields: it keeps what a hurried motion does to it
 
-    scene: Scene
     _state: FemState
     _index: int
     _gel: GelParams
@@ -77,10 +74,6 @@ class FemWorld(BaseWorld):
     _inertia: Inertia  # of the last motion
 
     # ---------------------------------------------------- what a world adds
-
-    @abstractmethod
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Views of all that changes in a motion, by name."""
 
     def _scalars(self) -> dict[str, NDArray[Any]]:
         """What a snapshot holds besides arrays: how the last motion has left this world."""
@@ -155,12 +148,6 @@ class FemWorld(BaseWorld):
 
     # ----------------------------------------------------------------- motion
 
-    def move(
-        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
-        *, flow: bool = False,
-    ) -> MoveStats:  # fmt: skip
-        return run(self.motion(MoveCommand(targets, loads or {}, duration, flow)), self._advance)
-
     def _run_command(self, command: MoveCommand) -> Motion:
         end = resolve_targets(self._poses, command.targets)
         require_loads(command.loads, self.sensors)
@@ -190,7 +177,7 @@ class FemWorld(BaseWorld):
                 return move_flowing(flow, settling, balanced=self.balanced)
             return come_to_rest(flow, from_rest(refine)) if self._rates.any() else from_rest(refine)
 
-        stats = yield from retried(self, command, attempt)
+        stats = yield from self._retried(command, attempt)
         self._poses = end
         self._rates[...] = flowing.rates[1] if command.flow and flowing.rates is not None else 0.0
         return stats

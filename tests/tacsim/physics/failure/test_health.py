@@ -23,10 +23,10 @@ from tacsim.physics.failure.health import (
 )
 from tacsim.physics.motion.controller import ForceReading, Launch, Motion, run
 from tacsim.physics.motion.path import Path
-from tacsim.physics.motion.retry import RETRIES, retried
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.snapshot import copies
 from tacsim.physics.worlds import press
+from tacsim.physics.worlds.base import RETRIES, BaseWorld
 from tacsim.physics.worlds.press import PressWorld
 
 BALL = Scene(body=None, indenter=Indenter(geometry=Sphere(radius=4e-3)), gel=Gel(size=(10e-3, 10e-3, 4e-3)))
@@ -43,15 +43,20 @@ def one_launch(refine: int) -> Motion:
     return STATS
 
 
-class Particles:
-    """A world whose motion is whatever a test wants."""
+class Particles(BaseWorld):
+    """A world whose motion is a single launch, which a test carries out."""
+
+    sensors = ("lower", "upper")
 
     def __init__(self) -> None:
-        self.scene = Scene()
+        self.scene, self._poses = Scene(), {"lower": Pose(), "upper": Pose()}
         self.state = {"position": np.ones((4, 3), np.float32), "velocity": np.zeros((4, 3), np.float32)}
 
-    def pose(self, name: str) -> Pose:
-        return Pose()
+    def _run_command(self, command: MoveCommand) -> Motion:
+        return self._retried(command, one_launch)
+
+    def _advance(self, path: Path, first: int, last: int) -> ForceReading:
+        raise AssertionError("the test advances it")
 
     def arrays(self) -> dict[str, np.ndarray]:
         return self.state
@@ -129,7 +134,7 @@ def test_a_motion_starts_again_from_the_state_before_it() -> None:
         world.launch(set_to("velocity", (0, 0), 0.0 if path.refine == 2 else np.nan))
         return REST
 
-    stats = run(retried(world, MoveCommand({}), one_launch), advance)
+    stats = run(world.motion(MoveCommand({})), advance)
     assert seen == [(1, 1.0), (2, 1.0)]
     assert stats.retries == 1 and world.state["position"][0, 0] == 2.0
 
@@ -145,7 +150,7 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
         return REST
 
     with pytest.raises(SimulationDiverged) as caught:
-        run(retried(world, MoveCommand({}), one_launch), advance)
+        run(world.motion(MoveCommand({})), advance)
     assert steps == [2**retry for retry in range(RETRIES + 1)]
     assert all(world.state[name].tobytes() == before[name].tobytes() for name in before)
     text = str(caught.value)
@@ -157,13 +162,13 @@ def test_a_motion_that_never_succeeds_leaves_the_world_as_it_was() -> None:
 def test_of_two_motions_in_step_one_fails_and_the_other_goes_on() -> None:
     """As whoever advances many worlds at once does: a failure is thrown into its own motion only."""
     good, bad = Particles(), Particles()
-    motions = [retried(good, MoveCommand({}), one_launch), retried(bad, MoveCommand({}), one_launch)]
+    motions = [good.motion(MoveCommand({})), bad.motion(MoveCommand({}))]
     launches = [next(motion) for motion in motions]
     good.state["position"] += 1.0
     bad.state["position"] += 1.0
     with pytest.raises(StopIteration) as ended:
         motions[0].send(REST)
-    again = motions[1].throw(SimulationDiverged("too fast", "here"))
+    again = motions[1].throw(SimulationDiverged("too fast", HERE))
     assert ended.value.value == STATS
     assert (launches[1].path.refine, again.path.refine) == (1, 2)
     assert good.state["position"].max() == 2.0 and bad.state["position"].max() == 1.0
@@ -178,7 +183,7 @@ def test_an_interrupted_motion_is_taken_back(error: type[BaseException]) -> None
         raise error
 
     with pytest.raises(error):
-        run(retried(world, MoveCommand({}), one_launch), advance)
+        run(world.motion(MoveCommand({})), advance)
     assert world.state["position"].max() == 1.0
 
 
@@ -188,7 +193,7 @@ def test_a_broken_state_is_told_before_anything_moves() -> None:
     with pytest.raises(
         SimulationDiverged, match=r"position\[3, 0\] is nan.*before the motion began.*restore a snapshot"
     ):
-        run(retried(world, MoveCommand({}), one_launch), lambda path, first, last: pytest.fail("it moved"))
+        run(world.motion(MoveCommand({})), lambda path, first, last: pytest.fail("it moved"))
 
 
 def test_a_grid_without_end_is_refused() -> None:

@@ -28,10 +28,10 @@ from tacsim.physics.body import plasticine
 from tacsim.physics.exec.lanes import COPIES, MAX_NUMBERS
 from tacsim.physics.failure.health import LARGEST_GRID, SimulationDiverged
 from tacsim.physics.motion.load import LoadNotReached
-from tacsim.physics.motion.retry import RETRIES
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World, make_world
 from tacsim.physics.worlds import press
+from tacsim.physics.worlds.base import RETRIES
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld

@@ -23,13 +23,28 @@ from robot.errors import DeviceError, DeviceNotConnectedError
 from robot.mock.camera.camera import MockCamera
 
 HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # parallel sessions stay apart
+FPS = 200.0
 WAIT = 20.0  # for what must come, however slow the machine [s]
 
 
-@pytest.fixture
-def camera() -> Iterator[MockCamera]:
-    with MockCamera(host=HOST, fps=60.0) as camera:
+@pytest.fixture(scope="module")
+def shared() -> Iterator[MockCamera]:
+    with MockCamera(host=HOST, fps=FPS) as camera:
         yield camera
+
+
+@pytest.fixture
+def camera(shared: MockCamera) -> Iterator[MockCamera]:
+    """The camera of the module; whole again after each test."""
+    yield shared
+    for fault in (shared.stall, shared.corrupt, shared.refuse):
+        fault(False)
+    shared.drop(0.0)
+    shared.delay(0.0)
+    shared.resize(320, 240)
+    shared.brightness(1.0)
+    shared.disconnect()
+    until(lambda: shared.state().clients == 0)
 
 
 def until(holds: Callable[[], bool]) -> None:
@@ -128,7 +143,7 @@ def test_a_pushed_picture_is_shown_under_its_number(camera: MockCamera) -> None:
                 picture, mark = client.frame()
             assert mark.image == number
             assert np.abs(picture.reshape(-1, 3).mean(axis=0) - (value, 20, 30)).max() < 3
-    assert camera.state().images == 3
+    assert camera.state().images == number
 
 
 def test_a_pushed_picture_does_not_wait_for_the_next_tick() -> None:
@@ -146,7 +161,7 @@ def test_keeps_its_rate(camera: MockCamera) -> None:
     with Client(camera) as client:
         marks = [client.frame()[1] for _ in range(60)]
     rate = 1e6 * (marks[-1].frame - marks[0].frame) / (marks[-1].clock - marks[0].clock)
-    assert 20.0 < rate < 66.0  # 60; a loaded machine may be slower, none is faster
+    assert 20.0 < rate < 1.1 * FPS  # a loaded machine may be slower, none is faster
 
 
 def test_without_stamp() -> None:
@@ -176,10 +191,10 @@ def test_a_slow_client_loses_frames_instead_of_filling_memory() -> None:
         def sent() -> int:
             return camera.state().sent
 
-        until(lambda: camera.state().clients == 1 and camera.state().frames > 60)
+        until(lambda: camera.state().clients == 1 and camera.state().frames > 20)
         stuck = sent()
         frames = camera.state().frames
-        until(lambda: camera.state().frames > frames + 30)
+        until(lambda: camera.state().frames > frames + 15)
         assert sent() <= stuck + 1  # one frame hangs in the socket; no other was handed out
 
 
@@ -209,26 +224,26 @@ def test_drop(camera: MockCamera) -> None:
 def test_delay(camera: MockCamera) -> None:
     camera.delay(0.25)
     with Client(camera) as client:
-        for _ in range(40):  # those of before the delay are through
-            _, mark = client.frame()
+        since = time.monotonic_ns() // 1000
+        while (mark := client.frame()[1]).clock < since:  # those of before the delay
+            pass
         assert time.monotonic_ns() // 1000 - mark.clock > 249_000
 
 
 def test_corrupt(camera: MockCamera) -> None:
     with Client(camera) as client:
-        camera.corrupt(True)
-        broken = 0
-        for _ in range(30):
+
+        def broken() -> bool:
             try:
-                image = np.array(Image.open(io.BytesIO(client.jpeg())).convert("RGB"))
-                broken += stamp.read(image) is None
+                return stamp.read(np.array(Image.open(io.BytesIO(client.jpeg())).convert("RGB"))) is None
             except Exception:
-                broken += 1
-        assert broken >= 20
+                return True
+
+        camera.corrupt(True)
+        until(broken)  # what was under way is whole
+        assert sum(broken() for _ in range(30)) >= 20
         camera.corrupt(False)
-        for _ in range(3):
-            client.jpeg()
-        client.frame()
+        until(lambda: not any(broken() for _ in range(5)))
 
 
 def test_resize_and_brightness(camera: MockCamera) -> None:
@@ -236,13 +251,11 @@ def test_resize_and_brightness(camera: MockCamera) -> None:
     with Client(camera) as client:
         camera.resize(160, 120)
         camera.brightness(1.5)
-        for _ in range(5):
-            picture, _ = client.frame()
-        assert picture.shape == (120, 160, 3) and abs(picture.mean() - 150) < 3
+        until(lambda: client.frame()[0].shape == (120, 160, 3))
+        until(lambda: abs(client.frame()[0].mean() - 150) < 3)
         camera.resize(320, 240)
-        for _ in range(5):
-            picture, _ = client.frame()
-        assert picture.shape == (240, 320, 3) and camera.state().size is None
+        until(lambda: client.frame()[0].shape == (240, 320, 3))
+        assert camera.state().size is None
 
 
 def test_disconnect_cuts_clients(camera: MockCamera) -> None:
@@ -291,7 +304,7 @@ def test_pushes_of_several_threads_keep_their_numbers(camera: MockCamera) -> Non
         thread.start()
     for thread in threads:
         thread.join()
-    assert sorted(numbers) == list(range(1, 61))
+    assert sorted(numbers) == list(range(min(numbers), min(numbers) + 60))
 
 
 @pytest.mark.parametrize(
@@ -300,9 +313,10 @@ def test_pushes_of_several_threads_keep_their_numbers(camera: MockCamera) -> Non
     + [np.zeros((240, 320, 3), np.float32)],
 )
 def test_pushes_of_another_shape_are_refused(camera: MockCamera, image: np.ndarray) -> None:
+    pushed = camera.state().images
     with pytest.raises(ValueError, match=r"push needs \(240, 320, 3\) uint8"):
         camera.push(image)
-    assert camera.state().images == 0
+    assert camera.state().images == pushed
 
 
 def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
@@ -346,10 +360,11 @@ def test_close_is_idempotent_and_leaves_nothing() -> None:
         camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
-def test_a_killed_process_is_said(camera: MockCamera) -> None:
-    os.kill(camera.pid, signal.SIGKILL)
-    with pytest.raises(DeviceNotConnectedError, match="has ended, exit status -9"):
-        camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
+def test_a_killed_process_is_said() -> None:
+    with MockCamera(host=HOST) as camera:
+        os.kill(camera.pid, signal.SIGKILL)
+        with pytest.raises(DeviceNotConnectedError, match="has ended, exit status -9"):
+            camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
 def test_a_process_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:

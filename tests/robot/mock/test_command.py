@@ -7,8 +7,10 @@ import subprocess
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
 from robot.camera.camera import Camera
+from robot.cli import app
 from robot.mock import FaultClient
 from tacsim.models.hardware import CameraSensorConfig
 from tests.robot.mock.wire_client import TIMEOUT, wire_host
@@ -58,5 +60,5 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
     ],
 )
 def test_what_it_refuses(options: list[str], words: str, code: int) -> None:
-    done = subprocess.run([*START, *options], capture_output=True, text=True, timeout=TIMEOUT)
-    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
+    done = CliRunner().invoke(app, ["mock", *options], env={"COLUMNS": "200"})
+    assert done.exit_code == code and words in done.stderr and "Traceback" not in done.stderr

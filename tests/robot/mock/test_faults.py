@@ -50,9 +50,7 @@ def test_state_tells_what_the_wire_tells(mock: MockUR, faults: FaultClient) -> N
         assert state.joints == pytest.approx(package["actual_q"], abs=1e-12)
         assert state.pose == pytest.approx(package["actual_TCP_pose"], abs=1e-12)
         assert state.clients == (30004,) and state.safety == "NORMAL" and state.mode == "RUNNING" and state.rests
-    begun = faults.state()
-    until(lambda: faults.state().tick >= begun.tick + 1000, "1000 ticks")
-    assert faults.state().tick_rate > 0
+    until(lambda: faults.state().tick_rate > 0, "500 ticks since the start of the process")
 
 
 @pytest.mark.parametrize(
@@ -198,7 +196,7 @@ def test_drop_is_seeded_and_drops_its_share(mock: MockUR, faults: FaultClient) -
     with streaming(mock) as client:
         begun = faults.state()
         faults.drop(0.5, seed=3)
-        times = np.array([client.receive()["timestamp"][0] for _ in range(1000)])
+        times = np.array([client.receive()["timestamp"][0] for _ in range(300)])
         ended = faults.state()
     share = (ended.packages_dropped - begun.packages_dropped) / (
         ended.packages_sent + ended.packages_dropped - begun.packages_sent - begun.packages_dropped

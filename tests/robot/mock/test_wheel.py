@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(
 LIMIT = 90.0  # of one client process [s]
 
 BEGIN = """
-import json, time
+import json, os, time
 from rtde_receive import RTDEReceiveInterface
 from rtde_control import RTDEControlInterface
 found = {}
@@ -38,10 +38,9 @@ def ends(receive, test, limit=20):
 
 def client(mock: MockUR, code: str) -> dict[str, Any]:
     """Runs the code with ur_rtde; what it leaves in `found`."""
-    text = (
-        BEGIN + f"host = {mock.host!r}\n" + textwrap.dedent(code) + "\nprint('FOUND' + json.dumps(found), flush=True)"
-    )
-    # The destructors of ur_rtde take a second; what was found is printed before.
+    end = "print('FOUND' + json.dumps(found), flush=True); os._exit(0)"
+    text = "\n".join([BEGIN, f"host = {mock.host!r}", textwrap.dedent(code), end])
+    # Without the destructors of ur_rtde, which take a second.
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=LIMIT)
     lines = [line for line in done.stdout.splitlines() if line.startswith("FOUND")]
     assert lines, done.stdout + done.stderr

@@ -102,10 +102,10 @@ def test_no_data_before_start_and_none_after_pause(mock: MockUR) -> None:
 
 
 def test_the_stream_is_in_order_without_gaps_and_at_its_frequency(mock: MockUR) -> None:
-    for frequency, step in ((500.0, 0.002), (125.0, 0.008), (10.0, 0.1)):
+    for frequency, step, count in ((500.0, 0.002, 12), (125.0, 0.008, 12), (10.0, 0.1, 4)):
         with RtdeClient(mock.host) as client:
             streaming(client, "timestamp", frequency=frequency)
-            times = [client.receive()["timestamp"][0] for _ in range(12)]
+            times = [client.receive()["timestamp"][0] for _ in range(count)]
         np.testing.assert_allclose(np.diff(times), step, atol=1e-9)
 
 
@@ -128,7 +128,7 @@ def test_inputs_have_one_owner_until_it_goes(mock: MockUR) -> None:
         assert second.inputs("input_int_register_0")[0] == 2
 
 
-def test_inputs_are_kept_and_told_through_the_door(mock: MockUR) -> None:
+def test_inputs_are_kept_and_told_by_the_fault_server(mock: MockUR) -> None:
     since = mock.faults.received().last
     with RtdeClient(mock.host) as client:
         client.inputs("input_int_register_5", "input_double_register_7")
@@ -245,9 +245,9 @@ def test_dashboard_power(mock: MockUR) -> None:
 def test_dashboard_pauses_and_plays(mock: MockUR) -> None:
     with ControlClient(mock.host) as client:
         goal = list(client.receive()["actual_TCP_pose"])
-        goal[2] -= 0.1
+        goal[2] -= 0.05
         client.write(3, [*goal, 0.1, 1.0])
-        client.wait(lambda state: state["actual_TCP_pose"][2] < goal[2] + 0.09)
+        client.wait(lambda state: state["actual_TCP_pose"][2] < goal[2] + 0.045)
         assert dashboard(mock.host, "pause", "programState") == ["Pausing program", "PAUSED <unnamed>"]
         client.wait(lambda state: state["runtime_state"] == (4,))
         assert dashboard(mock.host, "play") == ["Starting program"]
@@ -295,11 +295,12 @@ def test_endless_lines_and_programs_are_cut(mock: MockUR, port: int, filling: by
 
 
 def test_slow_reader_loses_whole_packages_only(mock: MockUR) -> None:
+    mock.faults.version(5, 25)  # which has all outputs
     with RtdeClient(mock.host) as slow, RtdeClient(mock.host) as quick:
         slow.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        streaming(slow, *OUTPUTS_WIDE)
+        streaming(slow, *OUTPUTS)
         streaming(quick, "timestamp")
-        until(lambda: mock.faults.state().packages_dropped > 100, "packages are dropped")
+        until(lambda: mock.faults.state().packages_dropped > 60, "packages are dropped")
         times = [slow.receive()["timestamp"][0] for _ in range(2)]
         while times[-1] - times[-2] < 0.1:  # what waited is whole and in order; then some are missing
             times.append(slow.receive()["timestamp"][0])
@@ -308,9 +309,6 @@ def test_slow_reader_loses_whole_packages_only(mock: MockUR) -> None:
         assert steps.min() > 0.0019
         np.testing.assert_allclose(steps / 0.002, np.round(steps / 0.002), atol=1e-6)
         quick.receive()
-
-
-OUTPUTS_WIDE = ("timestamp", *(f"output_double_register_{i}" for i in range(48)), "actual_q", "target_q")
 
 
 def test_a_hundred_connections_and_too_many(mock: MockUR) -> None:
@@ -340,7 +338,7 @@ def test_half_open_lines(mock: MockUR) -> None:
     until(lambda: not mock.faults.state().clients, "gone")
 
 
-def test_door_refuses_nonsense(faults: FaultClient, mock: MockUR) -> None:
+def test_the_fault_server_refuses_nonsense(faults: FaultClient, mock: MockUR) -> None:
     with socket.create_connection((mock.host, 30020), TIMEOUT) as line, line.makefile("rw") as file:
         for request in ("nonsense", "[]", "{}", '{"do": "fly"}', '{"do": "drop"}', '{"do": "wall", "z": 0, "k": 1}'):
             file.write(request + "\n")

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from benchmarks.cases.press import renew as renew
 from benchmarks.cases.real.labels import BadData
-from benchmarks.cases.registry import chosen
+from benchmarks.cases.registry import select_cases
 from benchmarks.harness.machine import backend
 from benchmarks.harness.runner import Case, Stopped, run_cases
 from benchmarks.harness.schema import GROUPS, Report
@@ -77,7 +77,7 @@ def measure(group: str, repeat: int | None, *, baselines: bool, long: bool, data
         return _measure_robot(repeat or (5 if long else 1))
     wanted = [name for name in GROUPS if group == name or (group == "all" and name != "robot")]
     try:
-        cases = chosen(wanted, baselines=baselines, long=long, data=data)
+        cases = select_cases(wanted, baselines=baselines, long=long, data=data)
     except BadData as error:
         raise typer.BadParameter(str(error), param_hint="--data") from None
     with Interrupt() as interrupt, progress() as bar:

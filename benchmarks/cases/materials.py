@@ -19,7 +19,7 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.oracle import laws
 
 RIGID = GelMaterial(youngs_modulus=100e6, poisson_ratio=0.45)  # gels as plates: they give 1 um
-Keep = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
+FreeAxes = tuple[float, float, float]  # by axis: 0 forbids motion, 1 allows it
 HALF_PERIODS = 4  # of a standing wave that are timed
 
 
@@ -204,21 +204,21 @@ def gel_wave(element: float, repeat: int) -> list[Measurement]:
     shape = np.sin(np.pi * depth / (2 * height))
     rows = []
     for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(config.mu / config.density))):
-        keep = (float(axis == 0), 0.0, float(axis == 2))
+        free = (float(axis == 0), 0.0, float(axis == 2))
         count = math.ceil((HALF_PERIODS + 1) * 2 * height / (speed * dt))
 
-        def run(axis: int = axis, keep: Keep = keep, count: int = count) -> FloatArray:
+        def run(axis: int = axis, free: FreeAxes = free, count: int = count) -> FloatArray:
             gel = GelBlock(config, dt, 0.0)
             velocity = gel.state.v[0, 0, ..., axis]
             velocity[:] = 1e-3 * shape
-            heard = np.empty(count)
+            signal = np.empty(count)
             for step in range(count):
-                heard[step] = velocity[1, 1] @ shape
-                gel.advance(1, keep)
-            return heard
+                signal[step] = velocity[1, 1] @ shape
+                gel.advance(1, free)
+            return signal
 
-        timing, heard = timed(run, 1)
-        rows.append(_wave_row(timing, half_period(heard) * dt, 2 * height / speed, f"gel, {name}", count))
+        timing, signal = timed(run, 1)
+        rows.append(_wave_row(timing, half_period(signal) * dt, 2 * height / speed, f"gel, {name}", count))
     return rows
 
 
@@ -234,32 +234,32 @@ def body_wave(spacing: float, repeat: int) -> list[Measurement]:
     phase = np.pi * (rest[:, 2] - rest[:, 2].min() + config.spacing / 2) / length
     rows = []
     for name, axis, speed in (("pressure wave", 2, 1.0), ("shear wave", 0, math.sqrt(config.mu / config.density))):
-        keep = (float(axis == 0), 0.0, float(axis == 2))
+        free = (float(axis == 0), 0.0, float(axis == 2))
         count = math.ceil((HALF_PERIODS + 1) * length / (speed * dt))
 
-        def run(count: int = count, axis: int = axis, keep: Keep = keep) -> FloatArray:
+        def run(count: int = count, axis: int = axis, free: FreeAxes = free) -> FloatArray:
             body = BodyBlock(config, rest, dt)
             body.fit(2 * config.cell)
             velocity = body.state.v()[:, axis]
             velocity[:] = 1e-3 * np.cos(phase)
             body.state.c()[:, axis, 2] = -1e-3 * np.pi / length * np.sin(phase)
-            heard = np.empty(count)
+            signal = np.empty(count)
             for step in range(count):
-                heard[step] = velocity @ np.cos(phase)
-                body.advance(1, keep)
-            return heard
+                signal[step] = velocity @ np.cos(phase)
+                body.advance(1, free)
+            return signal
 
-        timing, heard = timed(run, 1, warm=partial(run, 1))  # seconds that nobody compares
-        rows.append(_wave_row(timing, half_period(heard) * dt, length / speed, f"plasticine, {name}", count))
+        timing, signal = timed(run, 1, warm=partial(run, 1))  # seconds that nobody compares
+        rows.append(_wave_row(timing, half_period(signal) * dt, length / speed, f"plasticine, {name}", count))
     return rows
 
 
-def half_period(heard: FloatArray) -> float:
+def half_period(signal: FloatArray) -> float:
     """Mean distance of the first zero crossings of a signal [samples]. Raises ValueError when there are too few."""
-    at = np.flatnonzero(np.sign(heard[:-1]) * np.sign(heard[1:]) < 0)
+    at = np.flatnonzero(np.sign(signal[:-1]) * np.sign(signal[1:]) < 0)
     if len(at) <= HALF_PERIODS:
         raise ValueError(f"the wave crossed zero {len(at)} times, {HALF_PERIODS + 1} are needed: it does not oscillate")
-    crossing = at + heard[at] / (heard[at] - heard[at + 1])
+    crossing = at + signal[at] / (signal[at] - signal[at + 1])
     return float(crossing[HALF_PERIODS] - crossing[0]) / HALF_PERIODS
 
 

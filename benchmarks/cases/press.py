@@ -72,9 +72,11 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
-USUAL = FASTEST_MACH  # the controller's default for what does not yield: a tenth of the shear wave's speed at nu 0.45
+DEFAULT_MACH = (
+    FASTEST_MACH  # the controller's default for what does not yield: a tenth of the shear wave's speed at nu 0.45
+)
 # Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
-OTHERS = (0.015, 0.05, 0.1)
+OTHER_MACHS = (0.015, 0.05, 0.1)
 
 
 def profile(world: PressWorld) -> Float64:
@@ -107,14 +109,14 @@ def quasi_static(repeat: int) -> list[Measurement]:
             stats.substeps, {"largest_um": _largest(difference), "force_percent": _percent(*forces)},
         )
     ]  # fmt: skip
-    for mach in OTHERS:
+    for mach in OTHER_MACHS:
         scene = press_scene(ball, element, mach=mach)
         timing, (other, stats) = timed(partial(press, scene, DEPTH), 1, warm=lambda: None)
         difference = profile(other) - profile(usual)
         rows.append(
             Measurement(
-                timing, _largest(difference), "µm at most", f"the same press at Mach {USUAL:g}, tolerance 1e-2",
-                f"two speeds, Mach {USUAL:g} and {mach:g}", stats.substeps, {"rms_um": rms(difference) * 1e6},
+                timing, _largest(difference), "µm at most", f"the same press at Mach {DEFAULT_MACH:g}, tolerance 1e-2",
+                f"two speeds, Mach {DEFAULT_MACH:g} and {mach:g}", stats.substeps, {"rms_um": rms(difference) * 1e6},
                 "seconds: at the second speed",
             )
         )  # fmt: skip
@@ -165,9 +167,9 @@ def sliding_force(element: float, repeat: int) -> list[Measurement]:
         return world, ratios, substeps
 
     timing, (world, ratios, substeps) = timed(slide, repeat)
-    way = (len(ratios) - 1) * SLIDE
-    figures = {"ratio": ratios[-1], "normal_n": abs(float(world.wrench("lower")[2])), "way_mm": way * 1e3}
-    note = "" if len(ratios) <= SLIDES else f"the ratio still changes after {way * 1e3:g} mm"
+    distance = (len(ratios) - 1) * SLIDE
+    figures = {"ratio": ratios[-1], "normal_n": abs(float(world.wrench("lower")[2])), "way_mm": distance * 1e3}
+    note = "" if len(ratios) <= SLIDES else f"the ratio still changes after {distance * 1e3:g} mm"
     return [
         Measurement(timing, _percent(ratios[-1], friction), "%", "Coulomb's law", "coefficient 0.3", substeps, figures,
                     note)

@@ -7,17 +7,27 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from benchmarks.cases import deep, incline, materials, press, scenes, squeeze
-from benchmarks.cases.real import balls, depths, films, labels, observe, punches, real, touching, twins
+from benchmarks.cases import incline, large_strain, materials, press, scenes, squeeze
+from benchmarks.cases.real import (
+    ball_touch,
+    balls,
+    contact_radius,
+    costs,
+    films,
+    invariance,
+    known_depth,
+    labels,
+    punches,
+)
 from benchmarks.cases.real.labels import BadData
 from benchmarks.harness.machine import backend
-from benchmarks.harness.runner import Case, lacking
+from benchmarks.harness.runner import Case, missing_case
 from benchmarks.harness.schema import Group
 
 CASES: tuple[Case, ...] = (
     *press.CASES,
     *squeeze.CASES,
-    *deep.CASES,
+    *large_strain.CASES,
     *incline.CASES,
     *materials.CASES,
     *scenes.CASES,
@@ -26,19 +36,21 @@ CASES: tuple[Case, ...] = (
 CPU_ONLY = "it runs on the CPU only"
 
 BY_DATA: dict[tuple[str, str], Callable[..., object]] = {  # cases that depend on the user's frames
-    ("real", real.CASE): real.contact_radius,
+    ("real", contact_radius.CASE): contact_radius.contact_radius,
     ("real", films.CASE): films.marker_film,
     ("real", balls.CASE): balls.ball_presses,
-    ("real", depths.CASE): depths.known_depth,
+    ("real", known_depth.CASE): known_depth.known_depth,
     ("real", punches.CASE): punches.punch,
-    ("real", twins.CASE): twins.invariance,
-    ("real", observe.RENDER): observe.calibrated_render,
-    ("real", observe.NORMALISE): observe.normaliser,
-    ("real", touching.CASE): touching.touch_ball,
+    ("real", invariance.CASE): invariance.invariance,
+    ("real", costs.RENDER): costs.calibrated_render,
+    ("real", costs.NORMALISE): costs.normaliser,
+    ("real", ball_touch.CASE): ball_touch.touch_ball,
 }
 
 
-def chosen(groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None) -> list[Case]:
+def select_cases(
+    groups: Iterable[Group], *, baselines: bool, long: bool = False, data: Path | None = None
+) -> list[Case]:
     """The cases of `groups` in their order; other methods only with `baselines`, long ones only with `long`.
 
     On a device (TACSIM_DEVICE) other methods, and cases that need the CPU, are named as not measured.
@@ -61,15 +73,15 @@ def _real_cases(data: Path) -> tuple[Case, ...]:
     is nothing at all, or where labels of the folder's own name what is not there; ConfigError."""
     found = (*films.cases(data), *balls.cases(data)) if data.is_dir() else ()
     try:
-        presses = real.cases(data)
+        presses = contact_radius.cases(data)
     except BadData as error:
         if all(case.missing for case in found) or (data / labels.OWN).is_file():
             raise
-        presses = (lacking("real", real.CASE, str(error)),)
+        presses = (missing_case("real", contact_radius.CASE, str(error)),)
     if not any(case.name == films.CASE for case in found):
-        found = (*found, lacking("real", films.CASE, f"no film of a dotted gel below {data}"))
-    of_light = (*depths.cases(data), *punches.cases(data), *twins.cases(data))
-    return (*presses, *found, *of_light, *observe.CASES, *touching.CASES)
+        found = (*found, missing_case("real", films.CASE, f"no film of a dotted gel below {data}"))
+    of_light = (*known_depth.cases(data), *punches.cases(data), *invariance.cases(data))
+    return (*presses, *found, *of_light, *costs.CASES, *ball_touch.CASES)
 
 
 def description(group: Group, name: str, method: str) -> str:

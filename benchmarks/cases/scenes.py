@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.cases.press import press, press_scene
-from benchmarks.cases.squeeze import PRESETS, STEP, close, closer, normal_forces, squeeze_scene, touching
+from benchmarks.cases.squeeze import (
+    PRESETS,
+    STEP,
+    close,
+    closing_targets,
+    normal_forces,
+    squeeze_scene,
+    world_in_contact,
+)
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
 from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Mesh, Scene, Shape, Sphere
@@ -67,7 +75,7 @@ def body(material: str, repeat: int) -> list[Measurement]:
         config = scene.body.material
         soft = BodyMaterial(youngs_modulus=config.youngs_modulus, poisson_ratio=config.poisson_ratio)
         scene = scene.model_copy(update={"body": Body(geometry=scene.body.geometry, material=soft)})
-    world = touching(scene)
+    world = world_in_contact(scene)
     close(world, 0.5e-3)
     begin = world.snapshot()
 
@@ -130,7 +138,7 @@ def batch(count: int, repeat: int) -> list[Measurement]:
     """Draft squeezes moved by one launch, each closed by 0.1 mm without a hold: what a substep costs each of them."""
     from tacsim.physics.worlds.batch import Batch
 
-    begin = touching(squeeze_scene("draft"))
+    begin = world_in_contact(squeeze_scene("draft"))
     close(begin, 0.5e-3)
     scene = squeeze_scene("draft", max_substeps=0)
     alone, many = make_world(scene), Batch([scene] * count)
@@ -138,7 +146,7 @@ def batch(count: int, repeat: int) -> list[Measurement]:
         world.restore(begin.snapshot())
 
     def run() -> MoveStats:
-        ends = many.move([closer(world, STEP) for world in many.worlds])
+        ends = many.move([closing_targets(world, STEP) for world in many.worlds])
         for end in ends:
             if isinstance(end, Exception):
                 raise end

@@ -36,7 +36,7 @@ def squeeze_scene(preset: str, physics: str = "hybrid", **settling: float) -> Sc
     return load_scene("squeeze", overrides)
 
 
-def touching(scene: Scene) -> World:
+def world_in_contact(scene: Scene) -> World:
     """A new world whose gels have just met the body, at rest."""
     world = make_world(scene)
     truth = world.truth()
@@ -46,7 +46,7 @@ def touching(scene: Scene) -> World:
     return world
 
 
-def closer(world: World, by: float) -> dict[str, Pose]:
+def closing_targets(world: World, by: float) -> dict[str, Pose]:
     """Targets of both sensors, nearer to each other by `by` [m] in all."""
     targets = {}
     for name, sign in (("lower", 1.0), ("upper", -1.0)):
@@ -57,7 +57,7 @@ def closer(world: World, by: float) -> dict[str, Pose]:
 
 def close(world: World, by: float, *, flow: bool = False) -> MoveStats:
     """Moves both sensors towards each other, by `by` [m] in all."""
-    return world.move(closer(world, by), flow=flow)
+    return world.move(closing_targets(world, by), flow=flow)
 
 
 def normal_forces(world: World) -> FloatArray:
@@ -70,7 +70,7 @@ def slow_force(preset: str, physics: str = "hybrid") -> float:
     scene = squeeze_scene(preset, physics, **SLOW)
 
     def compute() -> list[float]:
-        world = touching(scene)
+        world = world_in_contact(scene)
         stats = close(world, SQUEEZE)
         if not stats.settled:
             raise RuntimeError(f"the slow squeeze did not settle: residual {stats.residual:.2g}")
@@ -84,7 +84,7 @@ def squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]:
     truth = slow_force(preset, physics)
     rows = []
     for settling, name in ((NOT_SETTLED, "not settled"), ({}, "settled to 1 %")):
-        start = touching(squeeze_scene(preset, physics))
+        start = world_in_contact(squeeze_scene(preset, physics))
         world = make_world(squeeze_scene(preset, physics, **settling))
         world.restore(start.snapshot())
         rows += _squeeze_rows(world, truth, name, repeat)
@@ -149,7 +149,7 @@ def settled_squeeze(preset: str, physics: str, repeat: int) -> list[Measurement]
     Our row of this very mesh is judged without its coarseness; the seed's bodies stick where ours rub.
     """
     truth = slow_force("standard")
-    world = touching(squeeze_scene(preset, physics))
+    world = world_in_contact(squeeze_scene(preset, physics))
     timing, stats = _squeezed_again(world, repeat)
     force = float(normal_forces(world).mean())
     figures = {"force_n": force, "truth_n": truth}
@@ -199,7 +199,7 @@ def _control_step_row(preset: str, physics: str, truth: FloatArray, flow: bool, 
 
 def _squeezed(scene: Scene) -> World:
     """By 1 mm from touch, so slowly that the way there adds nothing."""
-    slow = touching(squeeze_scene(scene.preset, scene.physics, **{**SLOW, "mach": 0.01}))
+    slow = world_in_contact(squeeze_scene(scene.preset, scene.physics, **{**SLOW, "mach": 0.01}))
     close(slow, 1e-3)
     world = make_world(scene)
     world.restore(slow.snapshot())
@@ -224,8 +224,8 @@ def slow_steps(preset: str, physics: str) -> FloatArray:
 
 def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
     """Pressed 0.5 mm, then the upper sensor moves 3 mm along x: by symmetry the body ends half-way."""
-    way = 3e-3
-    world = touching(squeeze_scene(preset, physics))
+    displacement = 3e-3
+    world = world_in_contact(squeeze_scene(preset, physics))
     close(world, 0.5e-3)
     begin = world.snapshot()
     centre = world.truth()
@@ -233,15 +233,15 @@ def reposition(preset: str, physics: str, repeat: int) -> list[Measurement]:
 
     def run() -> MoveStats:
         world.restore(begin)
-        return world.move({"upper": Pose(pose.position + [way, 0.0, 0.0], pose.quaternion)})
+        return world.move({"upper": Pose(pose.position + [displacement, 0.0, 0.0], pose.quaternion)})
 
     timing, stats = timed(run, repeat, warm=lambda: None)
     moved = world.truth()
     assert centre is not None and moved is not None
     travel = float(moved.position[0] - centre.position[0])
     return [
-        Measurement(timing, abs(travel - way / 2) * 1e3, "mm", "half the sensor's way, by symmetry", "3 mm sideways",
-                    stats.substeps, {"travel_mm": travel * 1e3, "residual": stats.residual},
+        Measurement(timing, abs(travel - displacement / 2) * 1e3, "mm", "half the sensor's path, by symmetry",
+                    "3 mm sideways", stats.substeps, {"travel_mm": travel * 1e3, "residual": stats.residual},
                     "" if stats.settled else "not settled")
     ]  # fmt: skip
 
@@ -259,7 +259,7 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
     scene = squeeze_scene(preset)
     assert scene.body is not None
     body = scene.body.model_copy(update={"sampling": sampling})
-    world = touching(scene.model_copy(update={"body": body}))
+    world = world_in_contact(scene.model_copy(update={"body": body}))
     begin = world.snapshot()
 
     def run() -> MoveStats:

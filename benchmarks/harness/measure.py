@@ -13,8 +13,8 @@ import numpy as np
 
 T = TypeVar("T")
 BUDGET = 1.0  # [s] no further repetition once the timed ones took this long ...
-LEAST = 3  # ... but so many, which a spread needs, ...
-DEAR = 5.0  # [s] ... unless one takes so long
+MIN_REPETITIONS = 3  # ... but so many, which a spread needs, ...
+LONG_REPETITION = 5.0  # [s] ... unless one takes so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def timed(run: Callable[[], T], repeat: int, warm: Callable[[], object] | None =
 
 
 def _worth_another(samples: Sequence[float]) -> bool:
-    return sum(samples) < BUDGET or (len(samples) < LEAST and max(samples) < DEAR)
+    return sum(samples) < BUDGET or (len(samples) < MIN_REPETITIONS and max(samples) < LONG_REPETITION)
 
 
 def step_cost(timing: Timing, substeps: int, count: int, what: str) -> dict[str, float]:

@@ -47,12 +47,12 @@ class Case:
         return self.cpu or self.method != "tacsim"
 
 
-def lacking(group: Group, name: str, why: str, resolution: str = "") -> Case:
+def missing_case(group: Group, name: str, why: str, resolution: str = "") -> Case:
     """A case of ours that cannot be measured here, and why."""
-    return Case(group, name, "tacsim", resolution, _never, missing=why)
+    return Case(group, name, "tacsim", resolution, _raise_missing, missing=why)
 
 
-def _never(repeat: int) -> list[Measurement]:
+def _raise_missing(repeat: int) -> list[Measurement]:
     raise AssertionError("a case that lacks its frames was measured")
 
 
@@ -70,7 +70,7 @@ def run_cases(
     failures: list[Failure] = []
     missing = [Missing(**_names(case), cause=case.missing) for case in cases if case.missing]
     group_seconds: dict[Group, float] = {}
-    for together in _apart([case for case in cases if not case.missing]):
+    for together in _by_process([case for case in cases if not case.missing]):
         started = time.perf_counter()
         for case, found in _run(together, repeat, on_start, stop):
             if isinstance(found, str):
@@ -95,7 +95,7 @@ def _names(case: Case) -> dict[str, Any]:
     return {"group": case.group, "case": case.name, "method": case.method, "resolution": case.resolution}
 
 
-def _apart(cases: Sequence[Case]) -> list[list[Case]]:
+def _by_process(cases: Sequence[Case]) -> list[list[Case]]:
     """Our own short cases of a group share a process, since loading the kernels takes longer than most of them run;
     another method gets one of its own, and so does every long case."""
     parts: dict[object, list[Case]] = {}

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MM = 1e3  # m -> mm, of a snapshot's lengths
 CELL = 2.0  # of the patch, in particle spacings
-FACING = 0.7  # least cosine between a particle's plane and the gel's surface
+LEAST_COSINE = 0.7  # least cosine between a particle's plane and the gel's surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +55,13 @@ def _of_sensor(world: World, name: str, index: int, spacing: float) -> Gaps:
     feet = transform(to_sensor, surface_points(x[outer], planes[outer]) / MM)
     normal = rotate(to_sensor, planes[outer])
     at, distance, upwards = _from_gel(world.surface(name), feet)
-    facing = -(normal * upwards).sum(axis=1) > FACING * np.linalg.norm(normal, axis=1)
+    towards_gel = -(normal * upwards).sum(axis=1) > LEAST_COSINE * np.linalg.norm(normal, axis=1)
     cell = np.floor(at / (CELL * spacing)).astype(int)
     cell -= cell.min(axis=0) - 1
     patch = np.zeros(cell.max(axis=0) + 2, dtype=bool)
     patch[tuple(cell[loaded].T)] = True
     within = binary_erosion(binary_fill_holes(patch), np.ones((3, 3), dtype=bool))[tuple(cell.T)]
-    inside, ring = distance[facing & within], distance[loaded & ~within]
+    inside, ring = distance[towards_gel & within], distance[loaded & ~within]
     if not len(inside):
         raise ValueError(f"'{name}' has no contact patch of at least three cells of {CELL * spacing * MM:g} mm across")
     return Gaps(

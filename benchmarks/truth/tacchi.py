@@ -98,7 +98,7 @@ def ball_cap() -> np.ndarray:
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=-1)
 
 
-class Press:
+class TacchiPress:
     """Gel and ball at the start; z = 0 is the grid's lower face."""
 
     def __init__(self) -> None:
@@ -134,9 +134,9 @@ class Press:
         return self.top - float(self.x[: self.gel, 2][self.surface].min())
 
 
-def run() -> tuple[Press, int]:
+def run() -> tuple[TacchiPress, int]:
     """Presses until the top layer has sunk by 1 mm. Raises RuntimeError if it never does."""
-    press = Press()
+    press = TacchiPress()
     for step in range(1, LONGEST + 1):
         press.substep()
         if press.sunk >= DEPTH * 1e3:
@@ -147,7 +147,7 @@ def run() -> tuple[Press, int]:
 def sphere_press(repeat: int) -> list[Measurement]:
     """The surface when the published run stops, against the limit of fine meshes."""
     start()
-    timing, (press, substeps) = timed(run, repeat, lambda: Press().substep())
+    timing, (press, substeps) = timed(run, repeat, lambda: TacchiPress().substep())
     at = press.rest[press.surface]
     found = (press.x[: press.gel, 2][press.surface] - press.top).astype(np.float64) * 1e-3
     line = np.linspace(-GRID_HALF, GRID_HALF, load_limit().profile.shape[0])

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from benchmarks.cases.real import observe, touching
-from benchmarks.cases.registry import CPU_ONLY, chosen
+from benchmarks.cases.real import ball_touch, costs
+from benchmarks.cases.registry import CPU_ONLY, select_cases
 from benchmarks.harness import machine
 from benchmarks.harness.runner import run_cases
 from benchmarks.harness.schema import Device, Failure, Missing, Report, Row, json_schema
@@ -101,10 +101,10 @@ def test_a_gpu_is_named_as_far_as_a_tool_names_it(
 def test_what_needs_the_cpu_is_named_and_not_run_on_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TACSIM_DEVICE", raising=False)
     groups = ("press", "squeeze", "materials", "scenes")
-    here = chosen(groups, baselines=True, long=True)
+    here = select_cases(groups, baselines=True, long=True)
     assert not any(case.missing for case in here)
     monkeypatch.setenv("TACSIM_DEVICE", "cuda")
-    there = chosen(groups, baselines=True, long=True)
+    there = select_cases(groups, baselines=True, long=True)
     assert [case.name for case in there] == [case.name for case in here]
     left = [case for case in there if case.missing]
     blocks = {"oedometer", "wave_speed", "momentum", "plasticine_alone"}
@@ -112,7 +112,7 @@ def test_what_needs_the_cpu_is_named_and_not_run_on_a_device(monkeypatch: pytest
     assert {case.method for case in left} == {"tacsim", "seed", "textbook", "tacchi-settings", "layer"}
     measured = {case.name for case in there if not case.missing}
     assert measured >= {"sphere_press", "squeeze", "control_step", "batch", "gel_step", "yield_plateau", "second_world"}
-    assert all(case.needs_cpu for case in (*observe.CASES, *touching.CASES))
+    assert all(case.needs_cpu for case in (*costs.CASES, *ball_touch.CASES))
     report = run_cases(left, 1, baselines=True)
     assert report.results == [] and report.failures == []
     assert {lack.cause for lack in report.missing} == {CPU_ONLY}
@@ -126,7 +126,7 @@ def test_what_is_marked_in_the_materials_group_makes_a_single_block(monkeypatch:
         raise RuntimeError(cpu_only or "")
 
     monkeypatch.setattr(blocks, "start", refuse)
-    for case in chosen(["materials"], baselines=False):
+    for case in select_cases(["materials"], baselines=False):
         if case.cpu:
             with pytest.raises(RuntimeError, match="a single block"):
                 case.measure(1)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from benchmarks.cases.real.films import CASE, OWN, SHIPPED, Films, marker_film, read_films
 from benchmarks.cases.real.labels import BadData
-from benchmarks.cases.registry import chosen, description
+from benchmarks.cases.registry import description, select_cases
 from tacsim.config import load
 from tests.calibration.dotted import draw, lattice_points
 
@@ -44,7 +44,7 @@ def film(drawn: Path, tmp_path: Path) -> Path:
 
 
 def test_dots_are_followed_and_those_that_leave_are_told(film: Path) -> None:
-    (case,) = (case for case in chosen(["real"], baselines=False, data=film) if case.name == CASE)
+    (case,) = (case for case in select_cases(["real"], baselines=False, data=film) if case.name == CASE)
     assert description("real", case.name, "tacsim").startswith("Dots followed")
     (row,) = case.measure(1)
     assert row.figures["dots"] == 48

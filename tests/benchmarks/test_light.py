@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from benchmarks.cases.real import balls, depths, observe, punches, twins
+from benchmarks.cases.real import balls, costs, invariance, known_depth, punches
 from benchmarks.cases.real.labels import BadData, read_labels
-from benchmarks.cases.registry import chosen, description
+from benchmarks.cases.registry import description, select_cases
 from benchmarks.harness.runner import run_cases
 from benchmarks.harness.schema import Row
 from benchmarks.pages.page import markdown
@@ -123,7 +123,7 @@ def test_only_the_first_set_that_is_there_is_calibrated_without_long(tmp_path: P
 
 
 def test_a_press_of_known_depth_is_simulated_from_it_alone(folder: Path) -> None:
-    picture, height = depths.known_depth(folder, BALL, 1)
+    picture, height = known_depth.known_depth(folder, BALL, 1)
     assert picture.variant.endswith(": picture") and height.variant.endswith(": height")
     assert picture.error < 0.3 * picture.figures["null_grey"]  # noise of frame and reference is half of it
     assert picture.figures["ssim"] > picture.figures["null_ssim"] + 0.1
@@ -155,7 +155,7 @@ def test_the_highest_face_of_a_mesh_is_the_punch(tmp_path: Path) -> None:
 
 
 def test_what_a_folder_lacks_is_said_and_is_no_failure(folder: Path) -> None:
-    cases = chosen(["real"], baselines=False, long=True, data=folder)
+    cases = select_cases(["real"], baselines=False, long=True, data=folder)
     lacking = {(case.name, case.resolution): case.missing for case in cases if case.missing}
     words = " | ".join(lacking.values())
     assert "lost: no nowhere_*.png below" in words
@@ -167,22 +167,24 @@ def test_what_a_folder_lacks_is_said_and_is_no_failure(folder: Path) -> None:
     assert {one.cause for one in report.missing} == set(lacking.values())
     assert "- ball_presses: lost: no nowhere" in markdown(report)
     there = {case.name for case in cases if not case.missing}
-    assert {balls.CASE, depths.CASE, punches.CASE, twins.CASE, observe.RENDER, observe.NORMALISE} <= there
+    assert {balls.CASE, known_depth.CASE, punches.CASE, invariance.CASE, costs.RENDER, costs.NORMALISE} <= there
     assert all(description("real", case.name, case.method) for case in cases)
 
 
 def test_without_light_everything_that_needs_it_says_so(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "presses.yaml").write_text(PRESSES.replace("light: hidden", "light: ''"), encoding="utf-8")
-    assert all("calibrate its light" in case.missing for case in (*depths.cases(tmp_path), *twins.cases(tmp_path)))
+    assert all(
+        "calibrate its light" in case.missing for case in (*known_depth.cases(tmp_path), *invariance.cases(tmp_path))
+    )
     (tmp_path / "presses.yaml").write_text(PRESSES, encoding="utf-8")
     (tmp_path / balls.OWN).write_text((folder / balls.OWN).read_text(encoding="utf-8"), encoding="utf-8")
     with pytest.raises(BadData, match=r"no ball_\*\.png below"):
-        depths.light_of(tmp_path, read_labels(tmp_path))
+        known_depth.light_of(tmp_path, read_labels(tmp_path))
 
 
 @pytest.mark.deep
 def test_costs_are_measured_beside_their_error() -> None:
-    for row in (*observe.calibrated_render(320, 3), *observe.normaliser(3)):
+    for row in (*costs.calibrated_render(320, 3), *costs.normaliser(3)):
         assert row.timing.median > 0 and len(row.timing.samples) >= 3
         limit = 1.0 if row.error_unit == "grey at most" else 6.0
         assert row.error < limit, row.variant
@@ -192,15 +194,15 @@ def test_costs_are_measured_beside_their_error() -> None:
 def test_presses_of_our_gel_beside_the_same_made_up_ones(
     folder: Path, hidden: balls.BallSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(twins, "LEAST_PRESSES", 6)
-    monkeypatch.setattr(twins, "FOLDS", 2)
-    rows = {row.variant: row for row in twins.invariance(folder, hidden, (21e-3, 16e-3, 8e-3), 1)}
+    monkeypatch.setattr(invariance, "MIN_PRESSES", 6)
+    monkeypatch.setattr(invariance, "FOLDS", 2)
+    rows = {row.variant: row for row in invariance.invariance(folder, hidden, (21e-3, 16e-3, 8e-3), 1)}
     assert rows["pictures: picture"].error < 0.25 * rows["pictures: picture"].figures["null"]
     assert rows["surfaces: rho, gradient"].error < 1
     assert rows["surfaces: rho, gradient"].figures["presses"] == 6
-    monkeypatch.setattr(twins, "LEAST_PRESSES", 10)
+    monkeypatch.setattr(invariance, "MIN_PRESSES", 10)
     with pytest.raises(BadData, match="6 presses; 10 are the least"):
-        twins.invariance(folder, hidden, (21e-3, 16e-3, 8e-3), 1)
+        invariance.invariance(folder, hidden, (21e-3, 16e-3, 8e-3), 1)
 
 
 def test_each_target_of_the_real_group_finds_its_rows() -> None:

@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from benchmarks.cases.press import layer_press
-from benchmarks.cases.registry import CASES, chosen, description
+from benchmarks.cases.registry import CASES, description, select_cases
 from benchmarks.harness import cache, measure
 from benchmarks.harness.measure import Measurement, Timing, forget_peak_memory, peak_memory, timed
 from benchmarks.harness.runner import Case, Stopped, run_cases
@@ -37,7 +37,7 @@ def test_repetitions_stop_at_the_budget_but_one_is_made(monkeypatch: pytest.Monk
     assert len(timed(lambda: 0, 2)[0].samples) == 2
     assert len(timed(lambda: 0, 1)[0].samples) == 1
     clock = iter(range(100))
-    monkeypatch.setattr(measure.time, "perf_counter", lambda: 1.01 * measure.DEAR * next(clock))
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: 1.01 * measure.LONG_REPETITION * next(clock))
     assert len(timed(lambda: 0, 10)[0].samples) == 1
 
 
@@ -154,11 +154,11 @@ def test_without_baselines_only_short_cases_of_ours() -> None:
     for group in GROUPS:
         if group in ("real", "robot"):  # no cases without frames; measured by tests
             continue
-        short = chosen([group], baselines=False)
-        every = chosen([group], baselines=True, long=True)
+        short = select_cases([group], baselines=False)
+        every = select_cases([group], baselines=True, long=True)
         assert short and set(short) <= set(every)
         assert {case.method for case in short} <= {"tacsim", "layer"} and not any(case.long for case in short)
-    baselines, long = chosen(GROUPS, baselines=True), chosen(GROUPS, baselines=False, long=True)
+    baselines, long = select_cases(GROUPS, baselines=True), select_cases(GROUPS, baselines=False, long=True)
     assert {case.method for case in baselines} > {"tacsim", "layer"} and not any(case.long for case in baselines)
     assert {case.method for case in long} == {"tacsim", "layer"} and any(case.long for case in long)
 

@@ -29,12 +29,12 @@ def test_a_balls_dent_is_that_of_fine_meshes() -> None:
 def test_a_press_ends_where_a_slow_one_does() -> None:
     settled, *speeds = press.quasi_static(1)
     assert settled.error < 1.2 and settled.figures["force_percent"] < 0.5
-    by_mach = dict(zip(press.OTHERS, speeds, strict=True))
+    by_mach = dict(zip(press.OTHER_MACHS, speeds, strict=True))
     for mach, most in ((0.015, 3.0), (0.05, 5.0), (0.1, 25.0)):  # um at most
         row = by_mach[mach]
         assert 0 < row.figures["rms_um"] < row.error < most
         assert row.substeps is not None and settled.substeps is not None
-        assert (row.substeps > settled.substeps) == (mach < press.USUAL)
+        assert (row.substeps > settled.substeps) == (mach < press.DEFAULT_MACH)
 
 
 @pytest.mark.deep

@@ -11,9 +11,9 @@ from matplotlib.image import imread
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-from benchmarks.cases.real import real
-from benchmarks.cases.real.labels import OWN, SHIPPED, BadData, Presses, read_frames, read_labels
-from benchmarks.cases.registry import chosen
+from benchmarks.cases.real import contact_radius
+from benchmarks.cases.real.labels import OWN, SHIPPED, BadData, PressLabels, read_frames, read_labels
+from benchmarks.cases.registry import select_cases
 from benchmarks.harness.runner import measure
 from benchmarks.pages.picture import draw_radii
 from robot.cli import app
@@ -31,8 +31,8 @@ def test_the_radius_of_frame_and_simulation(
     folder_of_frames: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, truth = folder_of_frames
-    monkeypatch.setattr(real, "ELEMENT", 0.5e-3)
-    case = chosen(["real"], baselines=False, data=folder)[0]
+    monkeypatch.setattr(contact_radius, "ELEMENT", 0.5e-3)
+    case = select_cases(["real"], baselines=False, data=folder)[0]
     rows = {row.variant: row for row in measure(case, 1)}
     image, pressure = rows["R 3 mm, 0.5 mm deep: image"], rows["R 3 mm, 0.5 mm deep: pressure"]
     assert image.figures["real_px"] == pytest.approx(truth, abs=1.0)
@@ -52,23 +52,23 @@ def test_other_thicknesses_are_long_rows(folder_of_frames: Folder) -> None:
     folder, _ = folder_of_frames
 
     def thicknesses(*, long: bool) -> list[str]:
-        cases = chosen(["real"], baselines=False, long=long, data=folder)
-        return [case.resolution for case in cases if case.name == real.CASE]
+        cases = select_cases(["real"], baselines=False, long=long, data=folder)
+        return [case.resolution for case in cases if case.name == contact_radius.CASE]
 
     assert thicknesses(long=False) == ["ball R 3 mm, gel 4 mm, h 0.5 mm"]
     assert len(thicknesses(long=True)) == 2
-    assert chosen(["real"], baselines=True, long=True) == []
+    assert select_cases(["real"], baselines=True, long=True) == []
 
 
 def test_the_shipped_labels_are_those_of_the_public_set() -> None:
-    labels = load(Presses, SHIPPED)
+    labels = load(PressLabels, SHIPPED)
     assert [press.radius_px for press in labels.presses] == [12.5, 20.0, 25.5, 30.5, 18.5, 28.0, 35.5, 42.0]
     assert labels.balls == pytest.approx([2.92e-3, 4.925e-3])
     assert labels.pixel_pitch == pytest.approx(5.92593e-5)
 
 
 def test_a_folder_without_labels_of_its_own_is_searched_for_the_public_frames(tmp_path: Path) -> None:
-    assert read_labels(tmp_path) == load(Presses, SHIPPED)
+    assert read_labels(tmp_path) == load(PressLabels, SHIPPED)
     with pytest.raises(BadData, match=r"no frame of 'THUsight.*sphere_0\.25_real\.png"):
         read_frames(tmp_path, read_labels(tmp_path))
 
@@ -123,8 +123,8 @@ def test_labels_with_mistakes_say_where(folder_of_frames: Folder) -> None:
 def test_a_frame_without_a_dent_is_named(folder_of_frames: Folder) -> None:
     folder, _ = folder_of_frames
     empty = np.asarray(Image.open(folder / "deep" / "empty.png"))
-    camera = real.Camera(read_labels(folder), empty)
-    with pytest.raises(BadData, match="this frame: no ball's contact"):
+    camera = contact_radius.RenderedSensor(read_labels(folder), empty)
+    with pytest.raises(BadData, match="this frame: no contact of a ball is seen"):
         camera.radius(empty, empty, 3e-3, "this frame")
 
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from benchmarks.cases import deep, press, scenes, squeeze
-from benchmarks.cases.squeeze import close, squeeze_scene, touching
+from benchmarks.cases import large_strain, press, scenes, squeeze
+from benchmarks.cases.squeeze import close, squeeze_scene, world_in_contact
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.batch import Batch
@@ -15,20 +15,20 @@ from tacsim.physics.worlds.batch import Batch
 
 def test_slab_theory() -> None:
     """Hill: a slab as wide as it is high bears 1 + 1 / (3 sqrt 3) of its yield stress; of ten times the width, 2.92."""
-    assert deep.slab_force(30e3, 1e-6, 1e-2) == pytest.approx(3.0 * (1 + 1 / (3 * math.sqrt(3))))
-    assert deep.slab_force(30e3, 1e-6, 1e-2 / 100 ** (1 / 3)) / (3.0 * 100 ** (1 / 3)) == pytest.approx(
+    assert large_strain.slab_force(30e3, 1e-6, 1e-2) == pytest.approx(3.0 * (1 + 1 / (3 * math.sqrt(3))))
+    assert large_strain.slab_force(30e3, 1e-6, 1e-2 / 100 ** (1 / 3)) / (3.0 * 100 ** (1 / 3)) == pytest.approx(
         2.9245, abs=1e-4
     )
 
 
 def test_a_slab_row_tells_what_the_body_itself_went_through() -> None:
-    (row,) = deep._slab_rows(squeeze_scene("draft"), (0.15,), "closed by {:.0f} %")
+    (row,) = large_strain._slab_rows(squeeze_scene("draft"), (0.15,), "closed by {:.0f} %")
     assert row.variant == "closed by 15 %"
     height = row.figures["height_mm"]
     assert 8.5 < height < 10  # the gels give way by the rest
     assert row.figures["squeezed_percent"] == pytest.approx(100 - 10 * height)
     assert f"{height:.2f} mm high" in row.note
-    assert row.figures["slab_n"] == pytest.approx(deep.slab_force(30e3, 1e-6, height * 1e-3))
+    assert row.figures["slab_n"] == pytest.approx(large_strain.slab_force(30e3, 1e-6, height * 1e-3))
 
 
 @pytest.mark.deep
@@ -75,12 +75,12 @@ def test_an_indenter_costs_and_presses(shape: object) -> None:
 
 @pytest.mark.deep
 def test_a_sheared_body_rests_where_it_is() -> None:
-    world = touching(squeeze_scene("draft"))
+    world = world_in_contact(squeeze_scene("draft"))
     close(world, 0.3e-3)
     pose = world.pose("upper")
     world.move({"upper": Pose(pose.position + [0.2e-3, 0, 0], pose.quaternion)})
     before = world.truth()
-    stats = deep._rest(world, "draft", 60)
+    stats = large_strain._rest(world, "draft", 60)
     after = world.truth()
     assert stats.substeps == 60 and not stats.settled
     assert before is not None and after is not None

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.cases.real import observe, touching
+from benchmarks.cases.real import ball_touch, costs
 from benchmarks.cases.registry import CASES
 from benchmarks.harness.schema import Report, Row
 from benchmarks.pages.targets import TARGETS, Selection, Target, Verdict, lines
@@ -133,7 +133,7 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
     keys.append(("real", "marker_film", "tacsim", "the film's own pixels"))
     keys += [("real", name, "tacsim", "") for name in ("ball_presses", "known_depth", "invariance")]
     keys.append(("real", "punch", "layer", ""))
-    keys += [(case.group, case.name, case.method, case.resolution) for case in (*observe.CASES, *touching.CASES)]
+    keys += [(case.group, case.name, case.method, case.resolution) for case in (*costs.CASES, *ball_touch.CASES)]
     rows = [
         row(group=group, case=name, method=method, resolution=resolution, variant=variant, figures=figures)
         for group, name, method, resolution in keys

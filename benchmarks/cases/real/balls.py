@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 CASE = "ball_presses"
 OWN = "balls.yaml"
 SHIPPED = Path(__file__).parents[2] / "references" / OWN
-FEWEST = 3  # presses
+MIN_PRESSES = 3  # presses
 LARGEST = 1 << 30  # [bytes] of an archive
 
 Frames = tuple[tuple[str, Image], ...]
@@ -83,8 +83,8 @@ def is_there(folder: Path, of: BallSet) -> bool:
 def read_balls(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     """The picture without contact, and names and pictures of the presses, (H, W, 3) RGB. Raises BadData."""
     reference, frames = _of_archive(folder, of) if of.archive else _of_pictures(folder, of)
-    if len(frames) < FEWEST:
-        raise BadData(f"{of.name}: {len(frames)} presses; to leave one out, {FEWEST} are the least")
+    if len(frames) < MIN_PRESSES:
+        raise BadData(f"{of.name}: {len(frames)} presses; to leave one out, {MIN_PRESSES} are the least")
     return reference, frames
 
 

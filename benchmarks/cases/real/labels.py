@@ -29,7 +29,7 @@ class BadData(ValueError):
     """A folder of real frames that cannot be used: what is missing, and where."""
 
 
-class Press(Config):
+class PressLabel(Config):
     """One press of a ball straight into the gel."""
 
     frames: tuple[str, ...] = ()  # names of its frame, the first that exists counts
@@ -42,7 +42,7 @@ class Press(Config):
         return f"R {self.ball_radius * 1e3:g} mm, {self.depth * 1e3:g} mm deep"
 
 
-class Punch(Config):
+class PunchLabel(Config):
     """One press of a flat punch straight into the gel."""
 
     frames: Annotated[tuple[str, ...], Field(min_length=1)]  # names of its frame, the first that exists counts
@@ -51,7 +51,7 @@ class Punch(Config):
     depth: Positive  # commanded [m]
 
 
-class Presses(Config):
+class PressLabels(Config):
     """Presses on one sensor."""
 
     name: str
@@ -63,8 +63,8 @@ class Presses(Config):
     backgrounds: Annotated[tuple[str, ...], Field(min_length=1)]  # names of the frame without contact, seen from the
     # folder of the presses' frames; the first that exists counts
     light: str = ""  # name of the ball presses (balls.yaml) on the same sensor that its light is calibrated by
-    presses: Annotated[tuple[Press, ...], Field(min_length=1)]
-    punches: tuple[Punch, ...] = ()
+    presses: Annotated[tuple[PressLabel, ...], Field(min_length=1)]
+    punches: tuple[PunchLabel, ...] = ()
 
     @property
     def balls(self) -> list[float]:
@@ -72,17 +72,17 @@ class Presses(Config):
         return list(dict.fromkeys(press.ball_radius for press in self.presses))
 
 
-def read_labels(folder: Path) -> Presses:
+def read_labels(folder: Path) -> PressLabels:
     """The labels that hold for `folder`. Raises BadData without such a folder, ConfigError for labels with mistakes."""
     from tacsim.config import load
 
     if not folder.is_dir():
         raise BadData(f"{folder} is no folder; name the folder that holds the real frames")
     own = folder / OWN
-    return load(Presses, own if own.is_file() else SHIPPED)
+    return load(PressLabels, own if own.is_file() else SHIPPED)
 
 
-def find_frames(folder: Path, labels: Presses) -> dict[Press, Path]:
+def find_frames(folder: Path, labels: PressLabels) -> dict[PressLabel, Path]:
     """The frame of each press that has one below `folder`.
 
     Raises BadData when there is none at all, when a name is there twice, or for a press with neither frame nor radius.
@@ -103,7 +103,7 @@ def find_frames(folder: Path, labels: Presses) -> dict[Press, Path]:
     return found
 
 
-def read_frames(folder: Path, labels: Presses) -> tuple[Image, dict[Press, Image]]:
+def read_frames(folder: Path, labels: PressLabels) -> tuple[Image, dict[PressLabel, Image]]:
     """The frame without contact, and those of the presses, (H, W, 3) RGB. Raises BadData that names the file."""
     paths = find_frames(folder, labels)
     background, reference = read_background(next(iter(paths.values())).parent, labels)
@@ -114,7 +114,7 @@ def read_frames(folder: Path, labels: Presses) -> tuple[Image, dict[Press, Image
     return reference, frames
 
 
-def read_punches(folder: Path, labels: Presses) -> dict[Punch, tuple[Path, Image]]:
+def read_punches(folder: Path, labels: PressLabels) -> dict[PunchLabel, tuple[Path, Image]]:
     """Mesh and frame of each punch that has both below `folder`. Raises BadData that names the file."""
     found = {}
     for punch in labels.punches:
@@ -124,7 +124,7 @@ def read_punches(folder: Path, labels: Presses) -> dict[Punch, tuple[Path, Image
     return found
 
 
-def read_background(home: Path, labels: Presses) -> tuple[Path, Image]:
+def read_background(home: Path, labels: PressLabels) -> tuple[Path, Image]:
     """The picture without contact of frames in `home`, and its path. Raises BadData."""
     background = next((path for name in labels.backgrounds if (path := home / name).is_file()), None)
     if background is None:

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cases.real import balls
-from benchmarks.cases.real.depths import light_of, pictures
+from benchmarks.cases.real.known_depth import light_of, pictures
 from benchmarks.cases.real.labels import (
     BadData,
     Image,
-    Presses,
-    Punch,
+    PressLabels,
+    PunchLabel,
     find,
     read_background,
     read_labels,
@@ -47,11 +47,11 @@ FIT_RIM = 20  # ... and that of the fit
 SCALES = (0.88, 0.92, 0.96, 1.0, 1.04)
 NEARER = 0.02  # and the two scales so far from the best
 STEPS = (4.0, 2.0, 1.0, 0.5)  # of the place [px]
-SKIN = 1.0  # the skin of the gel and the optics round an edge off [px]
+EDGE_BLUR = 1.0  # by the gel's coating and the optics [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Face:
+class PunchFace:
     """The face of a punch that touches the gel."""
 
     points: Float64  # (n, 2) in the image's axes, from the mesh's own axis [m]
@@ -71,7 +71,7 @@ class Face:
         return np.asarray(covered)
 
 
-def read_face(path: Path) -> Face:
+def read_face(path: Path) -> PunchFace:
     """The highest face of an STL in millimetres. Raises BadData."""
     from tacsim.geometry.mesh import load_mesh
 
@@ -83,13 +83,13 @@ def read_face(path: Path) -> Face:
     triangles = mesh.faces[top[mesh.faces].all(axis=1)]
     if len(triangles) == 0:
         raise BadData(f"{path}: its highest point is no flat face")
-    return Face(np.asarray(mesh.vertices[:, :2] * [1.0, -1.0], dtype=np.float64), np.asarray(triangles))
+    return PunchFace(np.asarray(mesh.vertices[:, :2] * [1.0, -1.0], dtype=np.float64), np.asarray(triangles))
 
 
-class Draw:
+class PunchRenderer:
     """Draws dents of a punch in calibrated light."""
 
-    def __init__(self, fit: LightFit, labels: Presses) -> None:
+    def __init__(self, fit: LightFit, labels: PressLabels) -> None:
         from tacsim.models.photometric import PhotometricLight, places_in_image
 
         self.reference = fit.reference
@@ -100,7 +100,7 @@ class Draw:
         self._blur = fit.forward.blur
         self._pitch, self._thickness = labels.pixel_pitch, labels.gel_thickness[0]
 
-    def dent(self, face: Face, scale: float, depth: float) -> Float32:
+    def dent(self, face: PunchFace, scale: float, depth: float) -> Float32:
         """(BOX, BOX, 2) slopes of the gel under the punch, whose axis is in the middle."""
         import cv2
 
@@ -111,7 +111,7 @@ class Draw:
         contact = layer_contact(
             gap, depth, self._pitch, self._thickness, material.youngs_modulus, material.poisson_ratio
         )
-        height = cv2.GaussianBlur(contact.displacement, (0, 0), SKIN)
+        height = cv2.GaussianBlur(contact.displacement, (0, 0), EDGE_BLUR)
         by_y, by_x = np.gradient(height, self._pitch)
         return np.stack([by_x, by_y], axis=-1).astype(np.float32)
 
@@ -131,7 +131,7 @@ class Draw:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PunchPlacement:
     """Where and how large a punch appears."""
 
     scale: float
@@ -140,7 +140,9 @@ class Placed:
     error: float  # mean |error| where it was fitted [grey levels]
 
 
-def place(draw: Draw, face: Face, depths: Sequence[float], frames: Sequence[Image], pitch: float) -> Placed:
+def fit_placement(
+    draw: PunchRenderer, face: PunchFace, depths: Sequence[float], frames: Sequence[Image], pitch: float
+) -> PunchPlacement:
     """Fits scale and place to all frames of a punch. Raises BadData when no contact is seen."""
     from calibration.compare import metrics
 
@@ -154,7 +156,7 @@ def place(draw: Draw, face: Face, depths: Sequence[float], frames: Sequence[Imag
     start = (patch.x - middle[0], patch.y - middle[1])
     where = face.mask(frames[0].shape[:2], *start, pitch, max(SCALES), FIT_RIM)  # one mask, so that errors compare
 
-    def tried(scale: float) -> Placed:
+    def tried(scale: float) -> PunchPlacement:
         dents = [draw.dent(face, scale, depth) for depth in depths]
 
         def error(x: float, y: float) -> float:
@@ -163,12 +165,12 @@ def place(draw: Draw, face: Face, depths: Sequence[float], frames: Sequence[Imag
                 np.mean([np.abs(draw(dent, x, y).astype(np.float32) - frame)[where].mean() for dent, frame in drawn])
             )
 
-        best = Placed(scale, *start, error(*start))
+        best = PunchPlacement(scale, *start, error(*start))
         for step in STEPS:
             better = True
             while better:
                 around = [(best.x + dx * step, best.y + dy * step) for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-                next_ = min((Placed(scale, x, y, error(x, y)) for x, y in around), key=lambda one: one.error)
+                next_ = min((PunchPlacement(scale, x, y, error(x, y)) for x, y in around), key=lambda one: one.error)
                 better = next_.error < best.error - 1e-9
                 best = next_ if better else best
         return best
@@ -185,11 +187,13 @@ def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:
     reference = _reference(folder, labels, found)
     if reference.shape != fit.reference.shape:
         raise BadData(f"{labels.name}: the frames of the punches and those of {labels.light} differ in size")
-    draw = Draw(fit, labels)
+    draw = PunchRenderer(fit, labels)
     draw.reference = reference
     face = read_face(next(iter(found.values()))[0])
     order = sorted(found, key=lambda one: one.depth)
-    placed = place(draw, face, [one.depth for one in order], [found[one][1] for one in order], labels.pixel_pitch)
+    placed = fit_placement(
+        draw, face, [one.depth for one in order], [found[one][1] for one in order], labels.pixel_pitch
+    )
     rows = []
     for one in order:
         wall, cpu = perf_counter(), process_time()
@@ -208,7 +212,7 @@ def punch(folder: Path, mesh: str, repeat: int) -> list[Measurement]:
     return rows
 
 
-def _reference(folder: Path, labels: Presses, found: dict[Punch, tuple[Path, Image]]) -> Image:
+def _reference(folder: Path, labels: PressLabels, found: dict[PunchLabel, tuple[Path, Image]]) -> Image:
     path = find(folder, next(iter(found)).frames)
     assert path is not None  # it was found before
     return read_background(path.parent, labels)[1]

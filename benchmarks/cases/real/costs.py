@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 RENDER, NORMALISE = "calibrated_render", "normaliser"
 DEGREE, POSITION = 5, 2  # the largest model that a calibration chooses
-LEAST = 25  # repetitions: a median of milliseconds needs more than a press
+MIN_REPETITIONS = 25  # repetitions: a median of milliseconds needs more than a press
 VIEW = (20e-3, 15e-3)  # of the gel, by the pictures of both sizes [m]
 BALL, DEPTH = 4e-3, 1e-3  # [m]
 
@@ -76,7 +76,7 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     surface = world.surface("lower")
     model = SensorModel(geometry=calibration.geometry, photometric=calibration.forward, texture=0.0)
     render = Renderer(model, (20e-3, 20e-3))
-    timing, image = timed(partial(render, surface), max(repeat, LEAST))
+    timing, image = timed(partial(render, surface), max(repeat, MIN_REPETITIONS))
     # the same polynomial, term by term, in double precision and without strips
     slopes = sample_surface(surface, image_grid(calibration.geometry)).gradient.astype(np.float64)
     steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / calibration.forward.steepest, 1.0)
@@ -108,7 +108,7 @@ def normaliser(repeat: int) -> list[Measurement]:
     flat = replace(surface, displacement=np.zeros_like(surface.displacement))
     normalise.take_reference(TactileFrame(render(flat), 0.0, 0))
     frame = TactileFrame(render(surface), 0.0, 0)
-    timing, seen = timed(partial(normalise, frame, 0.0), max(repeat, LEAST))
+    timing, seen = timed(partial(normalise, frame, 0.0), max(repeat, MIN_REPETITIONS))
     truth = surface_map(surface, grid, None).height
     assert seen.height is not None
     error = float(np.sqrt(np.mean((seen.height - truth)[truth > 0.1 * DEPTH] ** 2))) / DEPTH * 100.0

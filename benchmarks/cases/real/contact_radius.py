@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cases.press import layer, press
-from benchmarks.cases.real.labels import BadData, Image, Presses, read_frames, read_labels
+from benchmarks.cases.real.labels import BadData, Image, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from calibration.light.circle import NoCircle, contact_circle
@@ -37,11 +37,11 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
     scene = ball_scene(labels, ball, thickness, element)
     press(ball_scene(labels, ball, 2e-3, 1e-3), 0.05e-3)  # compiles
     world = make_world(scene)
-    camera = Camera(labels, background)
+    camera = RenderedSensor(labels, background)
     before = camera.see(world)
     rows = []
     for at in sorted((p for p in labels.presses if p.ball_radius == ball), key=lambda p: p.depth):
-        timing, stats = timed(partial(_deeper, world, ball, at.depth), 1, warm=lambda: None)
+        timing, stats = timed(partial(_press_to, world, ball, at.depth), 1, warm=lambda: None)
         pressed = pressed_radius(world) / labels.pixel_pitch
         figures = {
             "ball_radius_mm": ball * 1e3,
@@ -72,7 +72,7 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
     return rows
 
 
-def ball_scene(labels: Presses, ball: float, thickness: float, element: float) -> Scene:
+def ball_scene(labels: PressLabels, ball: float, thickness: float, element: float) -> Scene:
     """The default gel in the size of the labels, under a ball."""
     return Scene(
         body=None,
@@ -83,7 +83,7 @@ def ball_scene(labels: Presses, ball: float, thickness: float, element: float) -
     )
 
 
-def _deeper(world: World, ball: float, depth: float) -> MoveStats:
+def _press_to(world: World, ball: float, depth: float) -> MoveStats:
     pose = world.pose("indenter")
     return world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)})
 
@@ -127,10 +127,10 @@ def theories(ball: float, depth: float, thickness: float) -> dict[str, float]:
     }
 
 
-class Camera:
+class RenderedSensor:
     """Our image of the gel, with as many pixels and the same pitch as the real one, and circles in such images."""
 
-    def __init__(self, labels: Presses, like: Image) -> None:
+    def __init__(self, labels: PressLabels, like: Image) -> None:
         from tacsim.models.sensor import SensorGeometry, SensorModel
         from tacsim.optics.render import Renderer
 

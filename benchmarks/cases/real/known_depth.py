@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet
-from benchmarks.cases.real.labels import BadData, Image, Press, Presses, read_frames, read_labels
-from benchmarks.cases.real.real import ELEMENT, ball_scene
+from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene
+from benchmarks.cases.real.labels import BadData, Image, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
 from tacsim.interface import Pose
@@ -38,7 +38,7 @@ REACH = 1.3  # the mask of a picture reaches this far, in radii of the cap that 
 HEIGHT_REACH = 1.5  # heights are compared this far from the middle, in radii of Hertz' contact
 
 
-def light_of(folder: Path, labels: Presses) -> BallSet:
+def light_of(folder: Path, labels: PressLabels) -> BallSet:
     """The ball presses that calibrate the sensor of the known depths. Raises BadData, ConfigError."""
     found = next((of for of in balls.read_sets(folder) if of.name == labels.light), None)
     if found is None:
@@ -57,7 +57,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     reference, frames = read_frames(folder, labels)
     fit, _, _ = balls.calibrated(folder, of)
     world = make_world(ball_scene(labels, ball, labels.gel_thickness[0], ELEMENT))
-    camera = Camera(of, fit, labels.gel_size, reference)
+    camera = CalibratedSensor(of, fit, labels.gel_size, reference)
     rows = []
     for press in sorted((p for p in frames if p.ball_radius == ball), key=lambda p: p.depth):
         try:
@@ -65,7 +65,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
         except NoCircle as error:
             raise BadData(f"the real frame of {press.name}: {error}") from None
         wall, cpu = perf_counter(), process_time()
-        stats = _deeper(world, ball, press.depth)
+        stats = _press_to(world, ball, press.depth)
         surface = moved(world.surface("lower"), (at.x, at.y), camera.model)
         image = camera.see(surface)
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
@@ -83,8 +83,8 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     return rows
 
 
-class Camera:
-    """The twin of a calibrated sensor: draws surfaces, and finds them in real frames."""
+class CalibratedSensor:
+    """A simulated sensor with the calibration of a real one: renders surfaces, and finds them in real frames."""
 
     def __init__(self, of: BallSet, fit: LightFit, gel_size: tuple[float, float], reference: Image) -> None:
         from calibration.bundle import read_sensor_model, write_bundle
@@ -141,7 +141,12 @@ def pictures(image: Image, real: Image, reference: Image, mask: Mask) -> dict[st
 
 
 def _height(
-    camera: Camera, surface: GelSurface, real: Image, press: Press, at: tuple[float, float], timing: Timing
+    camera: CalibratedSensor,
+    surface: GelSurface,
+    real: Image,
+    press: PressLabel,
+    at: tuple[float, float],
+    timing: Timing,
 ) -> Measurement:
     """Of the surface that the inverse finds in the real frame against the simulated one."""
     from tacsim.optics.surface import surface_map
@@ -169,7 +174,7 @@ def _height(
     )  # fmt: skip
 
 
-def _deeper(world: World, ball: float, depth: float) -> bool:
+def _press_to(world: World, ball: float, depth: float) -> bool:
     pose = world.pose("indenter")
     return world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)}).settled
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet, Frames
-from benchmarks.cases.real.depths import GRID, light_of
+from benchmarks.cases.real.known_depth import GRID, light_of
 from benchmarks.cases.real.labels import BadData, Image, read_labels
 from benchmarks.harness.measure import Measurement, Timing
-from benchmarks.harness.runner import Case, lacking
+from benchmarks.harness.runner import Case, missing_case
 from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CASE = "invariance"
 FOLDS = 5
-LEAST_PRESSES = 10
+MIN_PRESSES = 10
 ELEMENT = 0.5e-3  # [m]
 
 
@@ -36,32 +36,34 @@ def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], 
     *pictures*: our surface is found in our picture, as the real one in its own. *surfaces*: our simulation says it.
     """
     reference, frames = balls.read_balls(folder, of)
-    if len(frames) < LEAST_PRESSES:
-        raise BadData(f"{of.name}: {len(frames)} presses; {LEAST_PRESSES} are the least that say something")
+    if len(frames) < MIN_PRESSES:
+        raise BadData(f"{of.name}: {len(frames)} presses; {MIN_PRESSES} are the least that say something")
     wall, cpu, pressed, notes = 0.0, 0.0, 0, []
-    ways: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
+    by_source: dict[str, list[tuple[Comparison, Calibration | None]]] = {"pictures": [], "surfaces": []}
     for fold in range(FOLDS):
         train = tuple(frame for k, frame in enumerate(frames) if k % FOLDS != fold)
         both, calibration, taken, said = _fold(of, reference, train, frames[fold::FOLDS], gel_size)
         wall, cpu, pressed = wall + taken[0], cpu + taken[1], pressed + len(both["pictures"].pairs)
         notes += said
-        for way, comparison in both.items():
-            ways[way].append((comparison, calibration))
+        for source, comparison in both.items():
+            by_source[source].append((comparison, calibration))
     timing, note = Timing((wall / pressed,), cpu / pressed), "; ".join(notes)
     rows = []
-    for way, folds in ways.items():
-        rows += _rows(way, folds, timing, note)
+    for source, folds in by_source.items():
+        rows += _rows(source, folds, timing, note)
     return rows
 
 
-def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: Timing, note: str) -> list[Measurement]:
+def _rows(
+    source: str, folds: list[tuple[Comparison, Calibration | None]], timing: Timing, note: str
+) -> list[Measurement]:
     from calibration.compare.invariance import pooled_invariance
 
     report = pooled_invariance(folds, GRID)
     rows = [
         Measurement(
             timing, view.rho, "x", "the distance of two real presses that are neighbours in size; 1 is as far",
-            f"{way}: rho, {view.view}", None,
+            f"{source}: rho, {view.view}", None,
             {
                 "rho_low": view.rho_low, "rho_high": view.rho_high, "auc": view.auc, "auc_low": view.auc_low,
                 "auc_high": view.auc_high, "distance": view.distance, "neighbour": view.neighbour,
@@ -70,19 +72,19 @@ def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: 
             note,
         )
         for view in report.views
-        if way == "pictures" or view.view in ("gradient", "height")
+        if source == "pictures" or view.view in ("gradient", "height")
     ]  # fmt: skip
     rows += [
         Measurement(
             timing, max(0.0, drift.fresh), "deg more", "the same frames before the change, against our gel's gradient",
-            f"{way}: drift, {drift.change.name}", None,
+            f"{source}: drift, {drift.change.name}", None,
             {"extra_deg": drift.fresh, "stale_deg": drift.stale, "usual_deg": report.angle}, note,
         )
         for drift in report.drifts
     ]  # fmt: skip
     overall = [pair for comparison, _ in folds for pair in comparison.pairs]
     kinds = [("gradient_angle", "gradient", "deg", 1.0), ("height_share", "height", "% of depth", 100.0)]
-    if way == "pictures":
+    if source == "pictures":
         kinds.insert(0, ("contact_mae", "picture", "grey", 1.0))
     for key, name, unit, scale in kinds:
         values, nulls = [pair.numbers[key] for pair in overall], [pair.null[key] for pair in overall]
@@ -92,7 +94,7 @@ def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: 
         rows.append(
             Measurement(
                 timing, float(np.nanmean(values)) * scale, unit, "the real frame, by `tacsim compare`",
-                f"{way}: {name}", None, figures, note,
+                f"{source}: {name}", None, figures, note,
             )
         )  # fmt: skip
     return rows
@@ -101,8 +103,8 @@ def _rows(way: str, folds: list[tuple[Comparison, Calibration | None]], timing: 
 def _fold(
     of: BallSet, reference: Image, train: Frames, test: Frames, gel_size: tuple[float, float, float]
 ) -> tuple[dict[str, Comparison], Calibration, tuple[float, float], list[str]]:
-    """Left-out presses by our gel, compared with the real ones in both ways; the calibration that has not seen them;
-    wall and processor time of pressing; what to look at."""
+    """Left-out presses by our gel, compared with the real ones, by source; the calibration that has not seen them; wall
+    and processor time of pressing; what to look at."""
     from calibration.bundle import read_sensor_model, write_bundle
     from calibration.compare.compare import compare_frames
     from calibration.errors import BadFrames
@@ -141,6 +143,6 @@ def cases(folder: Path) -> tuple[Case, ...]:
     try:
         of = light_of(folder, labels)
     except BadData as error:
-        return (lacking("real", CASE, str(error), resolution),)
+        return (missing_case("real", CASE, str(error), resolution),)
     size = (*labels.gel_size, labels.gel_thickness[0])
     return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size), long=True),)

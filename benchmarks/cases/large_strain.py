@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.cases.materials import RIGID
-from benchmarks.cases.squeeze import PRESETS, SLOW, TOUCH, close, normal_forces, squeeze_scene, touching
+from benchmarks.cases.squeeze import PRESETS, SLOW, TOUCH, close, normal_forces, squeeze_scene, world_in_contact
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import Pose, Truth
@@ -23,7 +23,7 @@ RIGID_SHARES = (0.5, 0.6, 2 / 3, 0.75, 0.8)
 # Between stiff plates: at 0.003 a body ends 6 % low at a quarter of its height at draft, 0.3 % below 0.002 at standard.
 PLATES_MACH = {"draft": 0.001, "standard": 0.002}
 DRIFT_SUBSTEPS = 100_000
-NEVER = 1e-12  # a tolerance that no residual in float32 keeps within
+UNREACHABLE = 1e-12  # a tolerance that no residual in float32 keeps within
 
 
 def slab(preset: str, repeat: int) -> list[Measurement]:
@@ -45,7 +45,7 @@ def rigid_slab(preset: str, repeat: int) -> list[Measurement]:
 def _slab_rows(scene: Scene, shares: Sequence[float], words: str) -> list[Measurement]:
     """A row for each share of the cube's height by which the sensors have closed; its own height is in the figures."""
     assert scene.body is not None and scene.body.material.yield_stress is not None
-    world = touching(scene)
+    world = world_in_contact(scene)
     rows: list[Measurement] = []
     done = 2 * TOUCH
     for share in shares:
@@ -76,7 +76,7 @@ def slab_force(yield_stress: float, volume: float, height: float) -> float:
 
 def sheared_rest(preset: str, repeat: int) -> list[Measurement]:
     """A body pressed and sheared, then left alone for 100,000 substeps: how far its centre and its particles creep."""
-    world = touching(squeeze_scene(preset))
+    world = world_in_contact(squeeze_scene(preset))
     close(world, 0.5e-3)
     pose = world.pose("upper")
     world.move({"upper": Pose(pose.position + [0.5e-3, 0.0, 0.0], pose.quaternion)})
@@ -97,7 +97,7 @@ def sheared_rest(preset: str, repeat: int) -> list[Measurement]:
 
 def _rest(world: World, preset: str, substeps: int) -> MoveStats:
     """Holds the state of `world` for so many substeps; `world` follows."""
-    still = make_world(squeeze_scene(preset, tolerance=NEVER, max_substeps=substeps))
+    still = make_world(squeeze_scene(preset, tolerance=UNREACHABLE, max_substeps=substeps))
     still.restore(world.snapshot())
     stats = still.move({})
     world.restore(still.snapshot())

@@ -159,7 +159,7 @@ def test_a_wrong_file_is_a_config_error(tmp_path: Path) -> None:
         open_rig(write(tmp_path, "name: r\nclock: sun\nsensors: {}\n"))
 
 
-def test_facts_that_are_loaded_take_no_more_overrides() -> None:
+def test_a_loaded_configuration_takes_no_more_overrides() -> None:
     with pytest.raises(TypeError, match="loaded already"):
         open_rig(load_rig("sim"), overrides=["period=1 s"])
 

@@ -63,7 +63,7 @@ class StubArm:
         return "follows its target"
 
 
-def driven(arm: StubArm, target: Pose | None = None) -> CommandedArm:
+def commanded(arm: StubArm, target: Pose | None = None) -> CommandedArm:
     made = CommandedArm(arm)  # type: ignore[arg-type]
     made.target = target
     return made
@@ -104,7 +104,7 @@ def test_after_a_reset_the_time_it_took_counts_for_nothing(time: Time) -> None:
     assert clock.late == 0 and clock.periods == []
 
 
-def test_looking_takes_a_tenth_of_a_second_at_least(time: Time) -> None:
+def test_waiting_for_data_takes_a_tenth_of_a_second_at_least(time: Time) -> None:
     for period, wanted in ((0.02, 0.1), (0.5, 0.5)):
         before = time.now
         WallClock(period).wait_for_data()
@@ -114,19 +114,19 @@ def test_looking_takes_a_tenth_of_a_second_at_least(time: Time) -> None:
 def test_a_command_is_repeated_until_its_arm_is_there(time: Time) -> None:
     arms = {"left": StubArm(3), "right": StubArm(7)}
     target = Pose(np.array([1.0, 2.0, 3.0]))
-    wait_for_arrival({name: driven(arm, target) for name, arm in arms.items()}, timeout=1.0)
+    wait_for_arrival({name: commanded(arm, target) for name, arm in arms.items()}, timeout=1.0)
     assert [len(arm.commands) for arm in arms.values()] == [3, 7]
     assert all(sent is target for arm in arms.values() for sent in arm.commands)
 
 
 def test_an_arm_without_target_is_only_waited_for(time: Time) -> None:
     arm = StubArm()
-    wait_for_arrival({"left": driven(arm)}, timeout=1.0)
+    wait_for_arrival({"left": commanded(arm)}, timeout=1.0)
     assert arm.commands == []
 
 
 def test_an_arm_that_does_not_arrive_is_named(time: Time) -> None:
-    arms = {"left": driven(StubArm(0), Pose()), "right": driven(StubArm(10**9), Pose())}
+    arms = {"left": commanded(StubArm(0), Pose()), "right": commanded(StubArm(10**9), Pose())}
     before = time.now
     with pytest.raises(DeviceError, match=r"arm 'right' did not come to its target within 2 s; it follows its target"):
         wait_for_arrival(arms, timeout=2.0)
@@ -135,29 +135,29 @@ def test_an_arm_that_does_not_arrive_is_named(time: Time) -> None:
 
 def test_what_stops_an_arm_is_what_is_raised(time: Time) -> None:
     with pytest.raises(ProtectiveStop):
-        wait_for_arrival({"left": driven(StubArm(error=ProtectiveStop("stopped")), Pose())}, timeout=2.0)
+        wait_for_arrival({"left": commanded(StubArm(error=ProtectiveStop("stopped")), Pose())}, timeout=2.0)
 
 
 def test_lock_step_waits_for_arms_then_forces_then_just_those_pictures(time: Time) -> None:
     log: list[object] = []
 
-    class Bench:
+    class Cell:
         def step(self, pause: float) -> dict[str, int]:
             log.append(("step", len(arm.commands), pause))
             return {"finger": 17}
 
-    class Eye:
+    class StubCamera:
         def wait_for(self, number: int, timeout: float) -> None:
             log.append(("picture", number))
 
     arm = StubArm(4)
-    clock = LockStep(PERIOD, {"left": driven(arm, Pose())}, {"finger": Eye()}, Bench())  # type: ignore[dict-item, arg-type]
+    clock = LockStep(PERIOD, {"left": commanded(arm, Pose())}, {"finger": StubCamera()}, Cell())  # type: ignore[dict-item, arg-type]
     clock.tick()
     assert log == [("step", 4, clocks.SETTLED), ("picture", 17)]
     assert clock.period == PERIOD and clock.diagnostics() == {}
 
 
-def test_a_look_waits_for_the_simulator_first() -> None:
+def test_waiting_for_data_waits_for_the_simulator_first() -> None:
     """Else an approach would go on while the simulator is busy with the first touch."""
     seen: list[str] = []
     WallClock(PERIOD, lambda: seen.append("caught up")).wait_for_data()

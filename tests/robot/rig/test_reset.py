@@ -86,7 +86,7 @@ class Scene:
         )
 
     def wait_for_data(self) -> None:
-        self.log.append("look")
+        self.log.append("wait")
 
     def restart(self) -> None:
         self.log.append("restart")
@@ -126,7 +126,7 @@ def test_it_retreats_along_its_own_axis_then_goes_to_the_start() -> None:
 def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last() -> None:
     scene = Scene()
     scene.reset.clear(0)
-    assert scene.log[4:] == ["look", ("lower", "zero"), ("upper", "zero"), "look", "reference"]
+    assert scene.log[4:] == ["wait", ("lower", "zero"), ("upper", "zero"), "wait", "reference"]
 
 
 def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms() -> None:
@@ -185,9 +185,9 @@ def test_an_arm_that_is_stopped_ends_it() -> None:
     assert "reference" not in scene.log
 
 
-def test_a_dry_run_moves_nothing_and_still_asks_and_looks() -> None:
+def test_a_dry_run_moves_nothing_and_still_asks_and_observes() -> None:
     scene = Scene(arms=False, touch_at=1.0)
     scene.reset.clear(0)
     scene.reset.touch()
     assert scene.motions() == [] and ("lower", "zero") not in scene.log
-    assert scene.log == ["look", "reference", "asked", "look", "restart"]
+    assert scene.log == ["wait", "reference", "asked", "wait", "restart"]

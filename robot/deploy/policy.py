@@ -39,7 +39,7 @@ def load_policy(name: str, task: Task | None, spec: RigSpec) -> Policy:
     """The policy called `name`, for a rig that delivers `spec`.
 
     "scripted": the task's own. "grip": closes until it feels contact, on any rig. "package.module:attribute": an object
-    with needs, reset and __call__ as tacsim.interface.Policy has them, a class of such objects (made without
+    with needs, reset and __call__ as tacsim.Policy has them, a class of such objects (made without
     arguments), or a function from Observation to Action. Runs code of that module, so name only modules you trust.
 
     Raises PolicyNotFound.
@@ -102,9 +102,7 @@ def _as_policy(found: object, name: str) -> Policy:
             ) from failure
     if isinstance(found, Policy):
         if not isinstance(found.needs, Needs):
-            raise PolicyNotFound(
-                f"policy '{name}': its needs must be a tacsim.interface.Needs, got {type(found.needs).__name__}"
-            )
+            raise PolicyNotFound(f"policy '{name}': its needs must be a tacsim.Needs, got {type(found.needs).__name__}")
         return found
     if callable(found):
         return FunctionPolicy(found)

@@ -316,7 +316,7 @@ def test_policies_by_name() -> None:
         ("broken_policies:hold", "itself imports 'no_such_package', which is missing"),
         ("failing_policies:hold", "importing 'failing_policies' failed: ZeroDivisionError"),
         ("ending_policies:hold", r"importing 'ending_policies' failed: SystemExit\(3\)"),
-        ("my_policies:Needless", "its needs must be a tacsim.interface.Needs, got NoneType"),
+        ("my_policies:Needless", "its needs must be a tacsim.Needs, got NoneType"),
     ],
 )
 def test_a_name_that_leads_nowhere_says_why(name: str, message: str) -> None:

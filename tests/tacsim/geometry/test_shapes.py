@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -323,12 +321,3 @@ def test_bad_grids_are_refused(tmp_path: Path) -> None:
         distance_grid(geometry, 0.005 * MM)
     with pytest.raises(ValueError, match="positive"):
         distance_grid(geometry, -1.0)
-
-
-def test_shapes_import_neither_taichi_nor_trimesh_nor_opencv() -> None:
-    code = (
-        "import sys, tacsim.geometry.shapes, tacsim.geometry.mesh; "
-        "print([m for m in ('taichi', 'trimesh', 'cv2') if m in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"

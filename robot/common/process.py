@@ -44,6 +44,9 @@ class Child:
         error: the class of every error.
         advice: what to do when it has ended, in errors.
         environment: added to the parent's.
+        ready_timeout: waits so long [s] for the child's first message, which is then in `ready`; None does not wait.
+            Raises `error` as `receive` does, with the process ended.
+        first_request: what is sent before that.
     """
 
     def __init__(
@@ -55,6 +58,8 @@ class Child:
         error: type[DeviceError] = DeviceNotConnectedError,
         advice: str = "start another",
         environment: Mapping[str, str] | None = None,
+        ready_timeout: float | None = None,
+        first_request: dict[str, Any] | None = None,
     ) -> None:
         self._name, self._error, self._advice = name, error, advice
         self._lock = threading.RLock()
@@ -71,6 +76,13 @@ class Child:
             env={**os.environ, **(environment or {}), "PYTHONPATH": path},
         )
         self.pid = self._process.pid
+        self.ready: dict[str, Any] = {}
+        if ready_timeout is not None:
+            try:
+                self.ready, _ = self._exchange(first_request, {}, ready_timeout)
+            except BaseException:
+                self.close(0.0)
+                raise
 
     @property
     def exit_status(self) -> int | None:
@@ -170,6 +182,35 @@ class Child:
             lines = self._errors.read().decode(errors="replace").strip().splitlines()[-LAST_LINES:]
             text += "".join(f"\n  {line}" for line in lines)
         return self._error(text)
+
+
+class ChildHandle:
+    """What the handles of child processes share. A context manager."""
+
+    _child: Child
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
+
+    @property
+    def running(self) -> bool:
+        """False once the process has ended."""
+        return self._child.running
+
+    def check(self) -> None:
+        """Raises a DeviceError, with its reason, if the process has ended."""
+        self._child.check()
+
+    def close(self) -> None:
+        """Ends the process; a second call does nothing."""
+        self._child.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 class Parent:

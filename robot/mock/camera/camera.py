@@ -7,13 +7,13 @@ The driver in `robot.camera.camera` reads it as it reads a real camera behind mj
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robot.common.loopback import require_loopback
-from robot.common.process import Child
+from robot.common.process import Child, ChildHandle
 
 STREAM = "/?action=stream"  # where mjpg-streamer has its stream
 ANSWER_TIMEOUT = 10.0  # a process that does not answer for so long is killed [s]
@@ -39,7 +39,7 @@ class MockCameraState:
     refuse: bool
 
 
-class MockCamera:
+class MockCamera(ChildHandle):
     """Starts the process, feeds it, breaks it, ends it. Safe to use from several threads."""
 
     def __init__(
@@ -62,13 +62,9 @@ class MockCamera:
         options = {"host": host, "port": port, "width": width, "height": height, "fps": fps, "quality": quality}
         arguments = [f"--{name}={value}" for name, value in options.items()]
         arguments += ["--stamped"] * stamped + ["--allow-network"] * allow_network
-        self._child = Child("robot.mock.camera", arguments, name=f"mock camera at {host}")
-        self.pid = self._child.pid
-        try:
-            self.port = int(self._child.receive(ANSWER_TIMEOUT)[0]["port"])
-        except BaseException:
-            self.close()
-            raise
+        name = f"mock camera at {host}"
+        self._child = Child("robot.mock.camera", arguments, name=name, ready_timeout=ANSWER_TIMEOUT)
+        self.port = int(self._child.ready["port"])
         self.url = f"http://{host}:{self.port}{STREAM}"
 
     def push(self, image: NDArray[np.uint8]) -> int:
@@ -120,25 +116,6 @@ class MockCamera:
         answer = self._ask("state")
         answer["size"] = None if answer["size"] is None else tuple(answer["size"])
         return MockCameraState(**{field.name: answer[field.name] for field in fields(MockCameraState)})
-
-    @property
-    def running(self) -> bool:
-        """False once the process has ended."""
-        return self._child.running
-
-    def check(self) -> None:
-        """Raises DeviceNotConnectedError, with its reason, if the process has ended."""
-        self._child.check()
-
-    def close(self) -> None:
-        """Ends the process; a second call does nothing."""
-        self._child.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _ask(self, command: str, value: Any = None, **pictures: NDArray[np.uint8]) -> Any:
         return self._child.ask({"do": command, "value": value}, pictures, timeout=ANSWER_TIMEOUT)[0]["result"]

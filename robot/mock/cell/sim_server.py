@@ -10,12 +10,12 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.common.process import Arrays, Child
+from robot.common.process import Arrays, Child, ChildHandle
 from robot.errors import DeviceError
 from tacsim.interface import FloatArray, Pose, SurfaceMap, Truth
 
@@ -44,7 +44,7 @@ class SceneFrame:
     seconds: float  # that it took
 
 
-class SimServer:
+class SimServer(ChildHandle):
     """Starts the process for a scene and talks to it.
 
     Args:
@@ -61,25 +61,22 @@ class SimServer:
         contact: Literal["simulated", "hertz"] = "simulated",
     ) -> None:
         self._index = 0
+        opened = {
+            "scene": scene.model_dump(mode="json"),
+            "models": {name: model.model_dump(mode="json") for name, model in models.items()},
+            "grid": grid.model_dump(),
+        }
         self._child = Child(
             "robot.mock.cell",
             name="simulated cell",
             error=SimServerError,
             advice="open the rig anew",
             environment={"TACSIM_THREADS": os.environ.get("TACSIM_THREADS", "1")},
+            ready_timeout=PATIENCE,
+            first_request={"do": "open", "contact": contact, **opened},
         )
-        self.pid = self._child.pid
-        try:
-            opened = {
-                "scene": scene.model_dump(mode="json"),
-                "models": {name: model.model_dump(mode="json") for name, model in models.items()},
-                "grid": grid.model_dump(),
-            }
-            answer, _ = self._child.ask({"do": "open", "contact": contact, **opened}, timeout=PATIENCE)
-        except BaseException:
-            self.close()
-            raise
-        self.initial = {name: pose_of(numbers) for name, numbers in answer["poses"].items()}  # of the sensors
+        poses = self._child.ready["poses"]
+        self.initial = {name: pose_of(numbers) for name, numbers in poses.items()}  # of the sensors
 
     def place(self, poses: Mapping[str, Pose]) -> SceneFrame:
         """Puts a fresh body into the cell, with the sensors at `poses`, clear of it. Raises SimServerError."""
@@ -107,16 +104,6 @@ class SimServer:
             stats=answer["stats"],
             seconds=answer["seconds"],
         )
-
-    def close(self) -> None:
-        """Ends the process; a second call does nothing."""
-        self._child.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def _truth(body: dict[str, Any] | None, arrays: Arrays) -> Truth | None:

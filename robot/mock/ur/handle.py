@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from robot.common import MOCK_SERIAL
 from robot.common.loopback import require_loopback
-from robot.common.process import Child
+from robot.common.process import Child, ChildHandle
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
 from robot.mock.ur.machine.machine import Version
@@ -24,7 +24,7 @@ class MockError(DeviceError):
     """A mock controller did not start."""
 
 
-class MockArms:
+class MockArms(ChildHandle):
     """Mock controllers in one process of their own, one for each host; a context manager.
 
     model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6). Raises MockError when they are
@@ -55,35 +55,15 @@ class MockArms:
         if realtime:
             arguments.append("--realtime")
         check_hosts(self.hosts, allow_network)
-        self._child = Child("robot.mock", arguments, name=f"mock controller on {', '.join(hosts)}", error=MockError)
-        self.pid = self._child.pid
         self.fault_clients = tuple(FaultClient(host, fault_port) for host in self.hosts)
-        try:
-            self._child.receive(ready_timeout)
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def running(self) -> bool:
-        """False once the process has ended."""
-        return self._child.running
-
-    def check(self) -> None:
-        """Raises MockError, with its reason, if the process has ended."""
-        self._child.check()
+        name = f"mock controller on {', '.join(hosts)}"
+        self._child = Child("robot.mock", arguments, name=name, error=MockError, ready_timeout=ready_timeout)
 
     def close(self) -> None:
         """Ends the process; a second call does nothing."""
         for faults in self.fault_clients:
             faults.close()
-        self._child.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
+        super().close()
 
 
 class MockUR(MockArms):

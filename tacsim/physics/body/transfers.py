@@ -44,8 +44,8 @@ from tacsim.physics.exec.lanes import (
     vec4,
 )
 
-# One axis each, environments one after the other: kernels find their way with one number that they have worked out
-# beforehand, which is much faster than several indices into arrays of several axes.
+# One axis each, environments one after the other: kernels work out one index beforehand, which is
+# much faster than several indices into arrays of several axes.
 Particles = ti.types.ndarray(dtype=ti.f32, ndim=1)  # rows of one number of all particles (tacsim.physics.exec.layout)
 Strips = ti.types.ndarray(dtype=strip, ndim=1)  # masses, velocities
 
@@ -83,7 +83,7 @@ class Slab(NamedTuple):
     ny: Any
     nz: Any
     base: Any  # where the grid begins in an array of strips
-    discard: Any  # where three planes behind the grid begin, which nobody reads
+    discard: Any  # where three planes behind the grid begin, which are never read
 
 
 @ti.func
@@ -128,11 +128,11 @@ def load(particles: ti.template(), at, stride, first: ti.template(), count: ti.t
 
 @ti.func
 def store(
-    particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template(), never
+    particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template(), zero
 ):  # fmt: skip
     for r in range(count):
         start = bounded(at + (first + r) * stride, 1)
-        values = lanes([overwrite(never, particles[start + lane], rows[r, lane]) for lane in range(LANES)])
+        values = lanes([overwrite(zero, particles[start + lane], rows[r, lane]) for lane in range(LANES)])
         for lane in ti.static(range(LANES)):
             particles[start + lane] = values[lane]
 
@@ -164,7 +164,7 @@ def put(rows: ti.template(), row: ti.template(), lane, values: ti.template()):
 
 @ti.func
 def stencil(x, slab: ti.template(), rows: ti.template(), indices: ti.template(), lane):
-    """Of one particle, into `rows` and `indices`. Off the slab (or NaN) its lines are where nobody reads."""
+    """Of one particle, into `rows` and `indices`. Off the slab (or NaN) its lines are at `slab.discard`."""
     s = (x - slab.origin) * slab.scale
     ny, nz = slab.ny, slab.nz
     wanted = ti.floor(s - 0.5).cast(ti.i32)
@@ -207,15 +207,15 @@ def clear_masses(env: ti.template(), part, body: ti.template()):
 @ti.func
 def particles_to_grid(env: ti.template(), part, body: ti.template()):
     """Return mapping; momentum and mass of this part's particles onto their nodes, in its copy of the grid."""
-    never, cell, dt = env.count(layout.ZERO), env.param(layout.BODY_CELL), env.param(layout.STEP)
+    zero, cell, dt = env.count(layout.ZERO), env.param(layout.BODY_CELL), env.param(layout.STEP)
     mass, mu, bulk = env.param(layout.BODY_MASS), env.param(layout.BODY_MU), env.param(layout.BODY_BULK)
     limit, hardening = env.param(layout.BODY_LIMIT), env.param(layout.BODY_HARDENING)
     impulse, inertia = -dt * env.param(layout.BODY_VOLUME) * 4.0 / cell, mass * cell
     first_block, last_block = block_range(env, part)
     stride = env.count(layout.STRIDE)
     slab = ti.static(slab_of(env, part, (env.index * COPIES + copy_of(part)) * env.count(layout.CAPACITY)))
-    zero = ti.cast(never, ti.f32)  # 0, but a 0 that the compiler knows would make a lane unlike its neighbours
-    lost, spare = 0, opaque(never, 16)
+    float_zero = ti.cast(zero, ti.f32)  # 0, but a 0 that the compiler knows would make a lane unlike its neighbours
+    lost, spare = 0, opaque(zero, 16)
     place = ti.Matrix.zero(ti.f32, 3, LANES)
     old = ti.Matrix.zero(ti.f32, 7, LANES)  # strain, flow
     new = ti.Matrix.zero(ti.f32, 7, LANES)
@@ -267,14 +267,14 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
             put(momentum, MOMENTUM_Z, lane, az)
             for i, j in ti.static(ti.ndrange(3, 3)):
                 shares[3 * i + j, lane] = grid[W_X + i, lane] * grid[W_Y + j, lane]
-        store(body.particles, start, stride, layout.STRAIN, 7, new, never)
+        store(body.particles, start, stride, layout.STRAIN, 7, new, zero)
         for lane in range(ti.min(LANES, env.count(layout.PARTICLES) - block * LANES)):
             lost += indices[OFF, lane]
             q, ax, ay, az = [four(momentum, row, lane, spare) for row in (MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z)]
             for s in ti.static(range(LINE)):
                 w = by_node(grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
                 by_x, by_y = w * per_node(ax), w * per_node(ay)
-                plane = w * (per_node(q) + by_node(zero + NODES * s, zero + (NODES * s + 1)) * per_node(az))
+                plane = w * (per_node(q) + by_node(float_zero + NODES * s, float_zero + (NODES * s + 1)) * per_node(az))
                 for i in ti.static(range(3)):
                     line = plane
                     for j in ti.static(range(3)):
@@ -297,12 +297,12 @@ def node_sum(env: ti.template(), i, at, body: ti.template()):
     if ti.static(ON_DEVICE):
         return body.masses[env.index * env.count(layout.CAPACITY) + at]
     else:
-        never = env.count(layout.ZERO)
-        here = opaque(never, env.index * env.count(layout.CAPACITY) + at)
-        body.velocities[here] = overwrite(never, body.velocities[here], strip(0.0))
+        zero = env.count(layout.ZERO)
+        here = opaque(zero, env.index * env.count(layout.CAPACITY) + at)
+        body.velocities[here] = overwrite(zero, body.velocities[here], strip(0.0))
         for part in ti.static(range(COPIES)):
             if i >= env.count(layout.SLAB + 2 * part) and i < env.count(layout.SLAB + 2 * part + 1):
-                copy = opaque(never, (env.index * COPIES + part) * env.count(layout.CAPACITY) + at)
+                copy = opaque(zero, (env.index * COPIES + part) * env.count(layout.CAPACITY) + at)
                 body.velocities[here] = body.velocities[here] + body.masses[copy]
         return body.velocities[here]
 
@@ -329,10 +329,10 @@ def moved_plane(plane, x, y, z, dt):
 def grid_to_particles(env: ti.template(), part, body: ti.template()):
     """Velocity and affine velocity back to this part's particles; strain, position and tangent plane follow.
 
-    Particles off the grid read nodes behind it: the launch is taken back anyway, since `particles_to_grid` has counted
+    Particles off the grid read nodes behind it: the launch is undone anyway, since `particles_to_grid` has counted
     them.
     """
-    never, dt, slot = env.count(layout.ZERO), env.param(layout.STEP), slot_of(part)
+    zero, dt, slot = env.count(layout.ZERO), env.param(layout.STEP), slot_of(part)
     first_block, last_block = block_range(env, part)
     stride = env.count(layout.STRIDE)
     slab = ti.static(slab_of(env, part, env.index * env.count(layout.CAPACITY)))
@@ -398,9 +398,9 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
                 extremes[d, lane] = ti.max(extremes[d, lane], ti.abs(velocity[d]))
                 extremes[3 + d, lane] += velocity[d]
             extremes[6, lane] = ti.min(extremes[6, lane], volume)
-        store(body.particles, start, stride, layout.PLANE, 6, place, never)
-        store(body.particles, start, stride, layout.STRAIN, 6, strain, never)
-        store(body.particles, start, stride, layout.VELOCITY, 12, rate, never)
+        store(body.particles, start, stride, layout.PLANE, 6, place, zero)
+        store(body.particles, start, stride, layout.STRAIN, 6, strain, zero)
+        store(body.particles, start, stride, layout.VELOCITY, 12, rate, zero)
     record_least(env, slot, layout.SMALLEST_STEP_VOLUME, smallest_lane(extremes, 6))
     fastest = 0.0
     for lane in ti.static(range(LANES)):

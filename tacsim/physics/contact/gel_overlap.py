@@ -17,7 +17,7 @@ def gel_overlap(params: GelParams, tops: Floats, rotations: Floats, origins: Flo
 
     tops: (2, nx + 1, ny + 1, 3) displacements of both gels' surfaces, each in its sensor's frame [mm]; rotations
     (2, 3, 3) and origins (2, 3) [mm] of the sensors in the world. Heights between nodes are linear, and those of a
-    surface are taken where its nodes rest: what it has moved sideways is left out.
+    surface are taken where its nodes rest: its sideways displacement is left out.
     """
     half = np.array(params.half)
     if _apart(half, tops, rotations, origins):

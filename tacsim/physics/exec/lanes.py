@@ -2,7 +2,7 @@
 
 Taichi's loops are scalar; LLVM merges eight equal scalar operations into one vector operation only if it finds them
 side by side, starting from stores to neighbouring addresses that it has seen before. Hence arrays keep one number of
-eight neighbours (particles, elements, nodes; `real`) side by side, and `keep_or` stores in the way that is recognised.
+eight neighbours (particles, elements, nodes; `lanes`) side by side, and `overwrite` stores so that LLVM recognises it.
 
 Work is cut into PARTS, whatever the number of threads: every part scatters into copies of its own, which are summed in
 a fixed order. Hence no atomics on the CPU, and the same bits with any number of threads.
@@ -56,24 +56,25 @@ def aligned_zeros(*shape: int) -> np.ndarray:
 
 
 @ti.func
-def overwrite(never, old, new):
-    """new; `old` in words only (never is 0, which the compiler can't know): a value stored over the one just read."""
+def overwrite(zero, old, new):
+    """Returns `new`. `old` is used in name only (`zero` is 0, which the compiler cannot know): LLVM makes vectors of a
+    value stored over the one just read."""
     if ti.static(ON_DEVICE):
         return new
     else:
-        return ti.bit_cast(ti.bit_cast(new, ti.i32) | (ti.bit_cast(old, ti.i32) & never), ti.f32)
+        return ti.bit_cast(ti.bit_cast(new, ti.i32) | (ti.bit_cast(old, ti.i32) & zero), ti.f32)
 
 
 @ti.func
-def opaque(never, index):
-    """index. The compiler takes a sum of several indices apart, and lanes behind it are no neighbours any more."""
-    return index | never
+def opaque(zero, index):
+    """Returns `index`. The compiler would take a sum of several indices apart, and see no neighbours behind it."""
+    return index | zero
 
 
 @ti.func
 def bounded(index, width: ti.template()):
-    """index, of things of `width` numbers. That it is neither negative nor large lets the compiler see which numbers
-    behind it are neighbours."""
+    """Returns `index`, of things of `width` numbers. Since it is neither negative nor large, the compiler sees which
+    numbers behind it are neighbours."""
     if ti.static(ON_DEVICE):
         return index
     else:
@@ -88,9 +89,9 @@ def load_lanes(array: ti.template(), at):
 
 
 @ti.func
-def store_lanes(array: ti.template(), at, values, never):
+def store_lanes(array: ti.template(), at, values, zero):
     start = bounded(at, 1)
-    kept = lanes([overwrite(never, array[start + lane], values[lane]) for lane in range(LANES)])
+    kept = lanes([overwrite(zero, array[start + lane], values[lane]) for lane in range(LANES)])
     for lane in ti.static(range(LANES)):
         array[start + lane] = kept[lane]
 

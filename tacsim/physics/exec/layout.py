@@ -1,6 +1,6 @@
 """Where each number stands in the small arrays that kernels share with worlds. Units: mm, N, MPa, wave speed 1."""
 
-# facts (environments, FACTS) float32: constants of one environment
+# params (environments, PARAMS) float32: constants of one environment
 STEP = 0  # time step [mm]
 GEL_SPACING = 1  # element edge [mm]
 GEL_MU = 2  # [MPa]
@@ -30,7 +30,7 @@ INVERSE_INERTIA = 36  # inverse moment of inertia of the particles then: xx, yy,
 PARAMS = 42
 
 # counts (environments, COUNTS) int32
-ZERO = 0  # always 0: see tacsim.physics.exec.lanes.keep_or
+ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite
 STEPS = 1  # substeps of this launch
 PARTICLES = 2
 GRID = 3  # node counts x, y, z
@@ -38,9 +38,9 @@ SLAB = 6  # first node plane and the one after the last of part 0, 1, ...
 KIND = 14  # of indenter
 STRIDE = 15  # particles that an environment has room for
 CAPACITY = 16  # strips of grid nodes that an environment has room for, in each copy
-SHAPE_NODES = 17  # of an indenter's distance grid, how many are at hand along x, y, z
+SHAPE_NODES = 17  # of an indenter's distance grid, how many are loaded along x, y, z
 ELEMENTS = 20  # of a gel along x, y, z
-SHAPE_FIRST = 23  # of the nodes that are at hand of an indenter's distance grid, number along x, y, z
+SHAPE_FIRST = 23  # number of the first loaded node of an indenter's distance grid along x, y, z
 COUNTS = 26
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed

@@ -32,12 +32,12 @@ def element_block(
     of each; to: where the forces go in `corners`, `row` the distance to the next corner or axis.
     """
     h, mu, lam = env.param(layout.GEL_SPACING), env.param(layout.GEL_MU), env.param(layout.GEL_LAMBDA)
-    never, quarter = env.count(layout.ZERO), 0.25 / h
+    zero, quarter = env.count(layout.ZERO), 0.25 / h
     for d in range(3):  # not unrolled here: kernels of more statements compile for much longer
         for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
             at = u + d * axis + k * layer + j + i * (gels.ny + 1)
             fill(rows, 8 * d + 4 * i + 2 * j + k, load_lanes(gels.nodes, at))
-    fill(rows, WHOLE, gels.lattice[opaque(never, block)])
+    fill(rows, WHOLE, gels.lattice[opaque(zero, block)])
     for lane in range(LANES):
         whole = rows[WHOLE, lane]
         area, stiffness = (0.25 * h * h) * whole, (HOURGLASS * 2.0 * mu * h / 8.0) * whole
@@ -79,4 +79,4 @@ def element_block(
                 rows[3 * k + d, lane] = yz[k] + odd[k]
                 rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
     for r in range(24):
-        store_lanes(gels.corners, to + r * row, lanes([rows[r, lane] for lane in range(LANES)]), never)
+        store_lanes(gels.corners, to + r * row, lanes([rows[r, lane] for lane in range(LANES)]), zero)

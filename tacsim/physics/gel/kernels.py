@@ -81,7 +81,7 @@ def margin(gels: ti.template()):
 
 
 @ti.func
-def node_block(gels: ti.template(), to, i, j, below, above, row, never):
+def node_block(gels: ti.template(), to, i, j, below, above, row, zero):
     """Internal force on LANES nodes along one axis, from the elements above them, at i in `corners`, and below, at j.
 
     to: where the force stands in `nodes`; below, above: 1 or 0, whether there are any; row: as for `element_block`.
@@ -91,13 +91,13 @@ def node_block(gels: ti.template(), to, i, j, below, above, row, never):
         offset = (12 * p + 6 * q) * row - p * (gels.ny + 1) - q
         under += load_lanes(gels.corners, i + offset)
         over += load_lanes(gels.corners, j + 3 * row + offset)
-    store_lanes(gels.nodes, to, below * under + above * over, never)
+    store_lanes(gels.nodes, to, below * under + above * over, zero)
 
 
 @ti.func
 def gel_forces(env: ti.template(), part, gels: ti.template()):
     """Internal forces on this part's nodes of its gel. A layer of elements, then the nodes below it, and so on up."""
-    never, nx, ny, layers = env.count(layout.ZERO), gels.nx, gels.ny, gels.layers
+    zero, nx, ny, layers = env.count(layout.ZERO), gels.nx, gels.ny, gels.layers
     pieces = PARTS // gels.number
     g, piece = part // pieces, part % pieces
     blocks = ((nx + 1) * (ny + 1) + LANES - 1) // LANES
@@ -123,12 +123,12 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
             i, j = here + block * LANES, before + block * LANES
             for d in range(3):
                 to = u + (6 + d) * axis + k * layer + block * LANES
-                node_block(gels, to, i + d * row, j + d * row, below, above, row, never)
+                node_block(gels, to, i + d * row, j + d * row, below, above, row, zero)
     record_least(env, part, layout.SMALLEST_VOLUME, smallest_lane(rows, SMALLEST))
 
 
 @ti.func
-def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, forces, axis, never):
+def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, forces, axis, zero):
     """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
     zeros for the next substep. forces: where those along x begin, `axis` the distance to those along y and z."""
     push = ti.Matrix.zero(ti.f32, 4 * LANES, 1)
@@ -146,11 +146,11 @@ def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, 
         for d in ti.static(range(3)):
             at = forces + d * axis + block * LANES
             force = load_lanes(gels.nodes, at) + lanes([turned[d, lane] for lane in range(LANES)])
-            store_lanes(gels.nodes, at, force, never)
+            store_lanes(gels.nodes, at, force, zero)
         for copy in ti.static(range(COPIES)):
             for quarter in range(4):
                 at = contact_force_start(env, gels, copy, g) + (block * 4 + quarter) * LANES
-                store_lanes(gels.contact_force, at, lanes(0.0), never)
+                store_lanes(gels.contact_force, at, lanes(0.0), zero)
 
 
 @ti.func
@@ -160,7 +160,7 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
     Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted. On a
     device a part is one column of nodes: of gel part // columns, number part % columns.
     """
-    never, dt, h = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING)
+    zero, dt, h = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING)
     nx, ny, layers = gels.nx, gels.ny, gels.layers
     pieces = PARTS // gels.number
     row, count = ny + 1, (nx + 1) * (ny + 1)
@@ -188,18 +188,18 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
             gels.nodes[top + (6 + d) * axis + first] += gels.contact_force[at]
             gels.contact_force[at] = 0.0
     else:
-        add_contact_forces(env, gels, g, first, last, top + 6 * axis, axis, never)
+        add_contact_forces(env, gels, g, first, last, top + 6 * axis, axis, zero)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
-            share = gels.lattice[opaque(never, blocks + block)] * scale
+            share = gels.lattice[opaque(zero, blocks + block)] * scale
             for d in range(3):
                 x = u + d * axis + k * layer + block * LANES
                 v, f = x + 3 * axis, x + 6 * axis
                 speed = keep * load_lanes(gels.nodes, v) + share * load_lanes(gels.nodes, f)
                 place = load_lanes(gels.nodes, x) + dt * speed
-                store_lanes(gels.nodes, v, speed, never)
-                store_lanes(gels.nodes, x, place, never)
+                store_lanes(gels.nodes, v, speed, zero)
+                store_lanes(gels.nodes, x, place, zero)
     first_row = surface_row(env, gels, g)
     i, j = first * LANES // row, first * LANES % row
     for block in range(first, last):
@@ -213,7 +213,7 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
                 for p in range(p0, p1):
                     for q in range(q0, q1):
                         to = surface_at(gels, first_row + quantity * (nx + 3) + p, q)
-                        values = vec4([overwrite(never, gels.surface[to + c], at[c]) for c in range(4)])
+                        values = vec4([overwrite(zero, gels.surface[to + c], at[c]) for c in range(4)])
                         for c in ti.static(range(4)):
                             gels.surface[to + c] = values[c]
             j += 1

@@ -7,6 +7,8 @@ Units: mm, N, MPa; densities are scaled so that the pressure wave speed is 1, he
 All particles lie in one array: lower gel, upper gel, body. Loops are serial and adds are plain: bitwise repeatable.
 """
 
+from typing import Any, NamedTuple
+
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import ELASTIC, full, stress_small_strain, vec6
 
@@ -20,7 +22,7 @@ Positions = ti.types.ndarray(dtype=ti.types.vector(3, ti.f64), ndim=1)  # a sett
 Scalars = ti.types.ndarray(dtype=f32, ndim=1)
 Vectors = ti.types.ndarray(dtype=Vec3, ndim=1)
 Matrices = ti.types.ndarray(dtype=Mat3, ndim=1)
-Grid = ti.types.ndarray(dtype=Vec4, ndim=3)  # momentum, then velocity; mass
+GridNodes = ti.types.ndarray(dtype=Vec4, ndim=3)  # momentum, then velocity; mass
 Drive = ti.types.ndarray(dtype=f32, ndim=4)  # [substep, sensor, row, xyz] of tacsim.physics.motion.path.Path
 Table = ti.types.ndarray(dtype=f32, ndim=2)
 
@@ -54,6 +56,26 @@ class Step:
     sway_damping: f32  # of the body, along x and y
     cells: ti.i32  # node layers between the two backing planes
     gels: ti.i32  # particles of one gel
+
+
+class Particles(NamedTuple):
+    """All particles inside a kernel (docs/decisions/0012): their positions, velocities, APIC matrices, deformation
+    gradients, Kirchhoff stresses, and whether each has left the grid."""
+
+    x: Any
+    v: Any
+    C: Any
+    F: Any
+    stress: Any
+    aside: Any
+
+
+class Grid(NamedTuple):
+    """The grid inside a kernel, and where it lies in this substep."""
+
+    nodes: Any
+    origin: Any
+    spacing: Any
 
 
 @ti.func
@@ -96,10 +118,10 @@ def weights(fx):
 
 
 @ti.func
-def inside(X, grid: ti.template()):
+def inside(X, nodes: ti.template()):
     """Whether the stencil of a particle at grid coordinates X lies in the grid; False for NaN."""
     ok = X[0] > 0.5 and X[1] > 0.5 and X[2] > 0.5
-    return ok and X[0] < grid.shape[0] - 1.5 and X[1] < grid.shape[1] - 1.5 and X[2] < grid.shape[2] - 1.5
+    return ok and X[0] < nodes.shape[0] - 1.5 and X[1] < nodes.shape[1] - 1.5 and X[2] < nodes.shape[2] - 1.5
 
 
 @ti.func
@@ -192,28 +214,25 @@ def neo_hookean(F, solid):
 
 
 @ti.func
-def particle_to_grid(
-    x: ti.template(), v: ti.template(), C: ti.template(), stress: ti.template(), aside: ti.template(),
-    grid: ti.template(), origin, spacing, step, gel, body, health: ti.template(),
-):  # fmt: skip
+def particle_to_grid(particles: ti.template(), grid: ti.template(), step, gel, body, health: ti.template()):
     """Scatters momentum, mass and the impulse of stress; sets aside (and so counts) particles outside the grid."""
-    for p in range(x.shape[0]):
-        X = ti.cast((x[p] - origin) / spacing, f32)
-        if aside[p] == 0 and not inside(X, grid):
-            aside[p] = 1
+    for p in range(particles.x.shape[0]):
+        X = ti.cast((particles.x[p] - grid.origin) / grid.spacing, f32)
+        if particles.aside[p] == 0 and not inside(X, grid.nodes):
+            particles.aside[p] = 1
             if p < 2 * step.gels:
                 health[1] += 1.0
-        if aside[p] == 0:
+        if particles.aside[p] == 0:
             base = ti.floor(X - 0.5, ti.i32)
             fx = X - base
             w = weights(fx)
             mass, volume = gel.mass, gel.volume
             if p >= 2 * step.gels:
                 mass, volume = body.mass, body.volume
-            affine, push = mass * C[p], -4.0 * step.dt * volume * stress[p]
+            affine, push = mass * particles.C[p], -4.0 * step.dt * volume * particles.stress[p]
             for a, b in ti.static(ti.ndrange(3, 3)):
-                affine[a, b] = affine[a, b] * spacing[b] + push[a, b] / spacing[b]
-            start = mass * v[p] - affine @ fx
+                affine[a, b] = affine[a, b] * grid.spacing[b] + push[a, b] / grid.spacing[b]
+            start = mass * particles.v[p] - affine @ fx
             q0 = Vec4(start[0], start[1], start[2], mass)
             ax = Vec4(affine[0, 0], affine[1, 0], affine[2, 0], 0.0)
             ay = Vec4(affine[0, 1], affine[1, 1], affine[2, 1], 0.0)
@@ -223,24 +242,24 @@ def particle_to_grid(
                 wij = w[i, 0] * w[j, 1]
                 for k in ti.static(range(3)):
                     node = base + ti.Vector([i, j, k])
-                    grid[node] = grid[node] + (wij * w[k, 2]) * (qij + az * float(k))
+                    grid.nodes[node] = grid.nodes[node] + (wij * w[k, 2]) * (qij + az * float(k))
 
 
 @ti.func
-def update_grid(grid: ti.template(), drive: ti.template(), n, origin, spacing, step, backing: ti.template()):
+def update_grid(grid: ti.template(), drive: ti.template(), n, step, backing: ti.template()):
     """Momentum -> velocity; nodes on and behind a backing plane move with their sensor and give it their momentum.
 
     `backing` = force and torque on each sensor, about its origin, world axes.
     """
     for s, a in ti.ndrange(2, 6):
         backing[s, a] = 0.0
-    for i, j, k in ti.ndrange(grid.shape[0], grid.shape[1], grid.shape[2]):
-        q = grid[i, j, k]
+    for i, j, k in ti.ndrange(grid.nodes.shape[0], grid.nodes.shape[1], grid.nodes.shape[2]):
+        q = grid.nodes[i, j, k]
         if q[3] > 0.0:
             u = Vec3(q[0], q[1], q[2]) / q[3]
             if k <= PAD or k >= PAD + step.cells:
                 s = ti.select(k <= PAD, 0, 1)
-                at = origin + spacing * Vec3(i, j, k)
+                at = grid.origin + grid.spacing * Vec3(i, j, k)
                 driven = driven_velocity(drive, n, s, at, step.dt)
                 force = (q[3] / step.dt) * (u - driven)
                 torque = (at - face(drive, n, s, step.dt)).cross(force)
@@ -248,18 +267,15 @@ def update_grid(grid: ti.template(), drive: ti.template(), n, origin, spacing, s
                     backing[s, a] += force[a]
                     backing[s, a + 3] += torque[a]
                 u = driven
-            grid[i, j, k] = Vec4(u[0], u[1], u[2], q[3])
+            grid.nodes[i, j, k] = Vec4(u[0], u[1], u[2], q[3])
 
 
 @ti.func
-def grid_to_particle(
-    x: ti.template(), v: ti.template(), C: ti.template(), F: ti.template(), stress: ti.template(),
-    aside: ti.template(), grid: ti.template(), origin, spacing, step, gel, body, health: ti.template(),
-):  # fmt: skip
+def grid_to_particle(particles: ti.template(), grid: ti.template(), step, gel, body, health: ti.template()):
     """Gathers velocity and its gradient C, updates F <- (I + dt C) F, maps it back to the yield surface."""
-    for p in range(x.shape[0]):
-        if aside[p] == 0:
-            X = ti.cast((x[p] - origin) / spacing, f32)
+    for p in range(particles.x.shape[0]):
+        if particles.aside[p] == 0:
+            X = ti.cast((particles.x[p] - grid.origin) / grid.spacing, f32)
             base = ti.floor(X - 0.5, ti.i32)
             fx = X - base
             w = weights(fx)
@@ -268,7 +284,7 @@ def grid_to_particle(
             for i, j in ti.static(ti.ndrange(3, 3)):
                 line, slope = Vec3(0.0), Vec3(0.0)
                 for k in ti.static(range(3)):
-                    q = grid[base + ti.Vector([i, j, k])]
+                    q = grid.nodes[base + ti.Vector([i, j, k])]
                     u = (w[i, 0] * w[j, 1] * w[k, 2]) * Vec3(q[0], q[1], q[2])
                     line += u
                     slope += u * (k - fx[2])
@@ -278,21 +294,21 @@ def grid_to_particle(
                     gradient[a, 1] += line[a] * (j - fx[1])
                     gradient[a, 2] += slope[a]
             for a, b in ti.static(ti.ndrange(3, 3)):
-                gradient[a, b] *= 4.0 / spacing[b]
-            v[p] = velocity
-            C[p] = gradient
+                gradient[a, b] *= 4.0 / grid.spacing[b]
+            particles.v[p] = velocity
+            particles.C[p] = gradient
             update = step.dt * gradient
             for a in ti.static(range(3)):
                 update[a, a] += 1.0
-            trial = update @ F[p]
+            trial = update @ particles.F[p]
             if p < 2 * step.gels:
-                F[p] = trial
-                stress[p] = neo_hookean(trial, gel)
+                particles.F[p] = trial
+                particles.stress[p] = neo_hookean(trial, gel)
                 health[0] = ti.min(health[0], trial.determinant())
             else:
                 elastic, tau = body_law(trial, body)
-                F[p] = elastic
-                stress[p] = tau
+                particles.F[p] = elastic
+                particles.stress[p] = tau
             health[2] = ti.min(health[2], update.determinant())
             health[3] = ti.max(health[3], velocity.norm())
 
@@ -322,8 +338,8 @@ def body_reference(drive: ti.template(), n, z, motion: ti.template(), step):
 
 @ti.func
 def advection(
-    x: ti.template(), v: ti.template(), aside: ti.template(), drive: ti.template(), n, step, gel,
-    motion: ti.template(), momentum: ti.template(), gain: ti.template(),
+    particles: ti.template(), drive: ti.template(), n, step, gel, motion: ti.template(), momentum: ti.template(),
+    gain: ti.template(),
 ):  # fmt: skip
     """Moves the particles, then damps their velocity (afterwards: damping must not scale the forces).
 
@@ -333,26 +349,26 @@ def advection(
     for s in range(2):
         before, after = Vec3(0.0), Vec3(0.0)
         for p in range(s * step.gels, (s + 1) * step.gels):
-            if aside[p] == 0:
-                x[p] = x[p] + step.dt * ti.cast(v[p], ti.f64)
-                at = ti.cast(x[p], f32)
-                before += v[p]
+            if particles.aside[p] == 0:
+                particles.x[p] = particles.x[p] + step.dt * ti.cast(particles.v[p], ti.f64)
+                at = ti.cast(particles.x[p], f32)
+                before += particles.v[p]
                 driven = driven_velocity(drive, n, s, at, step.dt)
-                v[p] = v[p] - step.gel_damping * step.dt * (v[p] - driven)
-                after += v[p]
+                particles.v[p] = particles.v[p] - step.gel_damping * step.dt * (particles.v[p] - driven)
+                after += particles.v[p]
         for a in ti.static(range(3)):
             gain[s, a] = gel.mass * (before[a] - momentum[s, a]) / step.dt
             momentum[s, a] = after[a]
-    for p in range(2 * step.gels, x.shape[0]):
-        if aside[p] == 0:
-            x[p] = x[p] + step.dt * ti.cast(v[p], ti.f64)
-            at = ti.cast(x[p], f32)
-            mean += v[p]
+    for p in range(2 * step.gels, particles.x.shape[0]):
+        if particles.aside[p] == 0:
+            particles.x[p] = particles.x[p] + step.dt * ti.cast(particles.v[p], ti.f64)
+            at = ti.cast(particles.x[p], f32)
+            mean += particles.v[p]
             count += 1
             lowest, highest = ti.min(lowest, at[2]), ti.max(highest, at[2])
-            excess = v[p] - body_reference(drive, n, at[2], motion, step)
+            excess = particles.v[p] - body_reference(drive, n, at[2], motion, step)
             rate = Vec3(step.sway_damping, step.sway_damping, step.body_damping)
-            v[p] = v[p] - step.dt * rate * excess
+            particles.v[p] = particles.v[p] - step.dt * rate * excess
     if count > 0:
         for a in ti.static(range(3)):
             motion[a] = mean[a] / count
@@ -361,27 +377,19 @@ def advection(
 
 @ti.kernel
 def advance(
-    x: Positions, v: Vectors, C: Matrices, F: Matrices, stress: Matrices, aside: Flags, grid: Grid, drive: Drive,
+    x: Positions, v: Vectors, C: Matrices, F: Matrices, stress: Matrices, aside: Flags, nodes: GridNodes, drive: Drive,
     motion: Scalars, momentum: Table, gain: Table, backing: Table, health: Scalars, gel: Solid, body: Solid, step: Step,
 ):  # fmt: skip
     """Many substeps of the whole scene in one launch, one a row of `drive`."""
     ti.loop_config(serialize=True)
     for n in range(drive.shape[0]):
         z0, dz = vertical(drive, n, step)
+        particles = ti.static(Particles(x, v, C, F, stress, aside))
         origin, spacing = Vec3(step.x0, step.y0, z0), Vec3(step.dx, step.dx, dz)
-        for i, j, k in ti.ndrange(grid.shape[0], grid.shape[1], grid.shape[2]):
-            grid[i, j, k] = Vec4(0.0)
-        particle_to_grid(x, v, C, stress, aside, grid, origin, spacing, step, gel, body, health)
-        update_grid(grid, drive, n, origin, spacing, step, backing)
-        grid_to_particle(x, v, C, F, stress, aside, grid, origin, spacing, step, gel, body, health)
-        advection(x, v, aside, drive, n, step, gel, motion, momentum, gain)
-
-
-@ti.kernel
-def map_back(F: Matrices, stress: Matrices, body: Solid):
-    """The body's law alone: trial F -> elastic F and Kirchhoff stress."""
-    ti.loop_config(serialize=True)
-    for p in range(F.shape[0]):
-        elastic, tau = body_law(F[p], body)
-        F[p] = elastic
-        stress[p] = tau
+        grid = ti.static(Grid(nodes, origin, spacing))
+        for node in ti.grouped(ti.ndrange(nodes.shape[0], nodes.shape[1], nodes.shape[2])):
+            nodes[node] = Vec4(0.0)
+        particle_to_grid(particles, grid, step, gel, body, health)
+        update_grid(grid, drive, n, step, backing)
+        grid_to_particle(particles, grid, step, gel, body, health)
+        advection(particles, drive, n, step, gel, motion, momentum, gain)

@@ -82,7 +82,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
 
     With `layout.WIDENING` the reference also widens as fast as a body must whose volume stays (docs/decisions/0002).
 
-    Only a sensor that touches the body imposes anything; one that nobody touches is damped towards rest. Across the
+    Only a sensor that touches the body imposes anything; a body without contact is damped towards rest. Across the
     sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides on one
     sensor must not be dragged back by the other.
     """
@@ -106,7 +106,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
     axis = p1 - p0
     length2 = axis.norm_sqr() + 1e-12
-    share = ti.select(touch0 and touch1, 1.0, 0.0)  # of the way from one sensor to the other that counts
+    share = ti.select(touch0 and touch1, 1.0, 0.0)  # of the distance from one sensor to the other that counts
     alone = ti.select(touch1 and not touch0, 1.0, 0.0)
     held = ti.select(touch0 or touch1, 1.0, 0.0)
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0

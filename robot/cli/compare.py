@@ -230,7 +230,7 @@ def _limits(texts: list[str] | None, option: str) -> list[Limit]:
 
 
 def _require_known(limits: list[Limit], values: dict[str, float]) -> None:
-    """A limit of something that could not be told must not look like a pass."""
+    """A limit of a figure that could not be measured must not pass."""
     unknown = [name for name, _, _ in limits if values[name] != values[name]]
     if unknown:
         raise typer.BadParameter(

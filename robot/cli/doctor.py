@@ -1,4 +1,4 @@
-"""`tacsim schema` and `tacsim doctor`: what may be said, and what the machine is like."""
+"""`tacsim schema` and `tacsim doctor`: what a file may say, and whether machine and rig are fit."""
 
 from __future__ import annotations
 

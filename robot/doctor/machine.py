@@ -1,4 +1,4 @@
-"""Looks at the machine: does what tacsim needs stand here, and what should be done about what does not."""
+"""Checks of the machine: what tacsim needs, whether it is there, and what to do where it is not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ State = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing looked at."""
+    """The result of one check."""
 
     name: str
     state: State
@@ -33,10 +33,8 @@ class Check:
 
 def examine() -> list[Check]:
     """All checks, in the order in which problems should be mended. A check that itself breaks is a `fail`."""
-    checks: list[Check] = []
-    for look in (python, packages, second_opencv, opencv, taichi, ur_rtde, processors, realtime, working_directory):
-        checks += _guarded(look)
-    return checks
+    functions = (python, packages, second_opencv, opencv, taichi, ur_rtde, processors, realtime, working_directory)
+    return [check for function in functions for check in _run(function)]
 
 
 def as_json(checks: Iterable[Check]) -> dict[str, Any]:
@@ -45,11 +43,11 @@ def as_json(checks: Iterable[Check]) -> dict[str, Any]:
     return {"ok": all(check["state"] != "fail" for check in listed), "checks": listed}
 
 
-def _guarded(look: Callable[[], list[Check]]) -> list[Check]:
+def _run(function: Callable[[], list[Check]]) -> list[Check]:
     try:
-        return look()
+        return function()
     except Exception as error:  # a broken installation can fail in any way, and that is the finding
-        name = look.__name__.replace("_", " ")
+        name = function.__name__.replace("_", " ")
         advice = "reinstall the packages: make run builds the environment anew"
         return [Check(name, "fail", f"{type(error).__name__}: {error}", advice)]
 

@@ -1,7 +1,7 @@
-"""Looks at a rig of hardware before anything moves: network, versions, remote control, cameras, limits.
+"""Checks of a rig of hardware before anything moves: network, versions, remote control, cameras, limits.
 
 Connects to the dashboard and to the RTDE port of each arm, and reads each camera for a second. It never becomes a
-commander: no input register is claimed and no program is sent, so it may look at an arm that another program drives.
+commander: no input register is claimed and no program is sent, so it may check an arm that another program drives.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from tacsim.models.rig import RigConfig
 
 PORTS = {DASHBOARD: "dashboard", 30003: "script", 30004: "RTDE"}
 TIMEOUT = 2.0  # of each connection [s]
-LOOK = 1.0  # how long a camera is looked at [s]
-OLDEST = (5, 6)  # PolyScope: remote control can be asked for since then
-SLOW = 0.8  # a camera this share slower than asked for is worth a word
+CAMERA_TIME = 1.0  # for which a camera is read [s]
+MIN_POLYSCOPE = (5, 6)  # the first version that tells whether it is in remote control
+MIN_FRAME_RATE = 0.8  # share of the rate asked for; a slower camera is a warning
 
 
 def examine_rig(config: RigConfig) -> list[Check]:
@@ -81,12 +81,9 @@ def _open(host: str, port: int) -> bool:
 def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterator[Check]:
     version = dashboard.ask("PolyscopeVersion")
     found = re.search(r"(\d+)\.(\d+)\.\d+", version)
-    fit = found is not None and (int(found[1]), int(found[2])) >= OLDEST
-    advice = (
-        ""
-        if fit
-        else f"update PolyScope to {OLDEST[0]}.{OLDEST[1]} or later: older ones cannot be asked for remote control"
-    )
+    fit = found is not None and (int(found[1]), int(found[2])) >= MIN_POLYSCOPE
+    lowest = ".".join(map(str, MIN_POLYSCOPE))
+    advice = "" if fit else f"update PolyScope to {lowest} or later: older ones cannot be asked for remote control"
     yield Check(f"{name}: PolyScope", "ok" if fit else "warn", version, advice)
     model, serial = dashboard.model(), dashboard.serial()
     wrong = model is not None and not config.model.startswith(model)
@@ -163,7 +160,7 @@ def _camera(name: str, config: CameraSensorConfig) -> Check:
     label = f"{name}: camera"
     try:
         with Camera(config, name, TIMEOUT + 1.0) as camera:
-            time.sleep(LOOK)
+            time.sleep(CAMERA_TIME)
             status = camera.status
     except DeviceError as failure:
         return Check(label, "fail", str(failure), "see cable, address, and what else uses the camera")
@@ -171,6 +168,6 @@ def _camera(name: str, config: CameraSensorConfig) -> Check:
     words = (
         f"{config.width} x {config.height} px, {fps:.1f} frames/s, newest {1e3 * age:.0f} ms old, {status.dropped} lost"
     )
-    if fps < SLOW * config.fps or status.damaged:
+    if fps < MIN_FRAME_RATE * config.fps or status.damaged:
         return Check(label, "warn", words, f"{config.fps:g} frames/s were asked for: exposure, USB hub, or cable?")
     return Check(label, "ok", words)

@@ -218,7 +218,7 @@ def _markers(read: FrameSet, pitch: float) -> Markers:
 
 
 def _noise(read: FrameSet) -> CameraNoise | None:
-    """The camera's noise, and a word on it."""
+    """The camera's noise, measured and printed."""
     from calibration.light.noise import NoiseUnknown, measure_noise
 
     try:
@@ -235,7 +235,7 @@ def _noise(read: FrameSet) -> CameraNoise | None:
 
 
 def _look_for_dots(fit: LightFit) -> None:
-    """A word on dots that nobody told of."""
+    """Warns of dots on the gel where --markers is not given."""
     from calibration.markers.flow import require_no_markers
     from calibration.reference import UnusableReference
 

@@ -45,7 +45,7 @@ def camera() -> Iterator[MockCamera]:
 @pytest.fixture
 def file(camera: MockCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(robot.doctor.rig, "TIMEOUT", 1.0)
-    monkeypatch.setattr(robot.doctor.rig, "LOOK", 0.3)
+    monkeypatch.setattr(robot.doctor.rig, "CAMERA_TIME", 0.3)
     path = tmp_path / "looked.yaml"
     path.write_text(RIG.replace("HOST", mock_host(71)).replace("SOURCE", camera.url))
     return path

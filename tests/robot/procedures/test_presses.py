@@ -114,9 +114,9 @@ def glaring() -> np.ndarray:
 @pytest.mark.parametrize(
     ("move", "why"),
     [
-        (finger(), "no contact of a ball is seen"),
+        (finger(), "no ball's contact is seen"),
         (PRESSES[0], "it is in the same place as press 1; press elsewhere"),
-        (glaring(), r"saturated: shorten the exposure|no contact of a ball"),
+        (glaring(), r"saturated: shorten the exposure|no ball's contact"),
         (SENSOR.press(0.5e-3, 8, 100).image, "the contact is cut off by the border of the picture"),
         (np.maximum(PRESSES[1], PRESSES[3]), "there is a second contact in the picture; press one ball at a time"),
     ],

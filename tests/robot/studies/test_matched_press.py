@@ -44,7 +44,7 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
         words += ["--set", setting]
     result = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
-    assert "still.png: not pressed: no contact of a ball is seen" in " ".join(result.output.split())
+    assert "still.png: not pressed: no ball's contact is seen" in " ".join(result.output.split())
     config = json.loads(Path("out/compare.json").read_text())
     overall = config["overall"]
     assert overall["contact_ncc"]["mean"] > 0.95

@@ -32,7 +32,10 @@ def debug(
         found = read(dump)
         world = dump_view.open_world(found)
     _print_error(found)
-    _print_table(dump_view.table(found), dump_view.TITLES)
+    rows = {"": dump_view.TITLES, **dump_view.table(found)}
+    for row, values in rows.items():
+        shown = "".join(f"{values.get(moment, ''):50}" for moment in dump_view.TITLES)
+        results.print(f"{row:38}{shown.rstrip()}", markup=False)
     picture = (dump.parent if dump.name == "dump.json" else dump) / "debug.png"
     with busy("drawing"):
         dump_view.draw(found, picture)
@@ -69,14 +72,3 @@ def _print_error(dump: Dump) -> None:
     for name, line in lines.items():
         if line:
             results.print(f"{name:10}{line}", markup=False)
-
-
-def _print_table(rows: dict[str, dict[str, str]], titles: dict[str, str]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    shown = [moment for moment in titles if any(moment in values for values in rows.values())]
-    table = Table("", *(titles[moment] for moment in shown), box=None, padding=(0, 2, 0, 0))
-    for row, values in rows.items():
-        table.add_row(row, *(escape(values.get(moment, "")) for moment in shown))
-    results.print(table)

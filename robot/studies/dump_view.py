@@ -25,12 +25,6 @@ from tacsim.physics.world import World, make_world
 from tacsim.report.figure import COLOURS, INK, canvas, plain, save
 
 TITLES = {"before": "before the motion", "good": "last good", "failed": "failed"}
-HEALTH = {
-    "overlap": "deepest overlap [mm]",
-    "capped": "overlaps capped",
-    "off_grid": "off the grid",
-    "courant": "time step / the wave's, most squeezed element or cell",
-}
 MOST_DRAWN = 6000  # particles
 
 
@@ -87,7 +81,7 @@ def table(dump: Dump) -> dict[str, dict[str, str]]:
     for moment in MOMENTS:
         for row, value in _figures(dump.states[moment], dump.info.scene).items():
             rows.setdefault(row, {})[moment] = value
-    return rows | {row: {"failed": dump.info.health[key]} for key, row in HEALTH.items() if key in dump.info.health}
+    return rows | {f"kernels: {key.replace('_', ' ')}": {"failed": seen} for key, seen in dump.info.health.items()}
 
 
 def _figures(state: State, scene: Scene) -> dict[str, str]:
@@ -112,7 +106,7 @@ def _figures(state: State, scene: Scene) -> dict[str, str]:
         backing = state["sums"][:, layout.BACKING : layout.BACKING + 3].reshape(gels, -1, 3).sum(axis=1)
         figures["force at backing [N]"] = "  ".join(map(millimetres, backing))
     elif "backing" in state:
-        figures["force at backing [N]"] = "  ".join(map(millimetres, state["backing"].reshape(gels, -1)[:, :3]))
+        figures["force at backing [N]"] = "  ".join(map(millimetres, state["backing"][:, :3]))
     return figures
 
 

@@ -1,4 +1,4 @@
-"""Constant load on any rig: an arm goes where it is told, but along the z of its sensor, where a force is held.
+"""Constant load on any rig: an arm follows its targets except along the z of its sensor, where a force is held.
 
 An arm that takes poses holds a force by moving until it feels it (position-based force control: Villani and De
 Schutter, Force Control, in Springer Handbook of Robotics, 2nd ed., 2016, ch. 9). Each control period the force tells
@@ -21,12 +21,12 @@ TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at 
 PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
 # The stiffness changes at most by these factors a period: forces are noisy; less towards soft, whose steps are longer
 HARDER, SOFTER = 2.0, 1.25
-SMALLEST = 1e-6  # a shorter way tells no stiffness [m]
+SMALLEST = 1e-6  # a shorter displacement tells no stiffness [m]
 REACH = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
 
 
 @dataclass
-class _Axis:
+class _NormalAxis:
     """What is known of one arm's z: where it began, what it felt last, and where it was last sent."""
 
     began: FloatArray  # (3,) [m]
@@ -38,8 +38,8 @@ class _Axis:
 class Admittance:
     """Turns the actions of a policy so that arms hold `loads` along the z of their sensors.
 
-    Call it once a control period with the action and what the arms said last; tell it by `sent` what they were really
-    sent. Everything of an action but the way along z is kept; an arm that the policy holds still follows its load.
+    Call it once a control period with the action and the latest arm states, then `sent` with the poses that were really
+    sent. It replaces only the displacement along z; an arm without a target of its own still follows its load.
     """
 
     def __init__(self, loads: Mapping[str, float], longest: float) -> None:
@@ -51,15 +51,15 @@ class Admittance:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"constant load: {name} must be a positive number, got {value!r}")
         self.loads, self._longest = dict(loads), longest
-        self._axes: dict[str, _Axis] = {}
+        self._axes: dict[str, _NormalAxis] = {}
 
     def reset(self) -> None:
-        """A new episode: nothing is known of its contact."""
+        """For a new episode: forgets stiffness and travel."""
         self._axes = {}
 
     def __call__(self, action: Action, arms: Mapping[str, ArmState]) -> Action:
-        """`action` with each loaded arm's way along z replaced. Raises LimitExceeded when a load is out of reach, or
-        when what is felt is no number."""
+        """`action` with each loaded arm's displacement along z replaced. Raises LimitExceeded when a load is out of
+        reach, or a force is not finite."""
         return Action(
             {**action.tool, **{name: self._target(name, action.tool.get(name), arms[name]) for name in self.loads}}
         )
@@ -72,9 +72,9 @@ class Admittance:
     def _target(self, name: str, asked: Pose | None, arm: ArmState) -> Pose:
         force = -float(arm.wrench[2])
         if not math.isfinite(force):
-            raise LimitExceeded(f"arm '{name}' holds a load of {self.loads[name]:g} N, but what it feels is {force}")
+            raise LimitExceeded(f"arm '{name}' holds a load of {self.loads[name]:g} N, but feels {force} N")
         here = arm.pose.position
-        axis = self._axes.setdefault(name, _Axis(here, (here, force), arm.pose))
+        axis = self._axes.setdefault(name, _NormalAxis(here, (here, force), arm.pose))
         normal = se3.rotation(arm.pose).as_matrix()[:, 2]
         self._learn(axis, float(normal @ (here - axis.before[0])), force)
         axis.before = here, force
@@ -89,17 +89,17 @@ class Admittance:
         along = normal @ (axis.sent.position - asked.position) + step
         return Pose(asked.position + along * normal, asked.quaternion)
 
-    def _learn(self, axis: _Axis, way: float, force: float) -> None:
-        """The stiffness from the last `way` along z [m] and the force at its end [N]; a force that fell on the way in
-        came from elsewhere (the body slid, tipped or yielded) and teaches nothing."""
+    def _learn(self, axis: _NormalAxis, displacement: float, force: float) -> None:
+        """The stiffness from the last displacement along z [m] and the force after it [N]; a force that fell as the
+        sensor pressed came from elsewhere (the body slid, tipped or yielded) and teaches nothing."""
         change = force - axis.before[1]
-        if abs(way) < SMALLEST or not change / way > 0:
+        if abs(displacement) < SMALLEST or not change / displacement > 0:
             return
-        found = change / way
+        found = change / displacement
         known = axis.stiffness
         axis.stiffness = found if known is None else min(max(found, known / SOFTER), known * HARDER)
 
-    def _step(self, axis: _Axis, load: float, force: float) -> float:
+    def _step(self, axis: _NormalAxis, load: float, force: float) -> float:
         """The next correction, positive towards the object [m]."""
         error = load - force
         if abs(error) <= TOLERANCE * load:

@@ -34,7 +34,7 @@ from tacsim.physics.exec.layout import (
     STRIDE,
     VELOCITY,
 )
-from tacsim.physics.gel.gel import MM, MPA
+from tacsim.physics.units import MM, MPA
 
 BORDER = 8  # [cells] that a grid is longer than its particles and their margin reach, at most
 

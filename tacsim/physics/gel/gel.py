@@ -14,9 +14,7 @@ import numpy as np
 from tacsim.models.scene import Gel, GelSurface, lame
 from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_zeros, padded
 from tacsim.physics.exec.layout import GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING
-
-MM = 1e3  # millimetres in a metre
-MPA = 1e-6  # megapascals in a pascal
+from tacsim.physics.units import MM, MPA
 
 
 @dataclass(frozen=True)

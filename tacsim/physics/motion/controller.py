@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from tacsim.models.scene import Settling
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
-from tacsim.physics.motion.path import MM, Path
+from tacsim.physics.motion.path import Path
 from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
+from tacsim.physics.units import MM
 
 LAUNCH = 20  # substeps of one launch while frames are driven
 COMPARED = 2  # earlier readings that one is compared with: a single one may meet the same phase of what rings

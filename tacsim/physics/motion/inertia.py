@@ -13,9 +13,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tacsim.interface import Pose
-from tacsim.physics.gel.gel import MM, MPA, GelParams
+from tacsim.physics.gel.gel import GelParams
 from tacsim.physics.motion.controller import Launch
 from tacsim.physics.motion.path import MOST_SUBSTEPS, PEAK_SLOPE, ROUNDING, Path, path_length
+from tacsim.physics.units import MM, MPA
 
 FASTEST_DRIVE = 0.3  # peak speed of a driven frame / the gel's wave speed
 

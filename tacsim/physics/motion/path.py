@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import LaunchSpan
+from tacsim.physics.units import MM
 
-MM = 1e3
 PEAK_SLOPE = 1.875  # of the ramp, over its mean
 # Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, which takes
 # longer by as much as its speed changes; time of the hold between two readings of the forces

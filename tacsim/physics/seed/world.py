@@ -23,9 +23,10 @@ from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
 from tacsim.physics.motion.controller import ForceReading, Motion, StepNumbers, move_and_settle
 from tacsim.physics.motion.load import keep_loads, require_loads
-from tacsim.physics.motion.path import MM, Path, plan, resolve_targets
+from tacsim.physics.motion.path import Path, plan, resolve_targets
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import copies, restore_arrays
+from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.base import BaseWorld
 
 Float32 = NDArray[np.float32]
@@ -43,8 +44,6 @@ FINEST = 0.72  # vertical spacing / lateral spacing of the grid, down to which t
 MARGIN = 3  # [cells] of grid round the particles
 TILT = 1e-3  # [rad] tilt up to here is ignored, beyond it is refused
 HALF_TURN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of the upper sensor at yaw 0
-
-MPA = 1e-6  # Pa -> MPa
 
 
 @dataclass(frozen=True)

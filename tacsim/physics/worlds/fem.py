@@ -16,7 +16,7 @@ from tacsim.models.scene import GelSurface
 from tacsim.physics.exec.layout import FORCE, GEL_DAMPING, STEP, STEPS
 from tacsim.physics.failure.diagnosis import element_lengths
 from tacsim.physics.failure.health import LARGEST_COURANT
-from tacsim.physics.gel.gel import MM, GelParams, GelState, gel_surface
+from tacsim.physics.gel.gel import GelParams, GelState, gel_surface
 from tacsim.physics.motion.controller import (
     ForceReading,
     Launch,
@@ -32,6 +32,7 @@ from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, plan, plan_flow, resolve_targets
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import restore_arrays, snapshot_of
+from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
 
 ZETA_GEL_HELD = 1.0  # zeta in alpha = zeta c / thickness, the damping of a gel while nothing is driven

@@ -46,10 +46,11 @@ from tacsim.physics.exec.layout import (
 )  # fmt: skip
 from tacsim.physics.exec.team import run_team
 from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
-from tacsim.physics.gel.gel import MM, MPA, GelState, common_lattice, gel_params
+from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
 from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.snapshot import copies
+from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.device import DeviceArrays, run_hybrid
 from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps

@@ -54,7 +54,7 @@ from tacsim.physics.exec.team import (
     run_team,
 )
 from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
-from tacsim.physics.gel.gel import MM, MPA, GelParams, GelState, common_lattice, gel_params
+from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_params
 from tacsim.physics.gel.kernels import (
     ContactForce,
     Corners,
@@ -68,6 +68,7 @@ from tacsim.physics.gel.kernels import (
 from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.snapshot import copies
+from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.device import DeviceArrays, run_press
 from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive

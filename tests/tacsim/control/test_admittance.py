@@ -125,7 +125,7 @@ def _twice(wall: Wall, held: Admittance) -> None:
 @pytest.mark.parametrize("felt", [np.nan, np.inf])
 def test_a_force_that_is_no_number_moves_nothing(felt: float) -> None:
     state = ArmState(Pose(), np.zeros(6), np.array([0.0, 0.0, felt, 0.0, 0.0, 0.0]), None, 0.0)
-    with pytest.raises(LimitExceeded, match="but feels (nan|-?inf) N"):
+    with pytest.raises(LimitExceeded, match=r"but feels (nan|-?inf) N"):
         holding()(Action({}), {"hand": state})
 
 

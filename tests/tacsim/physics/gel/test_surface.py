@@ -12,8 +12,9 @@ from tacsim.optics.spline import displacement_and_jacobian
 from tacsim.physics.contact.contact import spline, surface_sums
 from tacsim.physics.exec.environment import Environment
 from tacsim.physics.exec.lanes import vec2, vec4
-from tacsim.physics.gel.gel import MM, GelState, gel_params, gel_surface
+from tacsim.physics.gel.gel import GelState, gel_params, gel_surface
 from tacsim.physics.gel.kernels import Gels, Surface, surface_row
+from tacsim.physics.units import MM
 
 GEL = gel_params(Gel(size=(6e-3, 5e-3, 2e-3)), 0.5e-3)
 NX, NY, _ = GEL.elements

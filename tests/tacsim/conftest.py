@@ -126,7 +126,7 @@ def open_springs(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]
             worlds.append(SpringWorld(scene))
             return worlds[-1]
 
-        monkeypatch.setattr("tacsim.physics.world.make_world", make)
+        monkeypatch.setattr("robot.rig.sim_rig.make_world", make)
         rig = open_rig(load_rig("sim", task=task, overrides=[*SMALL, *overrides]))
         rig.world = worlds[-1]  # type: ignore[attr-defined]
         opened.append(rig)

@@ -208,15 +208,9 @@ class Channel:
 
 def command_record(time: float, kind: CommandKind, pose: FloatArray | None = None) -> shared_ring.Record:
     """A command record; `pose` (7,) for CommandKind.TARGET."""
-    record = np.zeros((), COMMAND)
-    record["time"], record["kind"] = time, kind
-    if pose is not None:
-        record["pose"] = pose
-    return record
+    return np.array((time, kind, np.zeros(7) if pose is None else pose), COMMAND)
 
 
 def tactile_record(exposed: float, depth: float, shear: float) -> shared_ring.Record:
     """A tactile report; see TACTILE."""
-    record = np.zeros((), TACTILE)
-    record["exposed"], record["depth"], record["shear"] = exposed, depth, shear
-    return record
+    return np.array((exposed, depth, shear), TACTILE)

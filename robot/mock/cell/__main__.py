@@ -22,6 +22,9 @@ from robot.mock.cell.sim_server import numbers_of, pose_of
 from tacsim.interface import FloatArray, Pose, SurfaceMap, Truth
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.optics.noise import noise_source
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import surface_map
 from tacsim.pose import distance
 
 if TYPE_CHECKING:
@@ -48,8 +51,6 @@ class WorldCell:
     """The simulated world and its renderers."""
 
     def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
-        from tacsim.optics.noise import noise_source
-        from tacsim.optics.render import Renderer
         from tacsim.physics.world import make_world
 
         self.world: World = make_world(scene)
@@ -80,8 +81,6 @@ class WorldCell:
         return self.world.wrench(name)
 
     def render(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
-        from tacsim.optics.surface import surface_map
-
         surface = self.world.surface(name)
         image, noise = self._renderers[name](surface), self._noise[name]
         if noise is not None:

@@ -12,27 +12,26 @@ There is no friction, no tilt of the dent, no body and no truth about one: tasks
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping
+from functools import lru_cache
 from itertools import count
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose, SurfaceMap
-from tacsim.models.scene import GelSurface
-
-if TYPE_CHECKING:
-    from tacsim.models.scene import Scene
-    from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.models.scene import GelSurface, Scene
+from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.optics.noise import noise_source
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import surface_map
 
 RADIUS = 4e-3  # of the balls [m]
 GAP = 0.2e-3  # between gel and ball at the beginning: two balls, one on the other, between two gels [m]
 SPACING = 0.25e-3  # of the nodes on which the surface is given [m]
 GRAIN = 10e-6  # places that are nearer than this to each other show one picture [m]
-KEPT = 512  # pictures
+KEPT = 512  # pictures that are not drawn again
 
 
 class HertzCell:
@@ -42,9 +41,6 @@ class HertzCell:
     """
 
     def __init__(self, scene: Scene, models: Mapping[str, SensorModel], grid: CanonicalGrid) -> None:
-        from tacsim.optics.noise import noise_source
-        from tacsim.optics.render import Renderer
-
         unknown = sorted(set(models) - set(scene.sensors))
         if unknown:
             raise ValueError(f"scene '{scene.name}' has no sensor '{unknown[0]}'; it has {', '.join(scene.sensors)}")
@@ -56,7 +52,7 @@ class HertzCell:
         self._renderers = {name: Renderer(model, scene.gel.size[:2]) for name, model in models.items()}
         self._noise = {name: noise_source(model, name) for name, model in models.items()}
         self._pictures = count()
-        self._drawn: OrderedDict[tuple[str | int, ...], tuple[NDArray[np.uint8], SurfaceMap]] = OrderedDict()
+        self._drawn = lru_cache(KEPT)(self._draw)
 
     @property
     def stats(self) -> Mapping[str, float]:
@@ -87,40 +83,27 @@ class HertzCell:
         self._poses = moved
 
     def wrench(self, name: str) -> FloatArray:
-        """(6,) on the sensor, about its origin, its axes [N, N m]."""
+        """(6,) on the sensor, about its origin, its axes [N, N m]: the ball pushes along its -z."""
         depth, x, y = _contact(self._poses[name], self._balls[name])
-        return self._wrench(depth, x, y)
-
-    def render(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
-        """Picture (H, W, 3) and surface of a sensor."""
-        image, surface = self._draw(name, *_contact(self._poses[name], self._balls[name]))
-        noise = self._noise[name]
-        return image if noise is None else noise(image, next(self._pictures)), surface
-
-    def _wrench(self, depth: float, x: float, y: float) -> FloatArray:
-        """(6,) on the sensor, about its origin: the ball pushes along its -z."""
         material = self._gel.material
         modulus = material.youngs_modulus / (1.0 - material.poisson_ratio**2)
         force = 4.0 / 3.0 * modulus * np.sqrt(RADIUS) * max(0.0, depth) ** 1.5
         return np.array([0.0, 0.0, -force, -y * force, x * force, 0.0])
 
-    def _draw(self, name: str, depth: float, x: float, y: float) -> tuple[NDArray[np.uint8], SurfaceMap]:
-        from tacsim.optics.surface import surface_map
-
-        # All places without touch look the same.
+    def render(self, name: str) -> tuple[NDArray[np.uint8], SurfaceMap]:
+        """Picture (H, W, 3) and surface of a sensor."""
+        depth, x, y = _contact(self._poses[name], self._balls[name])
+        # Without touch the place of the ball does not show.
         place = (depth, x, y) if depth > 0.0 else (0.0, 0.0, 0.0)
-        steps = tuple(round(value / GRAIN) for value in place)
-        key: tuple[str | int, ...] = (name, *steps)
-        if key in self._drawn:
-            self._drawn.move_to_end(key)
-            return self._drawn[key]
-        surface = dent(self._gel.size[:2], *(GRAIN * step for step in steps))
-        markers = self._models[name].markers
-        found = self._renderers[name](surface), surface_map(surface, grid=self._grid, markers=markers)
-        self._drawn[key] = found
-        if len(self._drawn) > KEPT:
-            self._drawn.popitem(last=False)
-        return found
+        image, surface = self._drawn(name, *(round(value / GRAIN) for value in place))
+        noise = self._noise[name]
+        return image if noise is None else noise(image, next(self._pictures)), surface
+
+    def _draw(self, name: str, *steps: int) -> tuple[NDArray[np.uint8], SurfaceMap]:
+        """The picture without noise, and the surface, with the ball at depth, x, y = GRAIN * steps [m]."""
+        depth, x, y = (GRAIN * step for step in steps)
+        surface = dent(self._gel.size[:2], depth, x, y)
+        return self._renderers[name](surface), surface_map(surface, self._grid, self._models[name].markers)
 
 
 def _contact(sensor: Pose, ball: FloatArray) -> tuple[float, float, float]:

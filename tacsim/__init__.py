@@ -90,6 +90,7 @@ if TYPE_CHECKING:
     from tacsim.record.reader import read_episode as read_episode
     from tacsim.record.writer import Recorder as Recorder
     from tacsim.report.report import write_report as write_report
+    from tacsim.rig import Reset as Reset
     from tacsim.rig import Rig as Rig
     from tacsim.tasks import Outcome as Outcome
     from tacsim.tasks import Reposition as Reposition

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -104,8 +105,7 @@ def _take_touches(
 
     config = load_rig(rig, overrides=overrides).config
     opened = without_task(config, arm, sensor)
-    question = f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?"
-    confirm_motion(config, question)
+    confirm_motion(config, f"Does the ball stand fixed and free below the start of arm '{arm}', and may the arm move?")
     with (
         _recording(folder / "touches.yaml", "touch", "touches", plan.touches) as (session, write),
         open_rig(opened, confirm=lambda question: True) as running,
@@ -146,10 +146,11 @@ def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) 
     )
     (place, turn), (best, best_turn) = fit.deviation, fit.best_deviation
     results.print(
-        f"tool_from_sensor: ± {1e3 * place:.3f} mm, ± {_degrees(turn):.3f} deg (at best, by Cramer and Rao, "
-        f"{1e3 * best:.3f} mm, {_degrees(best_turn):.3f} deg); scatter {fit.scatter:.2f} of what the noise allows"
+        f"tool_from_sensor: ± {1e3 * place:.3f} mm, ± {math.degrees(turn):.3f} deg (at best, by Cramer and Rao, "
+        f"{1e3 * best:.3f} mm, {math.degrees(best_turn):.3f} deg); scatter {fit.scatter:.2f} of what the noise allows"
     )
-    _print_entry(arm, fit.tool_from_sensor)
+    results.print("Write into the rig file:")
+    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(fit.tool_from_sensor)}", markup=False)
     report = {
         "tool_from_sensor": pose_as_json(fit.tool_from_sensor, fit.covariance),
         "bound": fit.bound.tolist(),
@@ -191,8 +192,6 @@ def hand_eye(
 
     Example: tacsim calibrate hand-eye poses.yaml
     """
-    import math
-
     from calibration.errors import CalibrationError
     from calibration.poses.hand_eye import HandEyeNoise
     from calibration.poses.records import read_board_poses
@@ -235,8 +234,9 @@ def _take_board_poses(
     from tacsim.config import load_rig
 
     config = load_rig(rig, overrides=overrides).config
-    question = f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?"
-    confirm_motion(config, question)
+    confirm_motion(
+        config, f"Does the camera see the board, and may arm '{arm}' turn its sensor to all sides from here?"
+    )
     with (
         _recording(folder / "poses.yaml", "hand-eye", "poses", plan.poses) as (session, write),
         open_arm(config, arm) as mover,
@@ -258,14 +258,14 @@ def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
     _show_fit(
         "How far each board was seen from where it should be",
         ("pose", "place [mm]", "direction [deg]"),
-        [(str(i + 1), f"{1e3 * m[0]:.3f}", f"{_degrees(m[1]):.3f}") for i, m in enumerate(fit.residuals)],
+        [(str(i + 1), f"{1e3 * m[0]:.3f}", f"{math.degrees(m[1]):.3f}") for i, m in enumerate(fit.residuals)],
         fit.used,
     )
     place, turn = fit.deviation
     name, board = ("base_from_camera", "flange_from_board") if fixed else ("flange_from_camera", "base_from_board")
     results.print(
-        f"{name}: ± {1e3 * place:.3f} mm, ± {_degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
-        f"allows; the flange's directions swing by {_degrees(fit.spread):.0f} deg"
+        f"{name}: ± {1e3 * place:.3f} mm, ± {math.degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
+        f"allows; the flange's directions swing by {math.degrees(fit.spread):.0f} deg"
     )
     results.print(f"  {name}: {_placement(fit.camera)}", markup=False)
     report = {
@@ -295,25 +295,14 @@ def _show_fit(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]],
     show_table(title, (*columns, ""), marked)
 
 
-def _print_entry(arm: str, pose: Pose) -> None:
-    results.print("Write into the rig file:")
-    results.print(f"  arms:\n    {arm}:\n      tool_from_sensor: {_placement(pose)}", markup=False)
-
-
 def _placement(pose: Pose) -> str:
     """A pose as a rig file writes it, to the tenth of a micrometre."""
     from calibration.poses.records import placement
 
     placed = placement(pose)
     position = ", ".join(f"{1e3 * each:.4f} mm" for each in placed.position)
-    rotation = ", ".join(f"{_degrees(each):.4f} deg" for each in placed.rotation)
+    rotation = ", ".join(f"{math.degrees(each):.4f} deg" for each in placed.rotation)
     return f"{{ position: [{position}], rotation: [{rotation}] }}"
-
-
-def _degrees(radians: float) -> float:
-    import math
-
-    return math.degrees(radians)
 
 
 def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:

@@ -91,7 +91,10 @@ def sensor(
         raise typer.BadParameter("give the ball's radius: without it no slope is known", param_hint="--ball-radius")
     if (pixel_pitch is None) == (view is None):
         raise typer.BadParameter("give either --pixel-pitch or --view")
-    seen = None if view is None else _load_view(view)
+    from calibration.lens.view import GelView
+    from tacsim.config import load
+
+    seen = None if view is None else load(GelView, view)
     ball, pitch = ball_radius, pixel_pitch if seen is None else seen.pixel_pitch
     if not (ball > 0 and pitch > 0):
         raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
@@ -192,13 +195,6 @@ def _write(
             written.append(folder / "residuals.png")
             draw(fit, written[-1])
     say_files(*written)
-
-
-def _load_view(path: Path) -> GelView:
-    from calibration.lens.view import GelView
-    from tacsim.config import load
-
-    return load(GelView, path)
 
 
 def _markers(read: FrameSet, pitch: float) -> Markers:

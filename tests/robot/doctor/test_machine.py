@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from packaging.requirements import Requirement
 
 from robot.doctor import machine
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_this_machine_is_fit_and_the_answer_is_json() -> None:
@@ -70,6 +74,20 @@ def test_a_second_opencv_is_harmful_unless_of_the_same_version(
     (check,) = machine.second_opencv()
     assert check.state == state and words in check.found
     assert (f"{machine.OPENCV}==4.13.0.92" in check.advice) == (state == "fail")
+
+
+def test_opencv_is_asked_for_as_lerobot_does_everywhere_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside LeRobot 0.6, which asks for opencv-python-headless below 4.14, both builds can only be of one version."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (ours,) = (need for need in map(Requirement, project["dependencies"]) if need.name == machine.OPENCV)
+    assert ours.specifier.contains("4.13.0.92") and not ours.specifier.contains("4.14.0.0")
+    for path in sorted((ROOT / "constraints").glob("py*.txt")):
+        (pin,) = (line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith(machine.OPENCV))
+        assert ours.specifier.contains(pin.partition("==")[2]), path.name
+    import cv2
+
+    monkeypatch.delattr(cv2, "calibrateHandEye")
+    assert Requirement(machine.opencv()[0].advice.split("'")[1]) == ours
 
 
 def test_opencv_without_hand_eye_calibration_fails(monkeypatch: pytest.MonkeyPatch) -> None:

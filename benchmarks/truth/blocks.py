@@ -8,7 +8,6 @@ from tacsim.physics.body.material import convect, hencky_return, mat3, vec6
 from tacsim.physics.body.plasticine import BodyParams, BodyState
 from tacsim.physics.body.transfers import (
     Body,
-    Particles,
     Strips,
     clear_masses,
     grid_to_particles,
@@ -16,17 +15,13 @@ from tacsim.physics.body.transfers import (
     particles_to_grid,
 )
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, vec3
 from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, piece_done, run_team
 from tacsim.physics.gel.element import SMALLEST_STRETCH
 from tacsim.physics.gel.gel import GelParams, GelState
 from tacsim.physics.gel.kernels import (
-    ContactForce,
-    Corners,
     Lattice,
-    Nodes,
-    Surface,
     gel_advance,
     gel_forces,
     gels_of,
@@ -41,7 +36,7 @@ Symmetric = ti.types.ndarray(dtype=vec6, ndim=1)
 @ti.kernel
 def body_substeps(
     team: ti.i32, steps: Steps,
-    particles: Particles, masses: Strips, velocities: Strips,
+    particles: Floats, masses: Strips, velocities: Strips,
     params: Params, counts: Counts, partial: Partial, keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, sync: Sync,
 ):  # fmt: skip
     """A free body, no damping; `keep` 0 forbids motion along an axis, 1 allows it. Spread over threads as the product's
@@ -77,7 +72,7 @@ def body_substeps(
 
 @ti.kernel
 def gel_substeps(
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial,
     keep_x: ti.f32, keep_y: ti.f32, keep_z: ti.f32, driven: ti.i32, speed: ti.f32,
 ):  # fmt: skip

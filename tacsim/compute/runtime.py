@@ -24,7 +24,7 @@ DEVICES = ("cpu", "cuda", "vulkan", "metal")
 DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
 
 _running: int | None = None  # process
-_at_work = threading.RLock()  # held by the thread that starts Taichi, compiles or launches
+_launch_lock = threading.RLock()  # held by the thread that starts Taichi, compiles or launches
 
 
 def start(cpu_only: str | None = None) -> str:
@@ -39,7 +39,7 @@ def start(cpu_only: str | None = None) -> str:
         raise ValueError(f"TACSIM_DEVICE must be one of {', '.join(DEVICES)}, found '{DEVICE}'")
     if cpu_only is not None and DEVICE != "cpu":
         raise RuntimeError(f"{cpu_only} runs on the CPU only, but TACSIM_DEVICE is '{DEVICE}': unset it")
-    with _at_work:
+    with _launch_lock:
         if _running is None:
             _initialise()
             _running = os.getpid()
@@ -67,7 +67,7 @@ def launching() -> Iterator[None]:
     """Round every launch of kernels, and what prepares and reads it: threads take turns, which costs them nothing, for
     a launch holds the interpreter anyway. Raises RuntimeError in a forked child, where it would never return."""
     _require_own_process()
-    with _at_work:
+    with _launch_lock:
         yield
 
 

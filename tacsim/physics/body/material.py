@@ -96,8 +96,8 @@ def log1p(x):
 def lanes_log1p(x):
     """The same for lanes, without a branch: far from 0 by the fourth root."""
     t = ti.sqrt(ti.sqrt(1.0 + x)) - 1.0
-    far = ti.abs(x) > SERIES_LOG1P
-    return ti.select(far, 4.0, 1.0) * log1p_series(ti.select(far, t / (2.0 + t), x / (2.0 + x)))
+    large = ti.abs(x) > SERIES_LOG1P
+    return ti.select(large, 4.0, 1.0) * log1p_series(ti.select(large, t / (2.0 + t), x / (2.0 + x)))
 
 
 @ti.func
@@ -203,15 +203,15 @@ def small_strain(e):
     shape = volume_preserving(e, (1.0 - t) / (1.0 + t))
     strain = 0.5 * log_pade(shape)
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
-    far = ti.select(ti.abs(x) > SERIES_LOG1P, 1, 0) | ti.select(square(shape) > SERIES_LOG**2, 1, 0)
-    return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), far
+    large = ti.select(ti.abs(x) > SERIES_LOG1P, 1, 0) | ti.select(square(shape) > SERIES_LOG**2, 1, 0)
+    return 0.5 * log1p_series(z), strain, (1.0 + t) / (1.0 - t), large
 
 
 @ti.func
 def stress_small_strain(e, mu, bulk):
     """Kirchhoff stress of a body that never yields, as by `hencky_return`; and 1 beyond `small_strain`, else 0."""
-    log_j, strain, _, far = small_strain(e)
-    return plus_identity(2.0 * mu * strain, bulk * log_j), far
+    log_j, strain, _, large = small_strain(e)
+    return plus_identity(2.0 * mu * strain, bulk * log_j), large
 
 
 @ti.func
@@ -220,7 +220,7 @@ def return_small_strain(e, flow, mu, bulk, limit, hardening):
 
     Returns also 1 where the strain is larger (and all else is wrong), else 0.
     """
-    log_j, strain, grow, far = small_strain(e)
+    log_j, strain, grow, large = small_strain(e)
     strain2, i2, i3 = product(strain, strain), minors(strain), determinant(strain)
     norm = ti.sqrt(strain2[0] + strain2[1] + strain2[2])
     now, give = limit + hardening * flow, 1.0 / (1.0 + ROOT * hardening)
@@ -234,9 +234,9 @@ def return_small_strain(e, flow, mu, bulk, limit, hardening):
     returned = plus_identity(growth * volume, volume - 1.0)
     yields = norm > now
     elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
-    far = far | ti.select(2.0 * f * norm > SERIES_EXP, 1, 0)
+    large = large | ti.select(2.0 * f * norm > SERIES_EXP, 1, 0)
     return (
-        elastic, flow + ROOT * give * ti.max(0.0, norm - now), plus_identity(2.0 * mu * f * strain, bulk * log_j), far
+        elastic, flow + ROOT * give * ti.max(0.0, norm - now), plus_identity(2.0 * mu * f * strain, bulk * log_j), large
     )  # fmt: skip
 
 
@@ -268,8 +268,8 @@ def hencky_return(e, flow, mu, bulk, limit, hardening):
     box 3.1). Returns the elastic e after the return, the new flow, and the Kirchhoff stress
     tau = 2 mu dev(eps) + K ln(J) I.
     """
-    elastic, new_flow, tau, far = return_small_strain(e, flow, mu, bulk, limit, hardening)
-    if far != 0:
+    elastic, new_flow, tau, large = return_small_strain(e, flow, mu, bulk, limit, hardening)
+    if large != 0:
         elastic, new_flow, tau = return_any_strain(e, flow, mu, bulk, limit, hardening)
     return elastic, new_flow, tau
 

@@ -11,29 +11,8 @@ import numpy as np
 
 from tacsim.models.scene import BodyMaterial, lame
 from tacsim.physics.body.material import ELASTIC
+from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, aligned_zeros, padded
-from tacsim.physics.exec.layout import (
-    AFFINE,
-    BODY_BULK,
-    BODY_CELL,
-    BODY_HARDENING,
-    BODY_LIMIT,
-    BODY_MASS,
-    BODY_MU,
-    BODY_VOLUME,
-    CAPACITY,
-    GRID,
-    ORIGIN,
-    PARTICLE_ROWS,
-    PARTICLES,
-    PLANE,
-    PLASTIC_STRAIN,
-    POSITION,
-    SLAB,
-    STRAIN,
-    STRIDE,
-    VELOCITY,
-)
 from tacsim.physics.units import MM, MPA
 
 BORDER = 8  # [cells] that a grid is longer than its particles and their margin reach, at most
@@ -66,8 +45,9 @@ class BodyParams:
     def params(self) -> dict[int, float]:
         """Entries of the array `params` (tacsim.physics.exec.layout)."""
         return {
-            BODY_CELL: self.cell, BODY_MU: self.mu, BODY_BULK: self.bulk, BODY_LIMIT: self.limit,
-            BODY_HARDENING: self.hardening, BODY_MASS: self.particle_mass, BODY_VOLUME: self.volume,
+            layout.BODY_CELL: self.cell, layout.BODY_MU: self.mu, layout.BODY_BULK: self.bulk,
+            layout.BODY_LIMIT: self.limit, layout.BODY_HARDENING: self.hardening,
+            layout.BODY_MASS: self.particle_mass, layout.BODY_VOLUME: self.volume,
         }  # fmt: skip
 
 
@@ -92,7 +72,7 @@ class BodyState:
     def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
         """points, planes: of each environment, (n, 3) [mm], [1/mm]; without planes no particle knows a surface."""
         self.counts = [len(p) for p in points]
-        self.rows = aligned_zeros(len(points), PARTICLE_ROWS, row_length(max(self.counts)))
+        self.rows = aligned_zeros(len(points), layout.PARTICLE_ROWS, row_length(max(self.counts)))
         for index, p in enumerate(points):
             self.x(index)[...] = p
             if planes is not None:
@@ -105,28 +85,28 @@ class BodyState:
 
     def x(self, environment: int = 0) -> np.ndarray:
         """Positions [mm], (n, 3), a view."""
-        return self._rows(environment, POSITION, 3).T
+        return self._rows(environment, layout.POSITION, 3).T
 
     def plane(self, environment: int = 0) -> np.ndarray:
         """Tangent planes [1/mm], (n, 3), a view."""
-        return self._rows(environment, PLANE, 3).T
+        return self._rows(environment, layout.PLANE, 3).T
 
     def v(self, environment: int = 0) -> np.ndarray:
         """Velocities, (n, 3), a view."""
-        return self._rows(environment, VELOCITY, 3).T
+        return self._rows(environment, layout.VELOCITY, 3).T
 
     def c(self, environment: int = 0) -> np.ndarray:
         """Affine velocities, (n, 3, 3), a view."""
-        columns: np.ndarray = self.rows[environment, AFFINE : AFFINE + 9].reshape(3, 3, -1)
+        columns: np.ndarray = self.rows[environment, layout.AFFINE : layout.AFFINE + 9].reshape(3, 3, -1)
         return columns[..., : self.counts[environment]].T
 
     def e(self, environment: int = 0) -> np.ndarray:
         """Elastic strains b_e - I, (n, 6), a view."""
-        return self._rows(environment, STRAIN, 6).T
+        return self._rows(environment, layout.STRAIN, 6).T
 
     def flow(self, environment: int = 0) -> np.ndarray:
         """Equivalent plastic strains, (n,), a view."""
-        return self._rows(environment, PLASTIC_STRAIN, 1).reshape(-1)
+        return self._rows(environment, layout.PLASTIC_STRAIN, 1).reshape(-1)
 
     @property
     def most(self) -> int:
@@ -144,16 +124,16 @@ class BodyState:
         """
         x = self.x(environment)
         origin, shape = fit_grid(x, cell, margin)
-        params[environment, ORIGIN : ORIGIN + 3] = origin
-        counts[environment, GRID : GRID + 3] = shape
-        counts[environment, PARTICLES] = len(x)
+        params[environment, layout.ORIGIN : layout.ORIGIN + 3] = origin
+        counts[environment, layout.GRID : layout.GRID + 3] = shape
+        counts[environment, layout.PARTICLES] = len(x)
         for part in range(COPIES):
             own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x)), 0]
             low, high = 0, 0
             if own.size:
                 low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
                 high = min(math.ceil((float(own.max()) + margin - float(origin[0])) / cell) + 3, shape[0])
-            counts[environment, SLAB + 2 * part : SLAB + 2 * part + 2] = low, high
+            counts[environment, layout.SLAB + 2 * part : layout.SLAB + 2 * part + 2] = low, high
         # three planes for what particles off the grid would add
         strips = (shape[0] + 3) * shape[1] * shape[2] // NODES
         if self.masses.shape[2] < strips:
@@ -161,7 +141,7 @@ class BodyState:
             room = max(strips, min(strips * 5 // 4, self.most // NODES))
             masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
             self.masses, self.velocities = masses, aligned_zeros(len(masses), room, 4 * NODES)
-        counts[:, STRIDE], counts[:, CAPACITY] = self.rows.shape[2], self.masses.shape[2]
+        counts[:, layout.STRIDE], counts[:, layout.CAPACITY] = self.rows.shape[2], self.masses.shape[2]
 
     def arguments(self) -> tuple[np.ndarray, ...]:
         """What every kernel with a body takes, in this order."""

@@ -44,9 +44,6 @@ from tacsim.physics.exec.lanes import (
     vec4,
 )
 
-# One axis each, environments one after the other: kernels work out one index beforehand, which is
-# much faster than several indices into arrays of several axes.
-Particles = ti.types.ndarray(dtype=ti.f32, ndim=1)  # rows of one number of all particles (tacsim.physics.exec.layout)
 Strips = ti.types.ndarray(dtype=strip, ndim=1)  # masses, velocities
 
 LINE = 2 if NODES == 2 else 3  # strips that hold three neighbours

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from tacsim.compute.runtime import ti
 from tacsim.physics.contact.contact import (
     CONTACT_DAMPING,
+    MULTIPLIER_RATE,
     TANGENT_STIFFNESS,
     friction,
     spline,
@@ -29,7 +30,6 @@ SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
 UNKNOWN = 1e9  # distance where none is known
 CELL_REACH = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
-MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
 
 
 class Indenter(NamedTuple):

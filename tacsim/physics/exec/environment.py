@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 from tacsim.compute.runtime import ti
 from tacsim.physics.exec.lanes import ON_DEVICE, vec3
 
+# Large arrays have one axis: kernels work out one index beforehand. With several the compiler sees no neighbours.
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Params = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, PARAMS): see tacsim.physics.exec.layout
 Counts = ti.types.ndarray(dtype=ti.i32, ndim=2)  # (environments, COUNTS)
 Partial = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, PARTS, NUMBERS)

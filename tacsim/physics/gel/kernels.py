@@ -23,11 +23,6 @@ from tacsim.physics.exec.lanes import (
 )
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
 
-# One axis each: kernels work out once where things begin. The compiler loses sight of neighbours in more axes.
-Nodes = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Surface = ti.types.ndarray(dtype=ti.f32, ndim=1)
-ContactForce = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Corners = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Lattice = ti.types.ndarray(dtype=lanes, ndim=1)
 
 

@@ -194,11 +194,11 @@ def body_law(F, solid):
     no singular values either (tacsim.physics.body.material)."""
     elastic = F
     tau = Mat3(0.0)
-    far = 1
+    large = 1
     if solid.limit >= ELASTIC:
-        near, far = stress_small_strain(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
+        near, large = stress_small_strain(finger_strain(F), solid.mu, solid.lam + 2.0 / 3.0 * solid.mu)
         tau = full(near)
-    if far != 0:
+    if large != 0:
         elastic, tau = return_mapping(F, solid)
     return elastic, tau
 

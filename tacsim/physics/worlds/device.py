@@ -14,20 +14,16 @@ import numpy as np
 
 from tacsim.compute.runtime import launching, ti
 from tacsim.physics.body.plasticine import BodyState
-from tacsim.physics.body.transfers import Body, Particles, Strips, grid_to_particles, particles_to_grid
+from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
 from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.contact.indenter import POINTS, Indenter, Pressure, Slip, Values, indent
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Params, Partial, record_least
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_least
 from tacsim.physics.exec.lanes import LANES, PARTS, lanes, smallest_lane, strip, vec3, vec4
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
 from tacsim.physics.gel.gel import GelState
 from tacsim.physics.gel.kernels import (
-    ContactForce,
-    Corners,
     Lattice,
-    Nodes,
-    Surface,
     gel_advance,
     gels_of,
     margin,
@@ -94,7 +90,7 @@ def column(env: ti.template(), gels: ti.template(), g, block):
 @ti.kernel
 def press_substep(
     it: ti.i32, drive: Drive,
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values, params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
@@ -124,7 +120,7 @@ def press_substep(
 @ti.kernel
 def elements_of_hybrid(
     it: ti.i32,
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice, masses: Strips,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice, masses: Strips,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body
@@ -158,8 +154,8 @@ def elements_of_hybrid(
 @ti.kernel
 def scatter_of_hybrid(
     it: ti.i32, drive: Drive,
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
-    particles: Particles, masses: Strips, velocities: Strips, histories: ContactHistories,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
+    particles: Floats, masses: Strips, velocities: Strips, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, most_particles: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
@@ -192,7 +188,7 @@ def scatter_of_hybrid(
 
 @ti.kernel
 def gather_of_hybrid(
-    it: ti.i32, particles: Particles, masses: Strips, velocities: Strips,
+    it: ti.i32, particles: Floats, masses: Strips, velocities: Strips,
     params: Params, counts: Counts, partial: Partial, most_particles: ti.i32,
 ):  # fmt: skip
     """Last third: the grid back to the particles."""

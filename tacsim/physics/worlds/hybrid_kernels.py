@@ -3,7 +3,6 @@
 from tacsim.compute.runtime import ti
 from tacsim.physics.body.transfers import (
     Body,
-    Particles,
     Strips,
     block_range,
     clear_masses,
@@ -13,15 +12,11 @@ from tacsim.physics.body.transfers import (
 )
 from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Params, Partial, record_sum
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_sum
 from tacsim.physics.exec.lanes import LANES, NODES, ON_DEVICE, PARTS, copy_of, part_range, slot_of, strip, vec3
 from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, piece_done
 from tacsim.physics.gel.kernels import (
-    ContactForce,
-    Corners,
     Lattice,
-    Nodes,
-    Surface,
     contact_force_start,
     gel_advance,
     gel_forces,
@@ -198,8 +193,8 @@ def gel_contact(
 @ti.kernel
 def substeps(
     team: ti.i32, drive: Drive,
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
-    particles: Particles, masses: Strips, velocities: Strips, histories: ContactHistories,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
+    particles: Floats, masses: Strips, velocities: Strips, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.

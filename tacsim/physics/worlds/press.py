@@ -23,7 +23,7 @@ from tacsim.physics.contact.indenter import (
     indent,
 )
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import MAX_NUMBERS, ON_DEVICE, PARTS, aligned_zeros
 from tacsim.physics.exec.layout import (
     BACKING,
@@ -56,11 +56,7 @@ from tacsim.physics.exec.team import (
 from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
 from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_params
 from tacsim.physics.gel.kernels import (
-    ContactForce,
-    Corners,
     Lattice,
-    Nodes,
-    Surface,
     gel_advance,
     gel_forces,
     gels_of,
@@ -86,7 +82,7 @@ TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller
 @ti.kernel
 def press_substeps(
     team: ti.i32, drive: Drive,
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip

@@ -11,14 +11,13 @@ from tacsim.models.scene import BodyMaterial, Box
 from tacsim.physics.body.plasticine import BodyState, body_params
 from tacsim.physics.body.transfers import (
     Body,
-    Particles,
     Strips,
     clear_masses,
     grid_to_particles,
     particles_to_grid,
 )
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.oracle import mls_mpm
 from tacsim.physics.worlds.hybrid_kernels import Drive, grid_update
@@ -33,7 +32,7 @@ Stages = dict[str, Pair]
 
 @ti.kernel
 def scatter(
-    particles: Particles, masses: Strips, velocities: Strips, params: Params, counts: Counts, partial: Partial
+    particles: Floats, masses: Strips, velocities: Strips, params: Params, counts: Counts, partial: Partial
 ):  # fmt: skip
     ti.loop_config(serialize=True)
     for part in range(PARTS):
@@ -45,7 +44,7 @@ def scatter(
 
 @ti.kernel
 def update(
-    drive: Drive, particles: Particles, masses: Strips, velocities: Strips, params: Params, counts: Counts,
+    drive: Drive, particles: Floats, masses: Strips, velocities: Strips, params: Params, counts: Counts,
     partial: Partial,
 ):  # fmt: skip
     ti.loop_config(serialize=True)
@@ -56,7 +55,7 @@ def update(
 
 @ti.kernel
 def gather(
-    particles: Particles, masses: Strips, velocities: Strips, params: Params, counts: Counts, partial: Partial
+    particles: Floats, masses: Strips, velocities: Strips, params: Params, counts: Counts, partial: Partial
 ):  # fmt: skip
     ti.loop_config(serialize=True)
     for part in range(PARTS):

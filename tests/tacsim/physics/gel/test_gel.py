@@ -8,17 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import Gel, GelMaterial
-from tacsim.physics.exec.environment import Counts, Environment, Params, Partial
+from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.layout import BACKING, COUNTS, ELEMENTS, GEL_DAMPING, NUMBERS, PARAMS, SMALLEST_VOLUME, STEP
 from tacsim.physics.gel.element import HOURGLASS
 from tacsim.physics.gel.gel import GelState, gel_params
 from tacsim.physics.gel.kernels import (
-    ContactForce,
-    Corners,
     Lattice,
-    Nodes,
-    Surface,
     gel_advance,
     gel_forces,
     gels_of,
@@ -31,7 +27,7 @@ pytestmark = pytest.mark.cpu
 @ti.kernel
 def substep(
     number: ti.template(), advance: ti.i32,
-    nodes: Nodes, surface: Surface, contact_force: ContactForce, corners: Corners, lattice: Lattice,
+    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     params: Params, counts: Counts, partial: Partial,
 ):  # fmt: skip
     ti.loop_config(serialize=True)

@@ -10,10 +10,10 @@ from tacsim.compute.runtime import start, ti
 from tacsim.models.scene import Gel
 from tacsim.optics.spline import displacement_and_jacobian
 from tacsim.physics.contact.contact import spline, surface_sums
-from tacsim.physics.exec.environment import Environment
+from tacsim.physics.exec.environment import Environment, Floats
 from tacsim.physics.exec.lanes import vec2, vec4
 from tacsim.physics.gel.gel import GelState, gel_params, gel_surface
-from tacsim.physics.gel.kernels import Gels, Surface, surface_row
+from tacsim.physics.gel.kernels import Gels, surface_row
 from tacsim.physics.units import MM
 
 GEL = gel_params(Gel(size=(6e-3, 5e-3, 2e-3)), 0.5e-3)
@@ -25,7 +25,7 @@ Sums = ti.types.ndarray(dtype=vec4, ndim=2)
 
 
 @ti.kernel
-def evaluate(surface: Surface, points: Points, found: Sums, gel: ti.i32, h: ti.f32, nx: ti.i32, ny: ti.i32):
+def evaluate(surface: Floats, points: Points, found: Sums, gel: ti.i32, h: ti.f32, nx: ti.i32, ny: ti.i32):
     """Displacement [mm] and its derivatives by x and y, as contact has them, at lattice coordinates."""
     gels = ti.static(Gels(None, surface, None, None, None, 2, nx, ny, 0))
     row = surface_row(ti.static(Environment(0, None, None, None)), gels, gel)

@@ -30,7 +30,7 @@ MOST_DRAWN = 6000  # particles
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What came of running the motion again: the failure, or how it went."""
+    """The outcome of running the motion again: a failure, or how it went."""
 
     failure: SimulationDiverged | None
     stats: MoveStats | None

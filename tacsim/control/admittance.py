@@ -1,7 +1,7 @@
 """Constant load on any rig: an arm follows its targets except along the z of its sensor, where a force is held.
 
 An arm that takes poses holds a force by moving until it feels it (position-based force control: Villani and De
-Schutter, Force Control, in Springer Handbook of Robotics, 2nd ed., 2016, ch. 9). Each control period the force tells
+Schutter, Force Control, in Springer Handbook of Robotics, 2nd ed., 2016, ch. 9). Each control period the force gives
 the next correction, by a stiffness that is learned from what the corrections before did. It needs poses and wrenches
 alone, so it is the same for simulated, mock and real arms, and every command still passes their limits.
 """
@@ -21,7 +21,7 @@ TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at 
 PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
 # The stiffness changes at most by these factors a period: forces are noisy; less towards soft, whose steps are longer
 HARDER, SOFTER = 2.0, 1.25
-SMALLEST = 1e-6  # a shorter displacement tells no stiffness [m]
+SMALLEST = 1e-6  # a shorter displacement gives no stiffness [m]
 REACH = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
 
 

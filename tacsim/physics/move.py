@@ -17,10 +17,10 @@ class MoveStats:
     residual: float  # largest relative force imbalance or force change at the end [-]
     settled: bool  # residual <= the scene's tolerance
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
-    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped) or met gels in one another
+    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped) or found gels in one another
     retries: int = 0  # times the motion was started again with half the time step
     load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
-    time_step: float = 0.0  # as the way of the gel's pressure wave in it; of the last substep [m]
+    time_step: float = 0.0  # of the last substep, as the distance that the gel's pressure wave travels in it [m]
     damping: float = 0.0  # of the gel in the last substep: its rate times the wave's time through the gel [-]
     gel_overlap: float = 0.0  # deepest overlap of the two gels with one another at the end, which they do not feel [m]
     courant: float = 0.0  # largest time step / time of the wave through the most squeezed element or grid cell [-]
@@ -37,8 +37,8 @@ class MoveCommand:
 
     def __post_init__(self) -> None:
         """Raises ValueError for options that exclude each other."""
-        if self.loads and self.duration is not None:
-            raise ValueError("loads are held in settled states, not in a motion with a duration: give one of the two")
-        if self.flow and (self.loads or self.duration is not None):
-            what = "loads are held in settled states" if self.loads else "a duration makes a motion dynamic"
-            raise ValueError(f"{what}, and a flowing motion is neither: give one of the two")
+        if bool(self.loads) + (self.duration is not None) + self.flow > 1:
+            raise ValueError(
+                "loads, duration and flow exclude one another: a load is held in settled states, a duration makes a "
+                "motion dynamic, and a flowing motion does not come to rest; give one of them"
+            )

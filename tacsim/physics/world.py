@@ -30,27 +30,25 @@ class World(Protocol):
         self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
         *, flow: bool = False,
     ) -> MoveStats:  # fmt: skip
-        """Drives the named frames to their targets along a ramped straight path, then holds until settled. What turns
-        takes the shorter way round: more than half a turn is several motions.
+        """Drives the named frames to their targets along a ramped straight path, then holds until settled. Rotations
+        take the shorter direction: more than half a turn needs several motions.
 
         loads: normal force [N, positive = pressed] of sensors that hold it by moving along their own z axis; across it,
-        and in orientation, they follow their target (or stay). Afterwards `pose` says where they came to. Raises
+        and in orientation, they follow their target (or stay). Afterwards `pose` says where they are. Raises
         LoadNotReached (tacsim.physics.motion.load), with the world as it was, for a load out of reach.
 
-        duration [s]: makes the motion dynamic (tacsim.physics.motion.inertia): it takes just so long, by the materials'
-        true densities and undamped, and is not held at its end; what still moves then goes on in a next motion with a
-        duration, and stops in one without. Raises ValueError together with loads, for one too short, and where the
-        world has no true inertia (`seed`).
+        duration [s]: makes the motion dynamic (tacsim.physics.motion.inertia): it takes exactly this long, with the
+        materials' true densities and undamped, and is not held at its end. What still moves then keeps its velocity in
+        a next motion with a duration, and is stopped by one without. Raises ValueError for one that is too short.
 
-        flow: frames pass their targets at speed and nothing is held, so a next such motion goes on from there: for many
-        small steps in a row, each in a third of the time and some percent of force from its state of rest
-        (docs/physics.md). Frames without a target are told to stay. With nothing to do and nothing in motion it holds
-        until settled, like every other motion, which first brings to rest what flows. Raises ValueError together with
-        loads or a duration, and for `seed`.
+        flow: frames pass their targets without stopping and nothing is held; the next such motion continues from there.
+        For many small steps in a row, each in a third of the time and within some percent of the force at rest
+        (docs/physics.md). Frames without a target come to a stop. With nothing to do and nothing moving it holds until
+        settled, like every other motion, which first brings to rest what flows.
 
-        Raises SimulationDiverged (tacsim.physics.failure.health) when no step size gives a finite state; KeyError,
-        TypeError or ValueError for an order that makes no sense, before anything moves; RuntimeError while another
-        motion is on its way.
+        Raises SimulationDiverged (tacsim.physics.failure.health) when no step size gives a finite state; KeyError or
+        ValueError for a command that makes no sense, before anything moves: loads, duration and flow exclude one
+        another, and physics 'seed' knows neither duration nor flow; RuntimeError while another motion is running.
         """
         ...
 
@@ -68,7 +66,7 @@ class World(Protocol):
         ...
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Raises TypeError or ValueError, with nothing changed, if `state` is no snapshot of such a world."""
+        """Raises ValueError, with nothing changed, if `state` is no snapshot of such a world."""
         ...
 
 

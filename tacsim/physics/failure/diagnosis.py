@@ -117,7 +117,7 @@ def _determinant(a: Floats, b: Floats, c: Floats) -> Floats:
 def place_of_worst(quantity: Quantity, good: State, failed: State, gel: tuple[float, float, float]) -> str:
     """Which particle or gel node has the worst of `quantity` in `failed`, in words; "" where there is no such thing.
 
-    Positions are those in `good`, the last state that was sound; `gel`: size of a gel [m].
+    Positions are those in `good`, the last physical state; `gel`: size of a gel [m].
     """
     thickness = gel[2] * 1e3
     values: NDArray[Any] | None = None  # the larger, the worse; by node or element of the gels, or by particle

@@ -41,7 +41,7 @@ Poses = Mapping[str, Pose]
 
 
 class DumpError(ValueError):
-    """A folder that is no sound dump."""
+    """A folder that holds no dump, or a damaged one."""
 
 
 class DumpInfo(Config):
@@ -103,26 +103,25 @@ def dumps_in(folder: Path | None) -> Iterator[None]:
 def write_if_asked(
     scene: Scene, poses: Poses, command: MoveCommand, before: State, failure: SimulationDiverged
 ) -> None:
-    """Writes a dump into a new folder below the one that TACSIM_DUMPS names, and tells `failure` of it.
+    """Writes a dump into a new folder below the one that TACSIM_DUMPS names, and notes it in `failure`.
 
-    poses: of the driven frames before the motion; before: the state then. A dump that could not be written whole leaves
-    nothing, and must not hide the failure: `failure` says why there is none.
+    poses: of the driven frames before the motion; before: the state then. A dump that cannot be written whole leaves
+    nothing and does not hide the failure, which then says why there is none.
     """
     parent = os.environ.get(FOLDER)
     if parent is None:
         failure.no_dump = f"set {FOLDER} to a folder to keep a replayable state"
     if not parent:
         return
-    folder = None
     try:
         folder = _new_folder(Path(parent))
-        _write(folder, scene, poses, command, before, failure)
-        failure.dump = folder
-    except BaseException as error:
-        if folder is not None:
+        try:
+            _write(folder, scene, poses, command, before, failure)
+        except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
-        if not isinstance(error, OSError | ValueError):
             raise
+        failure.dump = folder
+    except (OSError, ValueError) as error:
         failure.no_dump = f"no dump could be written to {parent}: {error}"
 
 
@@ -222,11 +221,7 @@ def read(folder: Path) -> Dump:
             for key in archive.files:
                 moment, _, name = key.partition(".")
                 states[moment][name] = archive[key]
-    except FileNotFoundError:
-        raise DumpError(f"{arrays} is missing: the dump is incomplete") from None
-    except KeyError as error:
-        raise DumpError(f"{arrays}: {error} is no moment of a dump: {', '.join(MOMENTS)}") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise DumpError(f"{arrays} is damaged: {error}") from None
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise DumpError(f"{arrays} is missing or damaged: {error}") from None
     scene, _ = _with_mesh(info.scene, str(folder / MESH))
     return Dump(info.model_copy(update={"scene": scene}), states)

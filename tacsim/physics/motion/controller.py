@@ -21,7 +21,7 @@ from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
 LAUNCH = 20  # substeps of one launch while frames are driven
-COMPARED = 2  # earlier readings that one is compared with: a single one may meet the same phase of what rings
+COMPARED = 2  # earlier readings that one is compared with: a single one may have the same phase of an oscillation
 FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
@@ -98,7 +98,7 @@ class Launch:
 
 @dataclass(frozen=True)
 class PreparedLaunch:
-    """A launch that one environment is ready for: its grid is laid and its parameters are set."""
+    """A launch that one environment is ready for: its grid is fitted and its parameters are set."""
 
     launch: Launch
     drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel

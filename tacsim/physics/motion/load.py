@@ -80,7 +80,7 @@ def keep_loads(
     world: LoadableWorld, start: Mapping[str, Pose], end: dict[str, Pose], loads: Mapping[str, float], refine: int, *,
     balanced: bool,
 ) -> Motion:  # fmt: skip
-    """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion came to.
+    """From `start` to `end` with `loads` [N] held; `end` (the same frames, in order) becomes where the motion ended.
 
     Before they touch, sensors go straight to their targets. Raises LoadNotReached.
     """

@@ -81,7 +81,7 @@ class BaseWorld(NotCopyable, ABC):
         """Substeps first..last of a path in one launch. Raises SimulationDiverged if its state is unphysical."""
 
     def motion(self, command: MoveCommand) -> Motion:
-        """`move`, launch by launch. Raises RuntimeError, once begun, while another motion is on its way."""
+        """`move`, launch by launch. Raises RuntimeError, once begun, while another motion is running."""
         if not self._lock.acquire(blocking=False):
             raise RuntimeError("this world is already moving: wait for that motion, or give each thread its own world")
         try:

@@ -56,7 +56,7 @@ class Batch(NotCopyable):
         `duration` and `flow` hold for all motions.
 
         Returns the outcome of each: the error of a motion that fails is not raised but returned, with that world as it
-        was before. One that is retried goes on while the others do.
+        was before. Retries of one do not delay the others.
 
         Raises ValueError for a wrong number of targets or loads, or a load of an environment that rests; what
         `World.move` raises for a command that makes no sense, before anything moves. On an interruption, worlds that

@@ -264,7 +264,7 @@ class PressWorld(FemWorld):
         return PreparedLaunch(launch, drive, where, good)
 
     def _cover(self, drive: np.ndarray) -> None:
-        """A mesh's distances wherever the gel's surface may meet it in this launch."""
+        """Fills in a mesh's distances wherever the gel's surface may touch it in this launch."""
         mesh = self._state.meshes[self._index]
         if mesh is None:
             return

@@ -132,7 +132,7 @@ def test_a_command_that_makes_no_sense_is_refused(tmp_path: Path, monkeypatch: p
         ({"loads": {"other": 1.0}}, "cannot be run again: no sensor 'other'"),
         ({"loads": {"lower": -1.0}}, "load of 'lower' is -1 N"),
         ({"duration": 1e308}, "duration is 1e+308 s"),
-        ({"duration": 1e-3, "flow": True}, "give one of the two"),
+        ({"duration": 1e-3, "flow": True}, "exclude one another"),
     ):
         (place / "dump.json").write_text(json.dumps({**info, **change}))
         result = tacsim("debug", place)

@@ -1,17 +1,16 @@
 """Shared memory between two processes: a :class:`Ring` of records, one writer, many readers.
 
 A record is written into the next slot, and only then counted. A reader copies the newest counted slot and counts again:
-as long as the writer has not come round to that slot meanwhile, the copy is whole. It is a sequence lock whose writer
-never waits and whose readers all but never repeat, and it keeps the past for those who want to look back.
+the copy is consistent unless the writer has reached that slot meanwhile. It is a sequence lock whose writer never waits
+and whose readers hardly ever repeat, and it keeps the last records.
 
-This relies on the order in which others see the writes of one processor: x86-64 keeps the order of stores, and of
-loads (Intel SDM 3A, 8.2.2), and an aligned 8-byte store is never seen half done. ur_rtde has wheels for nothing else;
-on other processors :func:`create` refuses.
+This relies on the memory order of x86-64, which keeps the order of stores, and of loads (Intel SDM 3A, 8.2.2), and in
+which an aligned 8-byte store is atomic. ur_rtde has wheels for nothing else; on other processors :func:`create` raises.
 
-A segment is a mapped file in the system's memory folder. It belongs to the process that made it and carries that
-process's number in its name. multiprocessing.shared_memory is not used: before Python 3.13 its resource tracker also
-takes charge of segments that a process only attached, and removes them when that process dies. Here the owner removes
-its segments when it closes, a worker those of an owner that died, and :func:`sweep` what both left behind.
+A segment is a mapped file in the system's shared memory folder, owned by the process that made it, whose id is in its
+name. multiprocessing.shared_memory is not used: before Python 3.13 its resource tracker also removes segments that a
+dying process had only attached. Here the owner removes its segments when it closes, a worker those of an owner that
+died, and :func:`sweep` whatever is left.
 """
 
 from __future__ import annotations
@@ -34,17 +33,17 @@ Record = NDArray[np.void]  # one record (shape ()) or several (n,)
 
 
 class Ring:
-    """The last `slots` records of type `record` in `memory`, which is zeroed when it is new."""
+    """The last `slots` records of type `record` in `memory`; new memory is zeroed."""
 
     def __init__(self, memory: memoryview | mmap.mmap, record: np.dtype[np.void], slots: int) -> None:
         self._count: NDArray[np.uint64] = np.ndarray((1,), np.uint64, memory)
-        # As plain bytes: NumPy copies records field by field, which takes twenty times as long.
+        # As plain bytes: NumPy copies records field by field, twenty times slower.
         self._record, self._bytes = record, np.dtype((np.void, record.itemsize))
         self._slots: Record = np.ndarray((slots,), self._bytes, memory, offset=_HEAD)
 
     @staticmethod
     def size(record: np.dtype[np.void], slots: int) -> int:
-        """Bytes of memory that such a ring takes; a multiple of a cache line."""
+        """Size of such a ring in memory [bytes]; a multiple of a cache line."""
         return _HEAD + -(-record.itemsize * slots // _HEAD) * _HEAD
 
     @property
@@ -63,8 +62,8 @@ class Ring:
         return self.newest()[1]
 
     def newest(self) -> tuple[int, Record | None]:
-        """The newest record with its number, which counts from 1; 0 and None before the first. (Asking for `count`
-        besides would be a second look: a record may come in between.)"""
+        """The newest record and its number, counted from 1; 0 and None before the first. (Reading `count` separately
+        could give the number of a later record.)"""
         while count := int(self._count[0]):
             slot = (count - 1) % len(self._slots)
             copy: Record = self._slots[slot : slot + 1].copy().view(self._record).reshape(())
@@ -85,22 +84,21 @@ class Ring:
 
 
 class Segment:
-    """A piece of shared memory. Who made it (:func:`create`) removes it in `close`; who attached only looks."""
+    """A piece of shared memory. Its owner (:func:`create`) removes it in `close`; who attached does not."""
 
     def __init__(self, path: Path, memory: mmap.mmap, *, owned: bool) -> None:
         self.name, self.memory = path.name, memory
         self._path, self._owned = path, owned
 
     def close(self) -> None:
-        """Lets go of the memory, and removes it if it is owned. Drop the rings on it first: as long as one is held, so
-        is the memory."""
+        """Releases the memory, and removes it if owned. A ring that is still held keeps the memory mapped."""
         if self._owned:
             self.remove()
-        with contextlib.suppress(BufferError):  # a ring still looks at it; it goes with the ring
+        with contextlib.suppress(BufferError):  # a ring still uses it
             self.memory.close()
 
     def remove(self) -> None:
-        """Takes the name away; who is attached stays so."""
+        """Removes the name; processes that are attached stay so."""
         self._path.unlink(missing_ok=True)
 
 
@@ -134,8 +132,8 @@ def attach(name: str) -> Segment:
 
 
 def sweep() -> list[str]:
-    """Removes segments whose owner is gone; returns their names. Processes in other containers that share the memory,
-    but not the process numbers, are taken for gone: give such containers memory of their own."""
+    """Removes segments whose owner is gone; returns their names. Containers that share this folder but not the process
+    ids would remove each other's segments: give them separate folders."""
     removed = []
     for path in FOLDER.glob(f"{PREFIX}-*-*"):
         owner = path.name.split("-")[1]

@@ -27,7 +27,7 @@ from robot.arm.channel import STATE, ArmStatus, Channel, WorkerConfig
 from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
 from robot.arm.trajectory import PERIOD
-from robot.common.kinematics import Kinematics, motion
+from robot.common.kinematics import Kinematics, displacement
 from robot.common.process import Parent
 from robot.common.realtime import WORKER, ask_for_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
@@ -140,7 +140,7 @@ class Worker:
         while True:
             if self._read():
                 expected = kinematics.forward(self.record["joints"], tool)
-                difference = motion(expected, self.state.flange @ tool)
+                difference = displacement(expected, self.state.flange @ tool)
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
                 if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
                     return

@@ -103,7 +103,7 @@ def inverse_frame(frame: FloatArray) -> FloatArray:
     return back
 
 
-def motion(before: FloatArray, after: FloatArray) -> FloatArray:
+def displacement(before: FloatArray, after: FloatArray) -> FloatArray:
     """(6,) from one frame (4, 4) to another: shift of the origin [m] and rotation vector [rad], in base axes."""
     return np.concatenate([after[:3, 3] - before[:3, 3], rotation_vector(after[:3, :3] @ before[:3, :3].T)])
 

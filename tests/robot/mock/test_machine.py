@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from robot.common.kinematics import matrix, motion, pose
+from robot.common.kinematics import displacement, matrix, pose
 from robot.mock.ur.machine.arm import PERIOD, Arm
 from robot.mock.ur.machine.load import GRAVITY, Wall
 from robot.mock.ur.machine.machine import Machine, Mode, Runtime, Safety
@@ -82,7 +82,7 @@ def test_movel_takes_the_time_of_its_trapezoid(bench: Bench, length: float, spee
     theory = length / speed + speed / acceleration if reaches_speed else 2 * math.sqrt(length / acceleration)
     assert theory <= ticks * PERIOD <= theory + 3 * PERIOD
     bench.until(lambda: bench.arm.rests)
-    np.testing.assert_allclose(motion(bench.arm.frame, matrix(goal)), 0, atol=1e-9)
+    np.testing.assert_allclose(displacement(bench.arm.frame, matrix(goal)), 0, atol=1e-9)
 
 
 def test_movel_stays_on_its_line_and_below_its_speed(bench: Bench) -> None:
@@ -118,7 +118,7 @@ def test_actual_trails_target_and_both_speeds_agree(bench: Bench) -> None:
     np.testing.assert_allclose(bench.arm.twist, [0, 0, -0.05, 0, 0, 0.1], atol=1e-4)
     before = bench.arm.frame.copy()
     bench.tick()
-    np.testing.assert_allclose(motion(before, bench.arm.frame) / PERIOD, bench.arm.twist, atol=1e-4)
+    np.testing.assert_allclose(displacement(before, bench.arm.frame) / PERIOD, bench.arm.twist, atol=1e-4)
 
 
 def test_speed_ramps_at_its_acceleration_and_goes_on_for_ever(bench: Bench) -> None:
@@ -199,7 +199,7 @@ def test_path_with_blend_does_not_stop_and_without_does() -> None:
             if gone > 0.02 and left > 0.02:
                 slowest = min(slowest, float(np.linalg.norm(bench.arm.target_twist[:3])))
         speeds[blend] = slowest, nearest
-        np.testing.assert_allclose(motion(bench.arm.target_frame, matrix(b)), 0, atol=1e-8)
+        np.testing.assert_allclose(displacement(bench.arm.target_frame, matrix(b)), 0, atol=1e-8)
         assert bench.machine.out_int[2] & 0x7FFF in (0, 1)
     assert speeds[0.0][0] < 0.01 and speeds[0.0][1] < 1e-9
     # A parabola between points 20 mm from the corner passes it at 20 mm / (2 sqrt 2).
@@ -292,7 +292,7 @@ def test_safeguard_stop_pauses_and_the_motion_goes_on(bench: Bench) -> None:
     bench.machine.safeguard_stop(False)
     bench.until(lambda: bench.machine.out_int[0] == 2)
     assert float(np.abs(bench.arm.target_qdd).max()) < 40  # no jump where it went on
-    np.testing.assert_allclose(motion(bench.arm.target_frame, matrix(goal)), 0, atol=1e-8)
+    np.testing.assert_allclose(displacement(bench.arm.target_frame, matrix(goal)), 0, atol=1e-8)
 
 
 def test_speed_slider_halves_the_speed(bench: Bench) -> None:

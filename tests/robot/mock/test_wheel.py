@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.common.kinematics import Kinematics, matrix, motion
+from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.mock import MOCK_SERIAL, MockUR
 from robot.mock.ur.machine.arm import HOME
 
@@ -106,12 +106,12 @@ def test_control_moves_and_answers(mock: MockUR) -> None:
         """,
     )
     assert found["moves"] == [True] * 3 and found["program"]
-    np.testing.assert_allclose(motion(matrix(found["pose"]), matrix(found["goal"])), 0, atol=1e-8)
+    np.testing.assert_allclose(displacement(matrix(found["pose"]), matrix(found["goal"])), 0, atol=1e-8)
     np.testing.assert_allclose(found["ik"], found["q"], atol=1e-7)
-    np.testing.assert_allclose(motion(matrix(found["fk"]), matrix(found["goal"])), 0, atol=1e-8)
+    np.testing.assert_allclose(displacement(matrix(found["fk"]), matrix(found["goal"])), 0, atol=1e-8)
     assert found["solvable"] == [True, False] and found["safe"] == [True, False, True, False]
     assert found["tcp"] == [True, [0, 0, 0.1, 0, 0, 0]] and found["trans"] == [1, 2, 0, 0, 0, 0]
-    np.testing.assert_allclose(motion(matrix(found["flange"]), matrix(found["goal"])), 0, atol=1e-8)
+    np.testing.assert_allclose(displacement(matrix(found["flange"]), matrix(found["goal"])), 0, atol=1e-8)
     assert found["step"] == 0.002 and found["steady"] and found["contact"] == 0
     np.testing.assert_allclose(found["history"], found["q"], atol=1e-9)
     assert found["payload"] == [True, True] and found["cog"] == [0, 0, 0.05]
@@ -157,7 +157,7 @@ def test_control_servo_speed_force_jog_and_paths(mock: MockUR) -> None:
     assert found["servo"] == [True] * 200 and found["servoStop"] and found["speed"] and found["speedStop"]
     assert found["force"] == [True] * 3 and found["jog"] == [True, True] and found["path"]
     # Numbers of a path have six digits on the wire.
-    np.testing.assert_allclose(motion(matrix(found["at"]), matrix(found["b"])), 0, atol=1e-5)
+    np.testing.assert_allclose(displacement(matrix(found["at"]), matrix(found["b"])), 0, atol=1e-5)
     assert found["async"] == [True, False] and found["program"]
 
 

@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from robot.common.kinematics import motion, rotation, rotation_vector
+from robot.common.kinematics import displacement, rotation, rotation_vector
 from robot.mock.ur.machine.arm import JOINT_ACCELERATION, PERIOD, Arm, MotionSteps, ProgramError, slowed
 from tacsim.interface import FloatArray
 
@@ -42,7 +42,7 @@ def between(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
 
 def path_length(a: FloatArray, b: FloatArray) -> float:
     """Length of the path between two frames: metres, or radians if those are more."""
-    step = motion(a, b)
+    step = displacement(a, b)
     return max(float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:])))
 
 
@@ -236,7 +236,7 @@ def _ramp(now: FloatArray, wanted: FloatArray, acceleration: float, *, joint: bo
 
 def servoc(arm: Arm, goal: FloatArray, acceleration: float, speed: float) -> MotionSteps:
     """Towards a frame at a bounded speed, braking in time; one control period."""
-    step = motion(arm.target_frame, goal)
+    step = displacement(arm.target_frame, goal)
     size = max(_norm(step[:3]), _norm(step[3:]))
     pace = min(speed, math.sqrt(acceleration * size), size / (4 * PERIOD))
     twist, _ = _ramp(arm.target_twist, step * (pace / size if size > 1e-12 else 0.0), acceleration, joint=False)

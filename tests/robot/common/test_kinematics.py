@@ -13,9 +13,9 @@ from robot.common.kinematics import (
     JOINT_RANGE,
     MODELS,
     Kinematics,
+    displacement,
     inverse_frame,
     matrix,
-    motion,
     pose,
     rotation_vector,
 )
@@ -74,7 +74,9 @@ def test_forward_is_the_product_of_the_dh_matrices(model: Model) -> None:
 def test_jacobian_is_the_derivative(model: Model) -> None:
     arm, h = Kinematics(model), 1e-6
     for q in random_joints(2, 30):
-        columns = [motion(arm.forward(q - step, TOOL), arm.forward(q + step, TOOL)) / (2 * h) for step in h * np.eye(6)]
+        columns = [
+            displacement(arm.forward(q - step, TOOL), arm.forward(q + step, TOOL)) / (2 * h) for step in h * np.eye(6)
+        ]
         np.testing.assert_allclose(arm.jacobian(q, TOOL), np.stack(columns, axis=1), atol=1e-8)
 
 

@@ -1,7 +1,6 @@
-"""A brought into the pixels of B without a person's help: one scale and one shift for the whole comparison.
+"""A brought into the pixels of B automatically: one scale and one shift for the whole comparison.
 
-One for all pairs, as a sensor does not move in its housing: a shift chosen anew for each pair would hide that contacts
-are in the wrong place.
+A sensor does not move in its housing, and a shift for each pair would hide that contacts are in the wrong place.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from tacsim.models.sensor import SensorGeometry
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-ASPECT = 0.02  # relative difference of two pictures' shapes that a scale may hide
-FARTHEST = 0.25  # of the picture: a shift beyond is a mistake in the pairing, not in the mounting
-SCATTER = 0.05  # of the picture: pairs that disagree by more have no shift in common
-SMOOTH = 5  # side of the Gaussian window of the fit [px]
-STEPS, SMALL = 200, 1e-4  # of the fit
+ASPECT_TOLERANCE = 0.02  # relative difference of the aspect ratios of two pictures that are scaled to each other
+MAX_SHIFT = 0.25  # share of the picture; beyond, the pairing is wrong, not the mounting
+MAX_SCATTER = 0.05  # of the pairs' shifts, share of the picture
+ECC_WINDOW = 5  # side of the Gaussian window of the fit [px]
+ECC_STEPS, ECC_TOLERANCE = 200, 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +81,7 @@ def by_size(source: tuple[int, int], shape: tuple[int, int]) -> Alignment:
     if source == shape:
         return Alignment(np.eye(2, 3), shape, source)
     across, down = source[1] / shape[1], source[0] / shape[0]
-    if abs(across / down - 1) > ASPECT:
+    if abs(across / down - 1) > ASPECT_TOLERANCE:
         raise BadFrames(
             f"A is {source[1]} x {source[0]} px, B {shape[1]} x {shape[0]}: no scale makes these the same picture. "
             "Give the sensors' calibrations (--calibration-a, --calibration-b) or the corners of the gel (--corners-a, "
@@ -117,9 +116,9 @@ def find_shift(changes: Iterable[tuple[Float32, Float32]], alignment: Alignment)
     scatter = float(np.median(np.linalg.norm(shifts - middle, axis=1)))
     size = max(alignment.shape)
     words = f"({middle[0]:+.2f}, {middle[1]:+.2f}) px"
-    if scatter > SCATTER * size:
+    if scatter > MAX_SCATTER * size:
         return alignment.shifted((0.0, 0.0), f"not shifted: the pairs disagree by {scatter:.0f} px; are they pairs?")
-    if float(np.linalg.norm(middle)) > FARTHEST * size:
+    if float(np.linalg.norm(middle)) > MAX_SHIFT * size:
         return alignment.shifted((0.0, 0.0), f"not shifted: {words} is too far; are these pairs?")
     x, y = (float(value) for value in middle)
     return alignment.shifted((x, y), f"shifted by {words}, the pairs agree within {scatter:.2f} px")
@@ -135,11 +134,11 @@ def _shift(a: Float32, b: Float32) -> tuple[float, float] | None:
     template, moved = _strength(b), _strength(a)
     start = np.eye(2, 3, dtype=np.float32)
     start[:, 2] = patches[0].x - patches[1].x, patches[0].y - patches[1].y
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, STEPS, SMALL)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ECC_STEPS, ECC_TOLERANCE)
     mask = np.ones(moved.shape, dtype=np.uint8)
     try:
-        _, warp = cv2.findTransformECC(template, moved, start, cv2.MOTION_TRANSLATION, criteria, mask, SMOOTH)
-    except cv2.error:  # it does not converge: these pictures do not show the same
+        _, warp = cv2.findTransformECC(template, moved, start, cv2.MOTION_TRANSLATION, criteria, mask, ECC_WINDOW)
+    except cv2.error:  # no convergence: these pictures do not show the same
         return None
     return float(warp[0, 2]), float(warp[1, 2])
 

@@ -1,9 +1,8 @@
 """How alike the frames of two sensors are: simulated against real, or any two.
 
-Every number stands beside two others. The *null* is what a picture without contact scores: A's reference in A's place.
-The *floor* is what a second picture of the untouched gel scores against the first: what noise alone makes. A
-simulation is worth something where it is surely better than the null, and perfect where it reaches the floor.
-B is taken for the truth.
+B is taken for the truth. Every number stands beside two others. The *null* is what a picture without contact scores:
+A's reference in A's place. The *floor* is what noise alone scores: a second picture of the untouched gel against the
+first. A simulation is worth something where it is surely better than the null, and perfect where it reaches the floor.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Numbers = dict[str, float]
 
-LOOKED_AT = 40  # pairs that the shift is found from, at most
-NOISE_FRAMES = 5  # untouched frames that the floor is made from, at most
-DRAWS = 2000  # of the bootstrap
-FEWEST = 3  # pairs: fewer have no interval
+MAX_SHIFT_PAIRS = 40  # pairs from which the shift is found
+MAX_NOISE_FRAMES = 5  # untouched frames from which the floor is made
+BOOTSTRAP_DRAWS = 2000
+MIN_PAIRS = 3  # for an interval
 GRID = CanonicalGrid()  # the usual one
-SWAPPED = 0.2  # by so much, red and blue exchanged must correlate better to be called so
+SWAPPED_GAIN = 0.2  # of the correlation, by red and blue exchanged, that makes them look swapped
 
 
 class Pairing(StrEnum):
@@ -104,7 +103,7 @@ class Overall:
     null: float
     floor: float
     better: float  # share of the pairs that are better than their null
-    beats_null: bool | None  # surely so, over all pairs; None: too few to tell
+    beats_null: bool | None  # surely so, over all pairs; None: too few pairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,36 +147,40 @@ def compare_frames(
     """Compares A with B.
 
     A calibration says where a side's pixels lie on the gel, and finds height and gradient in its pictures; without one
-    the surfaces that a simulation has recorded count. `on_pair` hears of progress. Raises BadFrames.
+    the surfaces that a simulation has recorded count. `on_pair` is given how many pairs are done, and
+    how many there are. Raises BadFrames.
     """
     couples, left = paired(a, b, options.pairing)
     alignment, notes = _alignment(a, b, couples, calibration_a, calibration_b, shift=options.shift)
     grid = options.grid
-    found_a, said_a = estimate_surfaces(a, [shot for shot, _ in couples], calibration_a, grid)
-    found_b, said_b = estimate_surfaces(b, [shot for _, shot in couples], calibration_b, grid)
+    found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a, grid)
+    found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b, grid)
     if found_a is not None and found_b is not None and calibration_b is not None:
         moved = np.array(alignment.shift) * calibration_b.geometry.pixel_pitch / grid.pitch
-        found_a = tuple(touch.moved(moved) for touch in found_a)
+        found_a = tuple(each.moved(moved) for each in found_a)
     elif found_a is not None and found_b is not None and max(map(abs, alignment.shift)) > 0.5:
         notes.append("surfaces are compared as they were recorded, without the shift: it is known in pixels only")
     if found_a is None or found_b is None:
         notes += [f"no surfaces are compared: {side}: {why}" for side, why in (("A", said_a), ("B", said_b)) if why]
         found_a = found_b = None
-    judge = _Judge(a, b, alignment, grid)
+    scorer = _Scorer(a, b, alignment, grid)
     pairs = []
-    for k, (shot_a, shot_b) in enumerate(couples):
+    for k, (frame_a, frame_b) in enumerate(couples):
         on_pair(k, len(couples))
-        touch_a, touch_b = (None if found is None else found[k] for found in (found_a, found_b))
-        pairs.append(judge.pair(shot_a, shot_b, touch_a, touch_b))
-    floor, said = _floor(judge, b, pairs, calibration_b, options.grid)
+        surface_a, surface_b = (None if found is None else found[k] for found in (found_a, found_b))
+        pairs.append(scorer.pair(frame_a, frame_b, surface_a, surface_b))
+    floor, said = _floor(scorer, b, pairs, calibration_b, options.grid)
     overall = {metric.key: _overall(metric, pairs, floor.get(metric.key, math.nan)) for metric in METRICS}
-    notes += [*left, *said, *judge.swapped(), *_few(len(pairs))]
+    notes += [*left, *said, *scorer.swapped()]
+    if len(pairs) < MIN_PAIRS:
+        words = "pair" if len(pairs) == 1 else "pairs"
+        notes.append(f"{len(pairs)} {words}: too few for intervals; {MIN_PAIRS} are the least")
     return Comparison(a, b, alignment, tuple(pairs), overall, tuple(notes), found_a, found_b)
 
 
 def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame, Frame]], list[str]]:
-    """The frames that belong together, and in words which were left out. Raises BadFrames when that cannot be told."""
-    named_a, named_b = ({Path(shot.name).stem.lower(): shot for shot in side.frames} for side in (a, b))
+    """The frames that belong together, and notes on those left out. Raises BadFrames where that is ambiguous."""
+    named_a, named_b = ({Path(frame.name).stem.lower(): frame for frame in each.frames} for each in (a, b))
     common = [name for name in named_a if name in named_b]
     same = len(common) == len(a.frames) == len(b.frames)
     if pairing is Pairing.name or (pairing is Pairing.auto and same):
@@ -195,16 +198,16 @@ def paired(a: FrameSet, b: FrameSet, pairing: Pairing) -> tuple[list[tuple[Frame
 
 
 def bootstrap(values: Float64, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the mean of values (n,), by resampling; NaN for fewer than FEWEST."""
-    if len(values) < FEWEST:
+    """95 % interval of the mean of values (n,), by resampling; NaN for fewer than MIN_PAIRS."""
+    if len(values) < MIN_PAIRS:
         return math.nan, math.nan
     rng = np.random.default_rng(seed)
-    means = values[rng.integers(0, len(values), (DRAWS, len(values)))].mean(axis=1)
+    means = values[rng.integers(0, len(values), (BOOTSTRAP_DRAWS, len(values)))].mean(axis=1)
     low, high = np.percentile(means, (2.5, 97.5))
     return float(low), float(high)
 
 
-class _Judge:
+class _Scorer:
     """Scores pairs in the pixels of B."""
 
     def __init__(self, a: FrameSet, b: FrameSet, alignment: Alignment, grid: CanonicalGrid) -> None:
@@ -215,19 +218,18 @@ class _Judge:
         self._plain: list[float] = []  # correlations of the pairs as they are, and with red and blue exchanged
         self._swapped: list[float] = []
 
-    def pair(self, a: Frame, b: Frame, touch_a: SurfaceEstimate | None, touch_b: SurfaceEstimate | None) -> Pair:
+    def pair(self, a: Frame, b: Frame, surface_a: SurfaceEstimate | None, surface_b: SurfaceEstimate | None) -> Pair:
         seen_a, seen_b = self._alignment(a.image), b.image.astype(np.float32)
         change_a, change_b = seen_a - self._reference_a, seen_b - self._b.reference
         contact_a, contact_b = (metrics.contact_region(change) & self._covered for change in (change_a, change_b))
         region = contact_a | contact_b
-        numbers = self._pictures(seen_a, seen_b, region) | _contacts(contact_a, contact_b)
+        numbers = self.pictures(seen_a, seen_b, region) | _contacts(contact_a, contact_b)
         numbers["contact_ncc"] = metrics.correlation(change_a, change_b, region)
-        none = np.zeros_like(contact_b)
-        null = self._pictures(self._reference_a, seen_b, region) | _contacts(none, contact_b)
+        null = self.pictures(self._reference_a, seen_b, region) | _contacts(np.zeros_like(contact_b), contact_b)
         null["contact_ncc"] = metrics.correlation(np.zeros_like(change_b), change_b, region)
-        if touch_a is not None and touch_b is not None:
-            numbers |= self.surfaces(touch_a, touch_b, touch_a)
-            null |= self.surfaces(flat_surface(touch_b), touch_b, touch_a)
+        if surface_a is not None and surface_b is not None:
+            numbers |= self._surfaces(surface_a, surface_b, surface_a)
+            null |= self._surfaces(flat_surface(surface_b), surface_b, surface_a)
         if region.any():
             self._plain.append(numbers["contact_ncc"])
             self._swapped.append(metrics.correlation(change_a[..., ::-1], change_b, region))
@@ -238,11 +240,8 @@ class _Judge:
         ]
         return Pair(a, b, numbers, null, tuple(flags), region, metrics.patch_of(contact_b))
 
-    def against_reference(self, shot: Frame, region: Mask) -> Numbers:
-        """An untouched frame of B against B's reference, where a pair has contact."""
-        return self._pictures(shot.image, self._b.reference, region)
-
-    def _pictures(self, one: metrics.Picture, other: metrics.Picture, region: Mask) -> Numbers:
+    def pictures(self, one: metrics.Picture, other: metrics.Picture, region: Mask) -> Numbers:
+        """Of two pictures whose contact is `region`."""
         similarity = metrics.similarity_map(one, other)
         rim = metrics.WINDOW // 2
         inner = np.zeros_like(self._covered)
@@ -257,45 +256,38 @@ class _Judge:
             "contact_ssim": float(similarity[region].mean()) if region.any() else math.nan,
         }
 
-    def surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, drawn: SurfaceEstimate) -> Numbers:
-        """Of A's surface against B's, where B or `drawn` is pressed."""
-        pressed_a, pressed_b, of_drawn = (metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, drawn))
-        where = (of_drawn | pressed_b) & b.valid
-        deepest = float(b.height.max(initial=0.0))
-        error = metrics.height_error(a.height, b.height, where)
+    def _surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, shown: SurfaceEstimate) -> Numbers:
+        """Of A's surface against B's, where B or `shown` is pressed."""
+        pressed_a, pressed_b, of_shown = (metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, shown))
         pressed = _contacts(pressed_a, pressed_b)
-        return {
-            "gradient_angle": metrics.gradient_angle(a.gradient, b.gradient, where),
-            "height_rmse": error,
-            "height_share": error / deepest if deepest > CONTACT_HEIGHT else math.nan,
+        no_flow = a.flow is None or b.flow is None or a.flow.shape != b.flow.shape
+        return surface_errors(a, b, (of_shown | pressed_b) & b.valid, b) | {
             "surface_iou": pressed["contact_iou"],
             "surface_radius": pressed["contact_radius"] * self._grid.pitch,
             "surface_centroid": pressed["contact_centroid"] * self._grid.pitch,
-            "marker_error": math.nan
-            if a.flow is None or b.flow is None or a.flow.shape != b.flow.shape
-            else metrics.end_point_error(a.flow, b.flow),
-        }
-
-    def noise(self, still: SurfaceEstimate, on: SurfaceEstimate) -> Numbers:
-        """Of the surface found in an untouched frame of B against a flat one, where another is pressed."""
-        where = metrics.pressed_region(on.height, CONTACT_HEIGHT) & on.valid
-        error = metrics.height_error(still.height, np.zeros_like(still.height), where)
-        deepest = float(on.height.max(initial=0.0))
-        return {
-            "gradient_angle": metrics.gradient_angle(still.gradient, np.zeros_like(still.gradient), where),
-            "height_rmse": error,
-            "height_share": error / deepest if deepest > CONTACT_HEIGHT else math.nan,
+            "marker_error": math.nan if no_flow else metrics.end_point_error(np.asarray(a.flow), np.asarray(b.flow)),
         }
 
     def swapped(self) -> list[str]:
         """A warning if the pairs agree better with red and blue exchanged."""
         plain, swapped = (float(np.mean(values)) if values else 0.0 for values in (self._plain, self._swapped))
-        if swapped > 0.5 and swapped > plain + SWAPPED:
+        if swapped > 0.5 and swapped > plain + SWAPPED_GAIN:
             return [
                 f"red and blue look swapped in A or B: exchanged they correlate by {swapped:.2f}, as they are by "
                 f"{plain:.2f}; OpenCV's pictures are BGR"
             ]
         return []
+
+
+def surface_errors(a: SurfaceEstimate, b: SurfaceEstimate, where: Mask, pressed: SurfaceEstimate) -> Numbers:
+    """Errors of gradient and height in a region (h, w); the share is of the depth of `pressed`."""
+    error = metrics.height_error(a.height, b.height, where)
+    deepest = float(pressed.height.max(initial=0.0))
+    return {
+        "gradient_angle": metrics.gradient_angle(a.gradient, b.gradient, where),
+        "height_rmse": error,
+        "height_share": error / deepest if deepest > CONTACT_HEIGHT else math.nan,
+    }
 
 
 def _contacts(a: Mask, b: Mask) -> Numbers:
@@ -333,8 +325,8 @@ def _alignment(
         raise BadFrames("A shows no part of the gel that B shows; are these the right calibrations?")
     if not shift:
         return alignment, []
-    chosen = couples if len(couples) <= LOOKED_AT else [
-        couples[int(k)] for k in np.linspace(0, len(couples) - 1, LOOKED_AT)
+    chosen = couples if len(couples) <= MAX_SHIFT_PAIRS else [
+        couples[int(k)] for k in np.linspace(0, len(couples) - 1, MAX_SHIFT_PAIRS)
     ]  # fmt: skip
     base_a, base_b = alignment(a.reference), b.reference.astype(np.float32)
     changes = ((alignment(one.image) - base_a, other.image - base_b) for one, other in chosen)
@@ -342,23 +334,29 @@ def _alignment(
 
 
 def _floor(
-    judge: _Judge, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None, grid: CanonicalGrid
+    scorer: _Scorer, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None, grid: CanonicalGrid
 ) -> tuple[Numbers, list[str]]:
-    """What two pictures of B without contact score, where the pairs have contact; and in words if there are none."""
-    quiet = [pair.b for pair in pairs if not pair.region.any()]
-    frames = [*b.untouched, *quiet][:NOISE_FRAMES]
+    """What pictures of B without contact score against each other, where the pairs have contact; and a note."""
+    frames = [*b.untouched, *(pair.b for pair in pairs if not pair.region.any())][:MAX_NOISE_FRAMES]
     touched = [pair for pair in pairs if pair.region.any()]
     if not frames or not touched:
         why = "B has no second frame without contact" if not frames else "no pair has contact"
         return {}, [f"noise floor absent: {why}"]
-    scores = [judge.against_reference(frame, pair.region) for frame in frames for pair in touched]
-    floor = {key: _mean([score[key] for score in scores]) for key in scores[0]}
+    floor = _means([scorer.pictures(frame.image, b.reference, pair.region) for frame in frames for pair in touched])
     found, _ = estimate_surfaces(b, frames, calibration, grid)
     pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration, grid)
     if found is not None and pressed is not None:
-        surfaces = [judge.noise(still, on) for still in found for on in pressed]
-        floor |= {key: _mean([score[key] for score in surfaces]) for key in surfaces[0]}
+        regions = [metrics.pressed_region(each.height, CONTACT_HEIGHT) & each.valid for each in pressed]
+        floor |= _means([
+            surface_errors(still, flat_surface(still), where, each)
+            for still in found
+            for where, each in zip(regions, pressed, strict=True)
+        ])  # fmt: skip
     return floor, [f"noise floor from {len(frames)} more frames of B without contact"]
+
+
+def _means(scores: Sequence[Numbers]) -> Numbers:
+    return {key: _mean([score[key] for score in scores]) for key in scores[0]}
 
 
 def _overall(metric: Metric, pairs: Sequence[Pair], floor: float) -> Overall:
@@ -380,12 +378,6 @@ def _overall(metric: Metric, pairs: Sequence[Pair], floor: float) -> Overall:
         better=float((gain > 0).mean()) if gain.size else math.nan,
         beats_null=None if math.isnan(surely) else surely > 0,
     )
-
-
-def _few(count: int) -> list[str]:
-    if count >= FEWEST:
-        return []
-    return [f"{count} pair{'s' if count > 1 else ''}: too few for intervals; {FEWEST} are the least"]
 
 
 def _mean(values: Sequence[float] | Float64) -> float:

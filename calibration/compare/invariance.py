@@ -1,4 +1,4 @@
-"""Would a policy notice that its frames come from another source? Three answers, for any pair of sources.
+"""Can a policy tell that its frames come from another source? Three measures, for any pair of sources.
 
 **rho**: the distance of a press to its partner, over the distance of two neighbouring presses of B. Below 1 the change
 of source matters less than the next press. **AUC**: how well a linear classifier tells the sources apart on presses
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
-from calibration.compare.compare import DRAWS, GRID, Comparison
+from calibration.compare.compare import BOOTSTRAP_DRAWS, GRID, Comparison
 from calibration.compare.surfaces import estimate_surfaces
 from calibration.errors import BadFrames
 from calibration.frame_set import Image
@@ -29,20 +29,20 @@ from tacsim.models.sensor import CanonicalGrid
 
 Float64 = NDArray[np.float64]
 
-PATCH = 5.2e-3  # side of the patch, where pixels have a known pitch [m]
-OF_RADIUS = 3.0  # ... and else in radii of the usual contact region
-POINTS = 36  # of the patch, each way
-FEWEST = 4  # presses
-COMPONENTS = 6  # principal ones that the classifier sees
+PATCH_SIDE = 5.2e-3  # where pixels have a known pitch [m]
+PATCH_SIDE_RADII = 3.0  # ... and else [radii of the median contact region]
+PATCH_POINTS = 36  # each way
+MIN_PRESSES = 4
+COMPONENTS = 6  # principal components that the classifier sees
 RIDGE = 1.0
-FOLDS = 20  # of the presses: up to so many, each press is left out alone
+MAX_FOLDS = 20  # up to so many presses, each is left out alone
 
 VIEWS = ("raw", "difference", "gradient", "height")
 
 
 @dataclass(frozen=True, slots=True)
 class Invariance:
-    """What one view says."""
+    """The measures in one view."""
 
     view: str
     signal: float  # mean norm of a patch's change by contact, in the view's own unit
@@ -90,7 +90,7 @@ class Drift:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything that is said of invariance."""
+    """All measures of invariance."""
 
     presses: int
     views: tuple[Invariance, ...]
@@ -108,10 +108,9 @@ def invariance(
 ) -> Report:
     """Of a finished comparison. Gradient and height need surfaces on both sides, the drift table B's calibration.
 
-    Raises BadFrames for fewer than FEWEST presses with contact in B.
+    Raises BadFrames for fewer than MIN_PRESSES presses with contact in B.
     """
-    folds = [(comparison, calibration_b)]
-    return pooled_invariance(folds, grid, on_step)
+    return pooled_invariance([(comparison, calibration_b)], grid, on_step)
 
 
 def pooled_invariance(
@@ -120,14 +119,16 @@ def pooled_invariance(
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
     """The same of several comparisons, each with B's calibration: parts of one set of presses, of which each was left
-    out of the calibration that it is seen through. Raises BadFrames for fewer than FEWEST presses with contact in B."""
+    out of the calibration that it is seen through. Raises BadFrames for fewer than MIN_PRESSES with contact in B."""
     touched = [
         {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
         for comparison, _ in folds
     ]
     count = sum(map(len, touched))
-    if count < FEWEST:
-        raise BadFrames(f"{count} pairs show contact in B; {FEWEST} are needed to tell how far two presses are apart")
+    if count < MIN_PRESSES:
+        raise BadFrames(
+            f"{count} pairs show contact in B; {MIN_PRESSES} are needed to tell how far two presses are apart"
+        )
     radii = [patch.radius for one in touched for patch in one.values()]
     half, words = _size(folds[0][1], radii)
     parts = [
@@ -171,9 +172,9 @@ def classifier_scores(of_a: Float64, of_b: Float64) -> tuple[Float64, Float64]:
     count = len(of_a)
     rows = np.concatenate([of_a, of_b])
     wanted = np.repeat([-1.0, 1.0], count)
-    fold = np.tile(np.arange(count) % min(count, FOLDS), 2)
+    fold = np.tile(np.arange(count) % min(count, MAX_FOLDS), 2)
     scores = np.zeros(2 * count)
-    for number in range(min(count, FOLDS)):
+    for number in range(min(count, MAX_FOLDS)):
         held = fold == number
         middle = rows[~held].mean(axis=0)
         away = rows - middle
@@ -202,8 +203,8 @@ def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray
     score_a, score_b = classifier_scores(of_a, of_b)
     distances = np.linalg.norm(of_a - of_b, axis=1)
     steps = np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
-    drawn = rng.integers(0, count, (DRAWS, count))
-    below = np.median(steps[rng.integers(0, count - 1, (DRAWS, count - 1))], axis=1)
+    drawn = rng.integers(0, count, (BOOTSTRAP_DRAWS, count))
+    below = np.median(steps[rng.integers(0, count - 1, (BOOTSTRAP_DRAWS, count - 1))], axis=1)
     rho_low, rho_high = np.percentile(np.median(distances[drawn], axis=1) / np.maximum(below, 1e-30), (2.5, 97.5))
     times = np.stack([(drawn == press).sum(axis=1) for press in range(count)], axis=1).astype(np.float64)
     auc_low, auc_high = np.percentile(area_under_curve(score_a, score_b, times), (2.5, 97.5))
@@ -224,9 +225,9 @@ def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray
 def _size(calibration: Calibration | None, radii: Sequence[float]) -> tuple[float, str]:
     """Half the side of the patch [px], and how large that is in words."""
     if calibration is not None:
-        return PATCH / 2 / calibration.geometry.pixel_pitch, f"{PATCH * 1e3:g} mm"
-    half = OF_RADIUS / 2 * float(np.median(radii))
-    return half, f"{2 * half:.0f} px: {OF_RADIUS:g} radii of the usual contact region"
+        return PATCH_SIDE / 2 / calibration.geometry.pixel_pitch, f"{PATCH_SIDE * 1e3:g} mm"
+    half = PATCH_SIDE_RADII / 2 * float(np.median(radii))
+    return half, f"{2 * half:.0f} px: {PATCH_SIDE_RADII:g} radii of the usual contact region"
 
 
 def _patches(
@@ -250,10 +251,10 @@ def _patches(
         if comparison.surfaces_a is None or comparison.surfaces_b is None:
             continue
         at_x, at_y, reach = _in_cells(comparison, k, calibration, grid, x, y)
-        touch_a, touch_b = comparison.surfaces_a[k], comparison.surfaces_b[k]
+        surface_a, surface_b = comparison.surfaces_a[k], comparison.surfaces_b[k]
         for view, one, other in (
-            ("gradient", touch_a.gradient, touch_b.gradient),
-            ("height", touch_a.height, touch_b.height),
+            ("gradient", surface_a.gradient, surface_b.gradient),
+            ("height", surface_a.height, surface_b.height),
         ):
             cut = _cut(other, at_x, at_y, reach)
             _add(found[view], _cut(one, at_x, at_y, reach), cut, cut)
@@ -274,7 +275,7 @@ def _in_cells(
     comparison: Comparison, k: int, calibration: Calibration | None, grid: CanonicalGrid, x: float, y: float
 ) -> tuple[float, float, float]:
     """Centre of the patch of pair k on the canonical grid, and half its side [cells]."""
-    reach = PATCH / 2 / grid.pitch
+    reach = PATCH_SIDE / 2 / grid.pitch
     if calibration is None:  # both surfaces were recorded
         assert comparison.surfaces_b is not None
         patch = metrics.patch_of(metrics.pressed_region(comparison.surfaces_b[k].height, CONTACT_HEIGHT))
@@ -288,10 +289,10 @@ def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> Float64
     """(d,) values of a square patch of a field (H, W[, n]) round x, y, as far as `half` each way."""
     import cv2
 
-    line = np.linspace(-half, half, POINTS)
+    line = np.linspace(-half, half, PATCH_POINTS)
     u, v = (points.astype(np.float32) for points in np.meshgrid(x + line, y + line))
     picture = np.ascontiguousarray(field, dtype=np.float32)
-    spacing = 2 * half / (POINTS - 1)
+    spacing = 2 * half / (PATCH_POINTS - 1)
     if spacing > 1.0:  # a patch of many pixels: else every few of them would decide
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * spacing), dtype=np.float32)
     cut = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

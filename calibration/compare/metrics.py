@@ -18,13 +18,14 @@ Mask = NDArray[np.bool_]
 
 WHITE = 255.0  # grey level
 WINDOW = 7  # side of the window of SSIM [px]
-BLUR = 2.0  # of a change of colour before contact is looked for in it [px]: noise of a camera must not look like touch
-LEAST_CHANGE = 5.0  # a smoothed change below this is no contact [grey levels]
-NOISES = 6.0  # ... nor one below so many times the noise of the picture
-SHARE = 0.25  # contact reaches down to this share of the strongest change, or (pressed surfaces: 1/2) of the depth
-ENOUGH = 10000  # pixels tell a median
-SMALLEST = 30  # pixels: a smaller patch is dirt
-HIDDEN = 3.0  # holes in a contact that are filled: the flat middle of a press has the colour of the untouched gel
+CONTACT_BLUR = 2.0  # of a change of colour before contact is looked for in it, against noise [px]
+# A smoothed change shows contact beyond the largest of
+MIN_CHANGE = 5.0  # [grey levels]
+MIN_CHANGE_TO_NOISE = 6.0  # times the noise of the picture
+MIN_CHANGE_SHARE = 0.25  # of the strongest change
+MEDIAN_PIXELS = 10000  # enough for a median
+MIN_PATCH = 30  # a smaller patch is dirt [px]
+CLOSING = 3  # radius of gaps in a contact that are closed [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,7 @@ def similarity_map(one: Picture, other: Picture) -> Float64:
     reflecting border. scikit-image's `structural_similarity` gives the same numbers."""
     import cv2
 
-    _difference(one, other)  # the same shape?
+    _require_alike(one, other)
     a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
     if min(a.shape[:2]) < WINDOW:
         raise ValueError(f"pictures of {a.shape[1]} x {a.shape[0]} px are smaller than SSIM's window of {WINDOW} px")
@@ -84,8 +85,8 @@ def structural_similarity(one: Picture, other: Picture, where: Mask | None = Non
 
 def correlation(one: Picture, other: Picture, where: Mask | None = None) -> float:
     """Pearson's correlation of two changes of colour (normalised cross-correlation without shift), over pixels and
-    channels; 0 if either does not vary: a picture without contact tells nothing of one with."""
-    _difference(one, other)
+    channels; 0 if either does not vary."""
+    _require_alike(one, other)
     a, b = (_chosen(np.asarray(picture, dtype=np.float64), where).ravel() for picture in (one, other))
     if a.size == 0:
         return math.nan
@@ -112,8 +113,7 @@ def height_error(one: NDArray[np.floating], other: NDArray[np.floating], where: 
 
 def overlap(one: Mask, other: Mask) -> float:
     """Intersection over union of two masks; NaN if both are empty."""
-    if one.shape != other.shape:
-        raise ValueError(f"masks differ in shape: {one.shape} and {other.shape}")
+    _require_alike(one, other)
     union = int((one | other).sum())
     return float((one & other).sum() / union) if union else math.nan
 
@@ -134,24 +134,25 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     import cv2
     from scipy.ndimage import binary_closing, binary_fill_holes, label
 
-    smooth = np.asarray(cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), BLUR), dtype=np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), CONTACT_BLUR), dtype=np.float32)
     red, green, blue = (np.abs(smooth[..., k] - level) for k, level in enumerate(untouched_change(smooth)))
     strength = np.maximum(np.maximum(red, green), blue)
-    limit = max(LEAST_CHANGE, NOISES * _noise(strength), SHARE * float(np.percentile(strength, 99.8)))
+    limit = max(
+        MIN_CHANGE, MIN_CHANGE_TO_NOISE * _noise(strength), MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
+    )
     found = strength > limit
-    reach = int(HIDDEN)
-    padded = np.pad(found, reach)  # closing eats what touches the border
-    closed = binary_closing(padded, iterations=reach)[reach:-reach, reach:-reach]
+    padded = np.pad(found, CLOSING)  # closing erodes what touches the border
+    closed = binary_closing(padded, iterations=CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
     parts, _ = label(binary_fill_holes(closed | found))
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return np.asarray(sizes[parts] >= SMALLEST)
+    return np.asarray(sizes[parts] >= MIN_PATCH)
 
 
 def untouched_change(change: NDArray[np.floating]) -> NDArray[np.floating]:
     """(3,) change of colour of the untouched gel: the median over (H, W, 3), then over the half nearest to it."""
     pixels = change.reshape(-1, change.shape[2])
-    pixels = pixels[:: max(1, len(pixels) // ENOUGH)]
+    pixels = pixels[:: max(1, len(pixels) // MEDIAN_PIXELS)]
     level = np.median(pixels, axis=0)
     away = np.abs(pixels - level).max(axis=1)
     return np.asarray(np.median(pixels[away <= np.median(away)], axis=0))
@@ -177,9 +178,13 @@ def _noise(strength: NDArray[np.floating]) -> float:
     return 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
 
 
-def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Float64:
+def _require_alike(one: NDArray[np.generic], other: NDArray[np.generic]) -> None:
     if one.shape != other.shape:
         raise ValueError(f"shapes differ: {one.shape} and {other.shape}; align them first")
+
+
+def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Float64:
+    _require_alike(one, other)
     return np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
 
 

@@ -18,9 +18,9 @@ from calibration.compare.invariance import CHANGES, VIEWS, Report
 
 Image = NDArray[np.uint8]
 
-SHOWN = 24  # pairs with pictures, the worst first
-THUMBNAIL = 240  # [px]
-QUALITY = 85  # of the page's JPEG
+MAX_PICTURED = 24  # pairs with pictures, the worst first
+THUMBNAIL = 240  # longer side [px]
+JPEG_QUALITY = 85
 WORST_BY = "contact_mae"
 FORMAT = 1
 
@@ -28,7 +28,7 @@ FILES = ("compare.json", "compare.csv", "compare.html")
 
 
 def figures(comparison: Comparison, report: Report | None = None) -> dict[str, float]:
-    """All that a threshold may speak of, by name; NaN where it is not known. Units as in the JSON file."""
+    """All figures that a threshold may name; NaN where not known. Units as in the JSON file."""
     found = {key: overall.mean for key, overall in comparison.overall.items()}
     for view in report.views if report else ():
         found |= {f"rho_{view.view}": view.rho, f"auc_{view.view}": view.auc, f"auc_low_{view.view}": view.auc_low}
@@ -145,8 +145,8 @@ def _html(comparison: Comparison, report: Report | None) -> str:
         shown=shown,
         verdict=verdict,
         number=lambda value, digits=2: "–" if math.isnan(value) else f"{value:.{digits}f}",
-        pairs=[(comparison.pairs[k], _pictures(comparison, k)) for k in order[:SHOWN]],
-        rest=[comparison.pairs[k] for k in order[SHOWN:]],
+        pairs=[(comparison.pairs[k], _pictures(comparison, k)) for k in order[:MAX_PICTURED]],
+        rest=[comparison.pairs[k] for k in order[MAX_PICTURED:]],
         nan=math.nan,
     )
 
@@ -197,7 +197,7 @@ def _inline(picture: Image) -> str:
     size = (max(1, round(columns * scale)), max(1, round(rows_ * scale)))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
     small = cv2.resize(picture, size, interpolation=how)
-    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.bundle import Calibration
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet, Image
+from calibration.frame_set import Frame, FrameSet
 from calibration.normaliser import normaliser_for_calibration
 from calibration.reference import UnusableReference
 from tacsim.interface import TactileFrame
@@ -22,7 +22,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceEstimate:
-    """The surface of one frame."""
+    """The gel surface in one frame."""
 
     height: Float32  # (h, w) into the gel [m]
     gradient: Float32  # (h, w, 2) [-]
@@ -50,21 +50,20 @@ def estimate_surfaces(
     frames: Sequence[Frame],
     calibration: Calibration | None,
     grid: CanonicalGrid,
-    reference: Image | None = None,
 ) -> tuple[tuple[SurfaceEstimate, ...] | None, str]:
-    """The surfaces of some frames of a side; or None, and why not.
+    """The surfaces of some of the frames; or None, and why not.
 
-    With a calibration they are found in the pictures, also where a simulation knows them by itself: then both sides go
-    the same way. `reference`: instead of the side's own. Raises BadFrames for a reference that cannot be used.
+    With a calibration they are found in the pictures, also where a simulation knows them, so that both sources are
+    treated alike. Raises BadFrames for a reference that cannot be used.
     """
     if calibration is None:
         return _recorded(frames, grid)
     normaliser = normaliser_for_calibration(calibration, grid)
     try:
-        normaliser.take_reference(TactileFrame(side.reference if reference is None else reference, 0.0, 0))
+        normaliser.take_reference(TactileFrame(side.reference, 0.0, 0))
         found = []
-        for shot in frames:
-            seen = normaliser(TactileFrame(shot.image, 0.0, 0), 0.0)
+        for frame in frames:
+            seen = normaliser(TactileFrame(frame.image, 0.0, 0), 0.0)
             assert seen.height is not None and seen.gradient is not None
             found.append(SurfaceEstimate(seen.height, seen.gradient, seen.flow, seen.valid))
     except UnusableReference as error:
@@ -83,12 +82,12 @@ def flat_surface(like: SurfaceEstimate) -> SurfaceEstimate:
 def _recorded(frames: Sequence[Frame], grid: CanonicalGrid) -> tuple[tuple[SurfaceEstimate, ...] | None, str]:
     shape = (grid.rows, grid.columns)
     found = []
-    for shot in frames:
-        if shot.surface is None:
+    for frame in frames:
+        if frame.surface is None:
             return None, "pictures alone have no height; give the sensor's calibration"
-        if shot.surface.height.shape != shape:
-            lies = " x ".join(map(str, shot.surface.height.shape))
+        if frame.surface.height.shape != shape:
+            lies = " x ".join(map(str, frame.surface.height.shape))
             return None, f"the recorded surface has {lies} cells, not {shape[0]} x {shape[1]}; give a calibration"
         everywhere = np.ones(shape, dtype=np.bool_)
-        found.append(SurfaceEstimate(shot.surface.height, shot.surface.gradient, shot.surface.flow, everywhere))
+        found.append(SurfaceEstimate(frame.surface.height, frame.surface.gradient, frame.surface.flow, everywhere))
     return tuple(found), ""

@@ -154,5 +154,5 @@ def test_what_does_not_fit_together_is_refused() -> None:
         metrics.similarity_map(NOISE[:5], NOISE[:5])
     with pytest.raises(ValueError, match="slopes must be"):
         metrics.gradient_angle(np.zeros((3, 3, 2)), np.zeros((3, 4, 2)))
-    with pytest.raises(ValueError, match="masks differ"):
+    with pytest.raises(ValueError, match="shapes differ"):
         metrics.overlap(np.zeros((2, 2), dtype=bool), np.zeros((2, 3), dtype=bool))

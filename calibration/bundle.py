@@ -30,16 +30,16 @@ from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
 FORMAT = 3
-LATER = {1: {"view", "noise"}, 2: {"noise"}, 3: set[str]()}  # by format: what it had not yet
+NOT_YET = {1: {"view", "noise"}, 2: {"noise"}, 3: set[str]()}  # by format: the fields it lacks
 FILE, REFERENCE = "calibration.yaml", "reference.png"
-LARGEST_FILE, LARGEST_PICTURE = 1 << 20, 1 << 26  # [bytes] of the YAML, and of the picture
+MAX_FILE_SIZE, MAX_PICTURE_SIZE = 1 << 20, 1 << 26  # [bytes] of the YAML, and of the picture
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class BadBundle(CalibrationError):
-    """A calibration that cannot be used: which, why, and what to do."""
+    """A bundle cannot be used."""
 
 
 class Residual(Config):
@@ -65,7 +65,7 @@ class Provenance(Config):
 
 
 class Calibration(Config):
-    """Everything that is known of one sensor."""
+    """All that calibration has found out about one sensor."""
 
     format: Literal[1, 2, 3]
     serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
@@ -106,14 +106,14 @@ class Calibration(Config):
 
     @model_validator(mode="after")
     def _format_has_all_that_is_given(self) -> Self:
-        for name in sorted(LATER[self.format]):
+        for name in sorted(NOT_YET[self.format]):
             if getattr(self, name) is not None:
                 raise ValueError(f"format {self.format} has no {name}")
         return self
 
     def digest(self) -> str:
         """What `checksum` must be."""
-        content = self.model_dump(mode="json", exclude={"checksum"} | LATER[self.format])
+        content = self.model_dump(mode="json", exclude={"checksum"} | NOT_YET[self.format])
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -137,7 +137,7 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
     file = path
     try:
         file = path / FILE if path.is_dir() else path
-        for part, most in ((file, LARGEST_FILE), (file.with_name(REFERENCE), LARGEST_PICTURE)):
+        for part, most in ((file, MAX_FILE_SIZE), (file.with_name(REFERENCE), MAX_PICTURE_SIZE)):
             about = part.stat()
             if not stat.S_ISREG(about.st_mode):  # a pipe would be waited for
                 raise BadBundle(f"{part} is no file: a calibration is a folder with {FILE} and {REFERENCE}")
@@ -154,8 +154,8 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
     version = re.search(r"^format:\s*(\S+)", text, re.MULTILINE)
     if version is None:
         raise BadBundle(f"{file} is no calibration: it names no format")
-    if version[1] not in map(str, LATER):
-        known = ", ".join(map(str, LATER))
+    if version[1] not in map(str, NOT_YET):
+        known = ", ".join(map(str, NOT_YET))
         raise BadBundle(f"{file} has format {version[1]}, this version of tacsim reads {known}; {again}")
     try:
         calibration = load(Calibration, file)

@@ -1,4 +1,4 @@
-"""How the light has changed since the reference was taken, told by where nothing touches."""
+"""Drift of the light since the reference, measured where nothing touches the gel."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-CALM = 0.08  # a pixel that changes less than this, drift apart, is not touched [-]
-LEAST_CALM = 0.15  # share of the view that must be calm for a drift to be told
-THIN = 5  # every so many pixels say enough of it
+UNTOUCHED_CHANGE = 0.08  # an untouched pixel changes less than this, without drift [-]
+MIN_UNTOUCHED_SHARE = 0.15  # of the view, to measure a drift
+STRIDE = 5  # of the pixels from which it is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,11 +20,11 @@ class Drift:
     """One picture's drift, a quadratic in the place."""
 
     weights: Float32  # (6, 3) of 1, u, v, uu, uv, vv with u, v in -1..1 across the view
-    told: bool  # enough of the gel was calm; otherwise it is but the median of all
+    measured: bool  # on enough untouched gel; otherwise it is the median of all
 
     def scaled(self, factor: Float32) -> Drift:
         """The same in other units: each channel times its `factor` (3,)."""
-        return Drift(self.weights * factor, self.told)
+        return Drift(self.weights * factor, self.measured)
 
 
 def size_of(change: Float32) -> float:
@@ -33,33 +33,33 @@ def size_of(change: Float32) -> float:
 
 
 class DriftFinder:
-    """Finds the drift in a view of `shape` (H, W): a quadratic in the place through the calm pixels, twice, the second
-    time through those near the first; their median where too few are calm to tell more."""
+    """Finds the drift in a view of `shape` (H, W): a quadratic in the place through the untouched pixels, fitted
+    twice, the second time to those near the first; the median where too few are untouched."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._u, self._v = (np.linspace(-1, 1, count, dtype=np.float32) for count in reversed(shape))
-        u, v = np.meshgrid(self._u[::THIN], self._v[::THIN])
+        u, v = np.meshgrid(self._u[::STRIDE], self._v[::STRIDE])
         self._few = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6)
 
     def __call__(self, planes: Float32, hidden: Mask) -> Drift:
-        """The drift in relative changes (3, H, W), of which those `hidden` (H, W) say nothing."""
-        seen = planes[:, ::THIN, ::THIN].reshape(3, -1)
-        on_gel = ~hidden[::THIN, ::THIN].ravel()
+        """The drift in relative changes (3, H, W), without those `hidden` (H, W)."""
+        seen = planes[:, ::STRIDE, ::STRIDE].reshape(3, -1)
+        on_gel = ~hidden[::STRIDE, ::STRIDE].ravel()
         weights = np.zeros((6, 3), dtype=np.float32)
         if on_gel.any():
             weights[0] = np.median(seen[:, on_gel], axis=1)
-        told = False
+        measured = False
         for _ in range(2):
             rest = np.abs(seen - np.einsum("ni,ic->cn", self._few, weights))
-            calm = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < CALM)
-            told = bool(calm.mean() >= LEAST_CALM)
-            if not told:
+            untouched = on_gel & (np.maximum(np.maximum(rest[0], rest[1]), rest[2]) < UNTOUCHED_CHANGE)
+            measured = bool(untouched.mean() >= MIN_UNTOUCHED_SHARE)
+            if not measured:
                 break
-            terms = self._few[calm].astype(np.float64)
-            # einsum: products so small would wake the threads of BLAS, which cost more than they give
+            terms = self._few[untouched].astype(np.float64)
+            # einsum: such small products are slower with the threads of BLAS
             square = np.einsum("ni,nj->ij", terms, terms) + 1e-6 * len(terms) * np.eye(6)
-            weights = np.linalg.solve(square, np.einsum("ni,cn->ic", terms, seen[:, calm])).astype(np.float32)
-        return Drift(weights, told)
+            weights = np.linalg.solve(square, np.einsum("ni,cn->ic", terms, seen[:, untouched])).astype(np.float32)
+        return Drift(weights, measured)
 
     def remove(self, planes: Float32, drift: Drift) -> None:
         """Takes the drift off relative changes (3, H, W)."""
@@ -83,5 +83,5 @@ class DriftFinder:
         return change.reshape(*shape, 3)
 
     def at(self, drift: Drift) -> Float32:
-        """(n, 3) the drift at every THIN-th row and column [-]."""
+        """(n, 3) the drift at every STRIDE-th row and column [-]."""
         return np.asarray(np.einsum("ni,ic->nc", self._few, drift.weights), dtype=np.float32)

@@ -1,4 +1,7 @@
-"""Native frame -> canonical observation: the same function for simulated, mock, real and recorded sensors."""
+"""Native frame -> canonical observation, the same for simulated, mock, real and recorded sensors.
+
+`normaliser_for_...` makes the one of a sensor; calibration/height says how a picture becomes a height.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,10 @@ from calibration.lens.rectification import Rectification, from_corners, from_geo
 from calibration.lens.view import GelView
 from calibration.markers.flow import MarkerFlow, marker_grid, require_no_markers
 from calibration.reference import (
-    LOST,
     LOST_COLOUR,
-    STALE,
+    LOST_SLOPE,
     STALE_COLOUR,
+    STALE_SLOPE,
     Reference,
     StaleReference,
     UnusableReference,
@@ -36,14 +39,14 @@ from tacsim.optics.grid import canonical_cells, canonical_image
 
 
 class NoReference(RuntimeError):
-    """A frame cannot be normalised before a contact-free one was taken."""
+    """A frame was to be normalised before a reference was taken."""
 
 
 class FrameNormaliser:
     """Rectifies a frame, compares it with the reference, and finds where there is contact.
 
     Height, gradient and flow are those of the source where it knows them (simulation). Otherwise they are found in the
-    picture: height and gradient if there is a `find` for that, flow if there are `markers`; what is not found is None.
+    picture: height and gradient by `find`, flow by `markers`; what is not found is None.
     """
 
     def __init__(
@@ -56,9 +59,9 @@ class FrameNormaliser:
         drifts: bool = False,
         untouched: NDArray[np.float32] | None = None,
     ) -> None:
-        """`rectify` gives the canonical image, or for a `find` its wider view. drifts: a real light is behind the
-        pictures, which may drift from its reference; where there is a `find`, that watches over it. untouched:
-        what `rectify` gives of the picture without contact that the sensor was calibrated with."""
+        """`rectify` gives the canonical image, or for a `find` its wider view. drifts: the light is real and may
+        drift from its reference; a `find` measures that itself. untouched: what `rectify` gives of the picture without
+        contact that belongs to the calibration."""
         shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
         if min(spare) < 0 or any(extra % (2 * grid.image_scale) for extra in spare) or (find is None and any(spare)):
@@ -70,11 +73,11 @@ class FrameNormaliser:
         self._valid.flags.writeable = False
         self._reference: Reference | None = None
         self._beyond = 0.0
-        self._watched = DriftFinder(shape) if drifts and find is None else None
+        self._find_drift = DriftFinder(shape) if drifts and find is None else None
         self._background: float | None = None
         self._drift: float | None = None
         self._untouched = untouched
-        self._sought = False  # something was sought in the last picture
+        self._sought = False  # the last observation was found in a picture
 
     @property
     def reference(self) -> Reference | None:
@@ -88,26 +91,26 @@ class FrameNormaliser:
 
     @property
     def beyond(self) -> float:
-        """Share of the pixels of the last picture whose colour lies beyond the calibrated slopes; their height and
-        gradient are only the nearest that the calibration knows. 0 where nothing had to be found."""
+        """Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
+        calibrated slope. 0 where nothing had to be found."""
         return self._beyond
 
     @property
     def background(self) -> float | None:
-        """Mean slope [degrees] that the drift of the light since the reference would be taken for, by the last picture
-        in which enough of the gel was untouched to tell; None where no height is found, or nothing told it yet."""
+        """Mean slope [degrees] that the drift of the light since the reference looks like, in the last picture with
+        enough untouched gel; None where no height is found, or before such a picture."""
         return self._background
 
     @property
     def drift(self) -> float | None:
-        """By how much the untouched gel's colour has changed since the reference [-], by the same picture; known
-        without slopes, too."""
+        """Relative change of the untouched gel's colour since the reference [-], in the same picture; also without
+        height."""
         return self._drift
 
     @property
     def stale(self) -> bool:
-        """True when the reference does not fit any more: take a fresh one as soon as nothing touches."""
-        return (self._drift or 0.0) > STALE_COLOUR or (self._background or 0.0) > STALE
+        """True when the reference is outdated: take a fresh one as soon as nothing touches."""
+        return (self._drift or 0.0) > STALE_COLOUR or (self._background or 0.0) > STALE_SLOPE
 
     @property
     def finds_flow(self) -> bool:
@@ -143,8 +146,8 @@ class FrameNormaliser:
         self._background = self._drift = None
 
     def diagnostics(self) -> dict[str, float]:
-        """How far the last observation is to be trusted, where it was found in a picture: `beyond`, `drift`,
-        `background` and `kept` as the properties say, and `stale` (0 or 1)."""
+        """Quality of the last observation, where it was found in a picture: the properties `beyond`, `drift`,
+        `background`, `kept`, and `stale` (0 or 1)."""
         if not self._sought:
             return {}
         found = {"stale": float(self.stale)}
@@ -161,9 +164,8 @@ class FrameNormaliser:
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
         """The observation of `frame` at time `now` [s].
 
-        Where a real light is behind the picture (`drifts`) and enough of the gel is untouched to tell its drift since
-        the reference, that drift, one quadratic over the gel, is taken off the canonical image as it is off gradient
-        and height. Sources that know their surface, and simulated lights, have none: nothing is taken off.
+        The drift of a real light (`drifts`) since the reference, one quadratic over the gel, is removed from image,
+        gradient and height, where enough of the gel is untouched to measure it.
 
         Raises NoReference; StaleReference when the light is another; MarkersLost when too few markers are seen;
         ValueError for a frame of another shape.
@@ -175,7 +177,7 @@ class FrameNormaliser:
         height, gradient, flow, drift = self._surface(frame, seen)
         if drift is not None:
             change = np.subtract(change, drift, out=drift)
-            change[self._off_image] = 0.0  # what is not seen has no drift either
+            change[self._off_image] = 0.0
         return TactileObservation(
             image=_byte_image(change),
             gradient=gradient,
@@ -202,12 +204,12 @@ class FrameNormaliser:
             self._check(frame.surface)
             return frame.surface.height, frame.surface.gradient, frame.surface.flow, None
         height = gradient = flow = removed = None
-        self._sought = any(part is not None for part in (self._find, self._markers, self._watched))
-        if self._watched is not None:
-            drift = self._watched(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
-            if drift.told:
-                self._drift = size_of(self._watched.at(drift))
-                removed = self._watched.part(drift, (0, 0), self._on_image.shape)
+        self._sought = any(part is not None for part in (self._find, self._markers, self._find_drift))
+        if self._find_drift is not None:
+            drift = self._find_drift(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
+            if drift.measured:
+                self._drift = size_of(self._find_drift.at(drift))
+                removed = self._find_drift.part(drift, (0, 0), self._on_image.shape)
         if self._find is not None:
             assert self._reference is not None
             found = self._find(change, self._reference.relative)
@@ -223,19 +225,19 @@ class FrameNormaliser:
 
     def _require_light(self) -> None:
         """Raises StaleReference."""
-        for told, limit, words in (
-            (self._background, LOST, "slopes of {:.0f} degrees"),
+        for measured, limit, words in (
+            (self._background, LOST_SLOPE, "slopes of {:.0f} degrees"),
             (self._drift, LOST_COLOUR, "{:.0%} of its colour"),
         ):
-            if told is not None and told > limit:
+            if measured is not None and measured > limit:
                 raise StaleReference(
-                    f"the untouched gel differs from its reference by {words.format(told)}: nothing can be told by it. "
-                    "Is a lamp out, or the exposure another? If not, take a fresh reference (Rig.reset does)"
+                    f"the untouched gel differs from its reference by {words.format(measured)}, too much to measure by "
+                    "it. Is a lamp out, or the exposure another? If not, take a fresh reference (Rig.reset does)"
                 )
 
     def _contact(self, change: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference. It misses the
-        flat middle of a contact, whose slope and colour are those of the untouched gel: only height knows it."""
+        """(h, w) where the colour, averaged over a cell and its neighbours, differs from the reference: not in the
+        flat middle of a contact, which has the colour of the untouched gel."""
         import cv2
 
         cell = _cells(change, self._grid).mean(axis=(1, 3), dtype=np.float32)

@@ -1,9 +1,9 @@
 """The reference image I0: what a sensor shows without contact. A fresh one matters more than any formula.
 
-A picture cannot say that nothing touches: a wide flat contact looks like none, and a change of light like a contact.
+A picture alone cannot show that nothing touches: a wide flat contact looks like none, a change of light like a contact.
 So a new reference is taken only where the arms' motion makes it certain: clear of everything at the start of an episode
 (`Rig.reset`), lifted off before each touch of a fixed ball (`tacsim calibrate touch`), or when a person says so.
-Between these moments the background of each picture tells how far the light has drifted (:mod:`calibration.drift`).
+Between these moments the untouched gel in each picture shows how far the light has drifted (:mod:`calibration.drift`).
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 
 SATURATED = 250.0  # a channel at or above this has lost its signal [grey levels]
-MOST_SATURATED = 0.05  # share of the gel that may be saturated; ten real sensors show 0 to 0.001
-DARKEST = 8.0  # mean grey level of each channel over the gel; below, noise and rounding are all there is
-
-
-STALE = 2.0  # background slopes that a reference which still fits never shows; real sensors: 0.3 to 0.7 [degrees]
-STALE_COLOUR = 0.05  # the same of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
-LOST = 20.0  # background slopes that no drift of a working light makes [degrees]
-LOST_COLOUR = 0.5  # the same of the colour [-]
-EXCHANGED = 0.5  # red and blue are exchanged if the picture is then so much nearer to the one it should be like
-ANOTHER = 0.02  # pictures that differ by less, each colour relative to its mean, are alike as they are [-]
-COARSE = 8  # pixels, each way, over which that is averaged
+MAX_SATURATED_SHARE = 0.05  # of the gel; ten real sensors show 0 to 0.001
+MIN_MEAN_LEVEL = 8.0  # of each channel over the gel; below, noise and rounding prevail [grey levels]
+# A reference is stale beyond, ...
+STALE_SLOPE = 2.0  # slope of the untouched gel; real sensors: 0.3 to 0.7 [degrees]
+STALE_COLOUR = 0.05  # change of the untouched gel's colour: a lamp's gain scales slopes and may tilt nothing [-]
+# ... and the light is another beyond:
+LOST_SLOPE = 20.0  # [degrees]
+LOST_COLOUR = 0.5  # [-]
+# Red and blue are exchanged
+EXCHANGED_RATIO = 0.5  # if that brings the picture so much nearer to the known one
+ALIKE = 0.02  # unless it is this near already, each colour relative to its mean [-]
+BLOCK = 8  # side of the blocks that are compared [px]
 
 
 class UnusableReference(ValueError):
-    """A reference image that nothing can be measured against."""
+    """A reference image that cannot be measured against."""
 
 
 class StaleReference(RuntimeError):
-    """The light is so far from what it was at the reference that nothing can be told any more."""
+    """The light has changed so much since the reference that nothing can be measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """I0 and its mean. Make it by :func:`make_reference`."""
+    """I0 and its mean, made by :func:`make_reference`."""
 
     image: Float32  # (H, W, 3) rectified, 0..255
     mean: Float32  # (3,) over the gel
     relative: Float32  # (H, W, 3) I0 / mean(I0) [-]
     valid: NDArray[np.bool_]  # (H, W)
-    scale: Float32  # (H, W, 3) 1 / mean where valid, else 0: one product instead of a division and a mask
+    scale: Float32  # (H, W, 3) 1 / mean where valid, else 0
 
     def difference(self, image: Float32) -> Float32:
         """(H, W, 3) relative change (I - I0) / mean(I0) of a rectified image [-]; 0 where not valid.
@@ -74,16 +75,16 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
     if not np.isfinite(gel).all():
         raise UnusableReference("reference is not finite")
     mean = gel.mean(axis=0)
-    if (mean < DARKEST).any():
+    if (mean < MIN_MEAN_LEVEL).any():
         raise UnusableReference(
-            f"reference is dark: mean R, G, B over the gel {_levels(mean)}, at least {DARKEST:g} each; are the "
+            f"reference is dark: mean R, G, B over the gel {_levels(mean)}, at least {MIN_MEAN_LEVEL:g} each; are the "
             "sensor's lights on, and is the exposure right?"
         )
     saturated = float((gel >= SATURATED).any(axis=1).mean())
-    if saturated > MOST_SATURATED:
+    if saturated > MAX_SATURATED_SHARE:
         raise UnusableReference(
-            f"reference is saturated on {saturated:.1%} of the gel, at most {MOST_SATURATED:.0%}: shorten the exposure "
-            "or dim the lights"
+            f"reference is saturated on {saturated:.1%} of the gel, at most {MAX_SATURATED_SHARE:.0%}: shorten the "
+            "exposure or dim the lights"
         )
     mean = mean.astype(np.float32)
     scale = np.where(valid[..., None], 1.0 / mean, 0.0).astype(np.float32)
@@ -93,20 +94,20 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
 def exchanged(image: Float32, known: Float32, valid: NDArray[np.bool_]) -> bool:
     """True when an image (H, W, 3) is like the `known` one of the same gel only with red and blue exchanged.
 
-    What counts is where on the gel each colour is bright: a dimmer lamp or another white balance changes nothing. Where
-    all colours are equally even, nothing is told, and the answer is no.
+    What counts is where on the gel each colour is bright, not the lamps' gain or the white balance. False where all
+    colours are equally even.
     """
     one, other = (_pattern(picture, valid) for picture in (image, known))
     apart = float(np.sqrt(((one - other) ** 2).mean()))
-    turned = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
-    return apart > ANOTHER and turned < EXCHANGED * apart
+    exchanged_apart = float(np.sqrt(((one[:, ::-1] - other) ** 2).mean()))
+    return apart > ALIKE and exchanged_apart < EXCHANGED_RATIO * apart
 
 
 def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
-    """(n, 3) how bright each part of the gel is in each colour, relative to all of it."""
+    """(n, 3) brightness of each block of the gel in each colour, relative to the mean."""
     import cv2
 
-    size = (valid.shape[1] // COARSE, valid.shape[0] // COARSE)
+    size = (valid.shape[1] // BLOCK, valid.shape[0] // BLOCK)
     whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     parts = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))[whole]
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)

@@ -17,13 +17,13 @@ from tacsim.optics.render import shade, untouched_image
 
 Float32 = NDArray[np.float32]
 
-STEEPEST = 1.5  # slopes that a table knows: up to here along each axis [-]
-STEP = 0.02  # of the slopes at which a table's light is evaluated [-]
-CELLS = 48  # of a table along each colour
-NOISE = 0.02  # relative change of colour that means nothing: a camera's noise [-]
-PRIOR = 0.5  # usual slope: where colour tells nothing, a small slope is likelier than a steep one [-]
-FOREIGN = 0.2  # a colour farther than this from all that the light can make belongs to no known slope [-]
-MARGIN = 0.08  # of a table beyond the colours of its light [-]
+MAX_SLOPE = 1.5  # along each axis [-]
+SLOPE_STEP = 0.02  # between the slopes at which the light is evaluated [-]
+CELLS = 48  # along each colour
+COLOUR_NOISE = 0.02  # standard deviation of the relative change of colour: a camera's noise [-]
+SLOPE_PRIOR = 0.5  # standard deviation of slopes: where colours do not decide, the smaller slope is likelier [-]
+FOREIGN = 0.2  # distance of a colour from all that the light can make, beyond which it belongs to no slope [-]
+MARGIN = 0.08  # of the table beyond the colours of its light [-]
 
 
 class GradientModel(Protocol):
@@ -68,8 +68,8 @@ class ColourTable:
             part *= colour
             slope += part
         steep = np.abs(slope)
-        beyond |= np.maximum(steep[0], steep[1]) > STEEPEST
-        np.clip(slope, -STEEPEST, STEEPEST, out=slope)
+        beyond |= np.maximum(steep[0], steep[1]) > MAX_SLOPE
+        np.clip(slope, -MAX_SLOPE, MAX_SLOPE, out=slope)
         beyond |= self.foreign.take(flat).reshape(shape)
         return np.moveaxis(slope, 0, -1), beyond
 
@@ -92,8 +92,8 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
     base = np.array(background, dtype=np.float32)
     if not (base > 0).all():
         raise ValueError(f"lighting: the untouched gel is black in a channel {background}; no change is relative to it")
-    steps = round(STEEPEST / STEP)
-    line = (np.arange(-steps, steps + 1) * STEP).astype(np.float32)
+    steps = round(MAX_SLOPE / SLOPE_STEP)
+    line = (np.arange(-steps, steps + 1) * SLOPE_STEP).astype(np.float32)
     slopes = np.stack(np.meshgrid(line, line), axis=-1)
     flat = shade(np.zeros((1, 1, 2), dtype=np.float32), lighting)
 
@@ -102,9 +102,9 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
         return relative
 
     colours = seen(slopes)
-    shifts = np.eye(2, dtype=np.float32) * np.float32(STEP / 2)
-    by_slope = np.stack([seen(slopes + shift) - seen(slopes - shift) for shift in shifts], axis=-1) / STEP
-    if float(np.linalg.svd(by_slope[steps, steps], compute_uv=False)[1]) < NOISE / PRIOR:
+    shifts = np.eye(2, dtype=np.float32) * np.float32(SLOPE_STEP / 2)
+    by_slope = np.stack([seen(slopes + shift) - seen(slopes - shift) for shift in shifts], axis=-1) / SLOPE_STEP
+    if float(np.linalg.svd(by_slope[steps, steps], compute_uv=False)[1]) < COLOUR_NOISE / SLOPE_PRIOR:
         raise ValueError(
             "lighting: the colour of the gel does not tell its slope along both axes, so no height can be found; "
             "it needs lights from at least two sides, in different colours"
@@ -116,7 +116,9 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
     nearest, foreign = _likeliest(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
     jacobian = by_slope.reshape(-1, 3, 2)[nearest].astype(np.float64)
     transposed = jacobian.transpose(0, 2, 1)
-    matrix = np.linalg.solve(transposed @ jacobian + (NOISE / PRIOR) ** 2 * np.eye(2), transposed)  # (n, 2, 3)
+    matrix = np.linalg.solve(
+        transposed @ jacobian + (COLOUR_NOISE / SLOPE_PRIOR) ** 2 * np.eye(2), transposed
+    )  # (n, 2, 3)
     offset = slopes.reshape(-1, 2)[nearest] - np.einsum("nij,nj->ni", matrix, colours.reshape(-1, 3)[nearest])
     maps = np.concatenate([offset, matrix.transpose(0, 2, 1).reshape(-1, 6)], axis=1).astype(np.float32)
     return ColourTable(low.astype(np.float32), scale.astype(np.float32), maps, foreign)
@@ -129,9 +131,9 @@ def _likeliest(colours: Float32, slopes: Float32, middles: Float32) -> tuple[NDA
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import KDTree
 
-    tree = KDTree(np.concatenate([colours / NOISE, slopes / PRIOR], axis=1))
-    asked = np.concatenate([middles / NOISE, np.zeros((len(middles), 2))], axis=1)
-    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=FOREIGN / NOISE)
+    tree = KDTree(np.concatenate([colours / COLOUR_NOISE, slopes / SLOPE_PRIOR], axis=1))
+    asked = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
+    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=FOREIGN / COLOUR_NOISE)
     foreign = ~np.isfinite(distance)
     where = distance_transform_edt(foreign.reshape(CELLS, CELLS, CELLS), return_distances=False, return_indices=True)
     native = np.ravel_multi_index(tuple(where.reshape(3, -1)), (CELLS, CELLS, CELLS))

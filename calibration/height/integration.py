@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
 
-RIM = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
+UNTOUCHED_RIM = 0.5e-3  # width of the band along the border of the view that counts as untouched [m]
 
 
 class Integrator:
@@ -24,15 +24,15 @@ class Integrator:
         eigenvalue = along_y[:, None] + along_x[None, :]
         eigenvalue[0, 0] = 1.0
         inverse = pitch / eigenvalue
-        inverse[0, 0] = 0.0  # slopes know no constant
+        inverse[0, 0] = 0.0  # slopes determine no constant
         self._inverse = inverse.astype(np.float32)
-        self._rim = np.flatnonzero(_border(shape, max(1, round(RIM / pitch))))
+        self._rim = np.flatnonzero(_border(shape, max(1, round(UNTOUCHED_RIM / pitch))))
 
     def __call__(self, gradient: Float32) -> Float32:
         """(rows, columns) height [m] of slopes (rows, columns, 2) along x, y [-].
 
-        Slopes say nothing of the constant: it is chosen so that the median along the border of the view is zero. The
-        median, not the least: one bulge, or a contact that reaches the border on one side, does not move it.
+        The constant is chosen so that the median along the border of the view is zero: one bulge, or a contact that
+        reaches the border on one side, does not move it.
         """
         from scipy.fft import dctn, idctn
 

@@ -21,8 +21,8 @@ Float64 = NDArray[np.float64]
 
 DEGREE = 3
 TERMS = 56
-GAIN = 2.4  # brings changes of colour to about -2..2, the size of x and y
-ROOM = 1.1  # slopes up to this times the steepest calibrated one are believed
+COLOUR_SCALE = 2.4  # brings changes of colour to about -2..2, the size of x and y
+EXTRAPOLATION = 1.1  # slopes reach up to this times the steepest calibrated one
 RIDGE = 1e-6  # times the number of pixels
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
@@ -39,13 +39,13 @@ class PolynomialSlopes:
     """An inverse model made ready for pixels at places x, y (H, W) in -1..1 across the sensor's own image."""
 
     def __init__(self, model: InverseModel, x: Float64, y: Float64) -> None:
-        self._steepest = ROOM * model.steepest
+        self._steepest = EXTRAPOLATION * model.steepest
         colours = [powers for powers in _colour_powers() if powers]
         self._powers: list[tuple[int, ...]] = [(), *colours]
         maps = {powers: np.zeros((2, *x.shape)) for powers in self._powers}
         for (colour, place), weight in zip(_terms(), model.weights, strict=True):
             at = np.prod([(x, y)[axis] for axis in place], axis=0) if place else np.ones_like(x)
-            maps[colour] += np.array(weight)[:, None, None] * at * GAIN ** len(colour)
+            maps[colour] += np.array(weight)[:, None, None] * at * COLOUR_SCALE ** len(colour)
         self._maps = {powers: grid.astype(np.float32) for powers, grid in maps.items()}
 
     def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
@@ -71,7 +71,7 @@ class PolynomialSlopes:
 
 def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:
     """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1; each term lies together in memory."""
-    inputs = np.stack([*(GAIN * change).T, x, y])
+    inputs = np.stack([*(COLOUR_SCALE * change).T, x, y])
     found: dict[tuple[int, ...], int] = {}
     terms = np.empty((TERMS, len(x)))
     for row, (colour, place) in enumerate(_terms()):

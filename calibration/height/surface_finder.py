@@ -1,7 +1,7 @@
 """Change of colour over a sensor's view -> height and gradient on the canonical grid.
 
 The view is wider than the canonical image: all of the gel that the camera sees. Slopes are integrated over all of it,
-because its border, farther from the contact, is the best zero there is.
+because its border, farther from the contact, is the best zero.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.drift import THIN, DriftFinder, size_of
+from calibration.drift import STRIDE, DriftFinder, size_of
 from calibration.height.colour_table import GradientModel
 from calibration.height.integration import Integrator
 from calibration.lens.rectification import seen_box
@@ -23,22 +23,22 @@ from tacsim.optics.grid import PixelGrid, canonical_image
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-INK = 0.6  # a pixel darker than this in all channels, relative to the mean of the gel, shows a printed dot
-DOT_RIM = 1  # pixels round a dot that its blurred edge reaches
-BRIDGE = 1.5  # slopes under a dot are those around it, weighted by a Gaussian so wide [px]
-PROBE = 0.02  # change of colour by which the slopes that it stands for are told [-]
+INK_LEVEL = 0.6  # a printed dot is darker in all channels, relative to the mean of the gel [-]
+DOT_RIM = 1  # width of the blurred edge of a dot [px]
+FILL_WIDTH = 1.5  # slopes under a dot are the mean of those around, weighted by a Gaussian of this deviation [px]
+COLOUR_STEP = 0.02  # of the finite differences of slope by colour [-]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundSurface:
-    """What a picture tells of the gel surface, on the canonical grid."""
+    """The gel surface found in a picture, on the canonical grid."""
 
     height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
     gradient: Float32  # (h, w, 2) [-]
     beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
-    drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it to tell
-    background: float | None  # mean angle of the slopes that this change would be taken for [degrees]
-    removed: Float32 | None  # (H, W, 3) part of the canonical image's change that is drift; None: none told or removed
+    drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it
+    background: float | None  # mean angle of the slopes that this change would look like [degrees]
+    removed: Float32 | None  # (H, W, 3) drift in the canonical image's change; None: not measured, or not removed
 
 
 class SurfaceFinder:
@@ -48,8 +48,7 @@ class SurfaceFinder:
         slopes: the inverse of its light, on the pixels of :func:`seen_box`.
         valid: (H, W) of :func:`view`, as the rectification gives it.
         dots: dots are printed on the gel.
-        drifts: the light changes in time, as that of any real sensor; what changes where nothing touches is removed.
-            It is measured in any case: see `FoundSurface.background`.
+        drifts: the light is real and drifts: the drift, which is measured in any case, is removed.
     """
 
     def __init__(
@@ -76,19 +75,19 @@ class SurfaceFinder:
         if self._known is None or self._known.picture is not reference:
             self._known = self._prepared(reference)
         known, hidden = self._known, self._known.hidden
-        planes = np.empty((3, *self._unseen.shape), dtype=np.float32)  # work on planes is several times as fast
+        planes = np.empty((3, *self._unseen.shape), dtype=np.float32)  # planes are several times as fast as pixels
         for channel in range(3):
             np.multiply(change[(*self._box, channel)], known.gain[channel], out=planes[channel])
         if self._dots:
             hidden = hidden | _ink(known.planes + planes)
         drift = self._drift(planes, hidden)
-        changed = self._drift.at(drift) if drift.told else None
+        changed = self._drift.at(drift) if drift.measured else None
         if self._drifts:
             self._drift.remove(planes, drift)
         gradient, beyond = self._slopes(np.moveaxis(planes, 0, -1))
         by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
         if self._dots:
-            _bridge((by_x, by_y), hidden)
+            _fill((by_x, by_y), hidden)
         if self._any_unseen:
             by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
         height = self._integrate(np.stack([by_x, by_y], axis=-1))
@@ -99,14 +98,14 @@ class SurfaceFinder:
             drift=None if changed is None else size_of(changed),
             background=None if changed is None else self._angle(changed),
             removed=self._drift.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
-            if self._drifts and drift.told
+            if self._drifts and drift.measured
             else None,
         )
 
     def _angle(self, change: Float32) -> float:
-        """Mean angle [degrees] over the gel of the slopes that changes of colour (n, 3) at every THIN-th pixel are."""
+        """Mean angle [degrees] of the slopes that changes of colour (n, 3) at every STRIDE-th pixel look like."""
         slope = np.einsum("nsc,nc->ns", self._response, change)
-        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::THIN, ::THIN].ravel()]
+        steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::STRIDE, ::STRIDE].ravel()]
         return float(np.degrees(np.arctan(steepness)).mean())
 
     def _prepared(self, picture: Float32) -> _Known:
@@ -156,28 +155,28 @@ def _ink(relative: Float32) -> Mask:
     """(H, W) where an image (3, H, W) relative to the mean of the gel shows a printed dot."""
     import cv2
 
-    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < INK).view(np.uint8)
+    dark = (np.maximum(np.maximum(relative[0], relative[1]), relative[2]) < INK_LEVEL).view(np.uint8)
     side = 2 * DOT_RIM + 1
     return np.asarray(cv2.dilate(dark, np.ones((side, side), dtype=np.uint8))).view(np.bool_)
 
 
 def _response(slopes: GradientModel, shape: tuple[int, int]) -> Float32:
-    """(n, 2, 3) how the slope answers to a small change of colour, at every THIN-th row and column."""
+    """(n, 2, 3) derivative of the slope by colour, at every STRIDE-th row and column."""
     answers = []
     for channel in range(3):
         change = np.zeros((*shape, 3), dtype=np.float32)
-        change[..., channel] = PROBE
+        change[..., channel] = COLOUR_STEP
         up, down = slopes(change)[0], slopes(-change)[0]
-        answers.append(((up - down) / (2 * PROBE))[::THIN, ::THIN].reshape(-1, 2))
+        answers.append(((up - down) / (2 * COLOUR_STEP))[::STRIDE, ::STRIDE].reshape(-1, 2))
     return np.stack(answers, axis=-1)
 
 
-def _bridge(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
-    """Gives planes of slopes (H, W) in the hidden pixels a weighted mean of what surrounds these."""
+def _fill(slopes: tuple[Float32, Float32], hidden: Mask) -> None:
+    """Sets planes of slopes (H, W) in the hidden pixels to a weighted mean of those around."""
     import cv2
 
-    told = (~hidden).astype(np.float32)
-    total = np.maximum(cv2.GaussianBlur(told, (0, 0), BRIDGE), np.float32(1e-6))
+    known = (~hidden).astype(np.float32)
+    total = np.maximum(cv2.GaussianBlur(known, (0, 0), FILL_WIDTH), np.float32(1e-6))
     for slope in slopes:
-        around = cv2.GaussianBlur(slope * told, (0, 0), BRIDGE)
+        around = cv2.GaussianBlur(slope * known, (0, 0), FILL_WIDTH)
         np.copyto(slope, around / total, where=hidden)

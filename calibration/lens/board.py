@@ -1,7 +1,7 @@
 """Boards whose points are known, found in pictures: dots in a rectangular lattice, and ChArUco.
 
-Dots may be printed, or pressed into a gel, and blurred: they are looked for as whatever is darker than its surroundings
-at one scale, and several scales are tried.
+Dots may be printed, or pressed into a gel, and blurred: they are whatever is darker than its surroundings at one of
+several scales.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from calibration.errors import CalibrationError
 from tacsim.interface import FloatArray
 from tacsim.models.quantity import parse
 
-SCALES = (2.0, 3.0, 5.0, 8.0, 12.0)  # of dots: standard deviation of the blur that shows them best [px]
-MOST = 100  # points along a board
-FEWEST_CORNERS = 6  # of a ChArUco board
-BEYOND = 0.5  # part of a border beyond which further dots lie: then the board is larger than said
-STRONG = 0.4  # of a usual dot's contrast: what is weaker is no dot
-SAME = 0.35  # of the distance of two dots: so near is the same place
+DOT_BLURS = (2.0, 3.0, 5.0, 8.0, 12.0)  # standard deviations of the blurs that are tried, for dots of any size [px]
+MAX_POINTS = 100  # along a board
+MIN_CORNERS = 6  # of a ChArUco board
+MAX_BEYOND = 0.5  # share of a border with further dots beyond it: more, and the board is larger than said
+MIN_CONTRAST = 0.4  # of a dot's pixels, share of its maximum
+SAME_PLACE = 0.35  # distance of two points at the same place [distance of neighbours]
 
 
 class BadBoard(CalibrationError):
-    """A board that is described wrongly, or not found."""
+    """A board is described wrongly, or not found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ def parse_board(text: str) -> Board:
             "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], such as 'charuco:8x6:3 mm:2.2 mm:DICT_4X4_50'"
         )
     columns, rows = int(size[1]), int(size[2])
-    if not (3 <= columns <= MOST and 3 <= rows <= MOST):
-        raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {MOST} each way")
+    if not (3 <= columns <= MAX_POINTS and 3 <= rows <= MAX_POINTS):
+        raise BadBoard(f"'{text}': {columns} x {rows}; allowed: 3 to {MAX_POINTS} each way")
     try:
         metres = [parse(length, "length") for length in lengths]
     except ValueError as error:
@@ -77,7 +77,7 @@ def parse_board(text: str) -> Board:
     if board.kind == "charuco":
         board = replace(board, marker=metres[1], dictionary=parts[4] if len(parts) == 5 else board.dictionary)
     if board.kind == "charuco":
-        _charuco(board)  # an unknown dictionary is told now
+        _charuco(board)  # refuses an unknown dictionary now
     return board
 
 
@@ -98,7 +98,7 @@ def _find_dots(image: NDArray[np.uint8], board: Board, reference: NDArray[np.uin
     if reference is not None:
         grey -= reference.mean(axis=2, dtype=np.float32)
     most = 0
-    for scale in SCALES:
+    for scale in DOT_BLURS:
         around = cv2.GaussianBlur(grey, (0, 0), 3.0 * scale)
         contrast = np.asarray(around - cv2.GaussianBlur(grey, (0, 0), scale), dtype=np.float64)
         found = _lattice(contrast, board)
@@ -150,11 +150,11 @@ def _lattice(contrast: FloatArray, board: Board) -> tuple[FloatArray, FloatArray
 
 
 def _even(lattice: FloatArray) -> bool:
-    """True if each step from dot to dot is much like the one before: OpenCV at times takes a dot of the next row."""
+    """True if each step from dot to dot is much like the one before: OpenCV may take a dot of the next row."""
     for axis in (0, 1):
         steps = np.diff(lattice, axis=axis)
         change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
-        if (change > SAME * np.linalg.norm(steps, axis=-1).mean()).any():
+        if (change > SAME_PLACE * np.linalg.norm(steps, axis=-1).mean()).any():
             return False
     return True
 
@@ -168,8 +168,8 @@ def _require_whole(lattice: FloatArray, blobs: FloatArray, board: Board) -> None
     for grid in (lattice, lattice[::-1], lattice.swapaxes(0, 1), lattice[:, ::-1].swapaxes(0, 1)):
         beyond = 2.0 * grid[0] - grid[1]
         near = np.linalg.norm(beyond[:, None] - blobs[None], axis=-1).min(axis=1)
-        there = near < SAME * np.linalg.norm(grid[0] - grid[1], axis=-1)
-        if there.mean() > BEYOND:
+        there = near < SAME_PLACE * np.linalg.norm(grid[0] - grid[1], axis=-1)
+        if there.mean() > MAX_BEYOND:
             raise BadBoard(
                 f"the picture shows more dots than {board.columns} x {board.rows}: {int(there.sum())} lie beyond one "
                 "border. Count again: all dots that are seen belong to the board"
@@ -193,7 +193,7 @@ def _centred(contrast: FloatArray, lattice: FloatArray) -> FloatArray:
             patch = cv2.getRectSubPix(
                 contrast.astype(np.float32), (2 * side + 1, 2 * side + 1), (float(place[0]), float(place[1]))
             )
-            weight = np.maximum(np.asarray(patch, dtype=np.float64) - STRONG * float(patch.max()), 0.0)
+            weight = np.maximum(np.asarray(patch, dtype=np.float64) - MIN_CONTRAST * float(patch.max()), 0.0)
             rows, columns = np.mgrid[-side : side + 1, -side : side + 1]
             move = np.array([(weight * columns).sum(), (weight * rows).sum()]) / max(float(weight.sum()), 1e-12)
             place = place + move
@@ -224,11 +224,11 @@ def _find_charuco(image: NDArray[np.uint8], board: Board) -> Points:
     found: Any = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
     corners, names, _, markers = found  # each None where nothing is seen
     count = 0 if names is None else len(names)
-    if count < FEWEST_CORNERS:
+    if count < MIN_CORNERS:
         seen = 0 if markers is None else len(markers)
         raise BadBoard(
             f"the board ({board}, {board.dictionary}) is not found: {count} of its corners and {seen} markers are "
-            f"seen, {FEWEST_CORNERS} corners are needed. Is it this board, and in focus?"
+            f"seen, {MIN_CORNERS} corners are needed. Is it this board, and in focus?"
         )
     every = np.asarray(printed.getChessboardCorners(), dtype=np.float64)[:, :2]
     order = np.ravel(names)

@@ -18,7 +18,7 @@ from calibration.lens.view import Corners, GelView, check_corners
 from tacsim.models.sensor import SensorGeometry
 from tacsim.optics.grid import PixelGrid, image_grid
 
-LARGEST_FACTOR = 16  # look-ups along each side of one canonical pixel
+MAX_FACTOR = 16  # look-ups along each side of one canonical pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +65,7 @@ class Rectification:
         anyway; an empty fraction where all are whole pixels), and which of them are not valid (None: all are)."""
         import cv2
 
-        rows, columns = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
-        box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        box = seen_box(self.valid)
         finer = tuple(slice(side.start * self.factor, side.stop * self.factor) for side in box)
         look_ups, fraction = cv2.convertMaps(self.pixels[finer], np.empty(0, dtype=np.float32), cv2.CV_16SC2)
         hidden = ~self.valid[box]
@@ -152,9 +151,9 @@ def _factor(pixels: NDArray[np.float64]) -> int:
 
 
 def _limited(factor: int) -> int:
-    if factor > LARGEST_FACTOR:
+    if factor > MAX_FACTOR:
         raise ValueError(
-            f"the native image has {factor} pixels along one canonical pixel, at most {LARGEST_FACTOR} are averaged; "
+            f"the native image has {factor} pixels along one canonical pixel, at most {MAX_FACTOR} are averaged; "
             "check the gel's size and the canonical pitch [m]"
         )
     return max(factor, 1)

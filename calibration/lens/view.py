@@ -1,8 +1,8 @@
 """Where points of space and of the gel's plane appear in a camera's picture: lens, and view of the plane.
 
 A lens is calibrated from several pictures of one board, tilted in many ways. The view of a gel's plane needs one
-picture of a board that lies on it: a perspective, through the lens if it is known; if not, radial distortion is fitted
-along, as far as dots that are left out are predicted better by it.
+picture of a board that lies on it: a perspective through the lens, or if that is unknown with as much radial distortion
+as predicts left-out dots better.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from tacsim.interface import FloatArray, Pose
 from tacsim.models.quantity import Config, Length
 from tacsim.models.sensor import SensorGeometry
 
-FEWEST_PICTURES = 6  # for a lens
-LARGEST_RESIDUAL = 1.5  # of a lens, root mean square [px]
-LARGEST_DOUBT = 0.03  # standard deviation of the focal length over itself
-LEAST_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]
-LARGEST_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
-FEWEST_POINTS = 6  # of a plane
+MIN_PICTURES = 6  # for a lens
+MAX_RESIDUAL = 1.5  # of a lens, root mean square [px]
+MAX_FOCAL_DEVIATION = 0.03  # relative standard deviation of the focal length
+MIN_TILT = np.radians(8.0)  # of the board between pictures, root mean square [rad]
+MAX_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
+MIN_POINTS = 6  # of a plane
 
-Side = Annotated[int, Field(ge=16, le=8192)]
+PixelCount = Annotated[int, Field(ge=16, le=8192)]
 Positive = Annotated[Length, Field(gt=0)]
 Pair = tuple[float, float]
 Corners = tuple[Pair, Pair, Pair, Pair]
 
 
 class BadView(CalibrationError):
-    """Pictures of a board that tell no lens, or no plane."""
+    """Pictures of a board determine no lens, or no plane."""
 
 
 class BadCorners(CalibrationError):
-    """The four corners are no picture of a rectangle."""
+    """The four corners are not those of a rectangle in a picture."""
 
 
 class Lens(Config):
     """A pinhole with distortion (Brown's model, as OpenCV has it)."""
 
-    width: Side  # of the picture [px]
-    height: Side
+    width: PixelCount  # of the picture [px]
+    height: PixelCount
     focal: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]  # fx, fy [px]
     centre: Pair  # cx, cy [px]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
@@ -116,8 +116,8 @@ def _seen(perspective: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def pinhole(image_shape: tuple[int, int], distortion: Sequence[float] = ()) -> Lens:
-    """A lens of which nothing is known: pixels over the picture's longer side, from its middle. `distortion`: k1, k2,
-    and how far from the picture's middle its centre is, over the longer side."""
+    """A lens of which nothing is known, with the picture's longer side for its focal length. `distortion`: k1, k2, and
+    its centre from the picture's middle, over the longer side."""
     rows, columns = image_shape
     k1, k2, off_x, off_y = (*distortion, 0.0, 0.0, 0.0, 0.0)[:4]
     side = float(max(rows, columns))
@@ -134,9 +134,9 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
     """The lens from several pictures of one board, and each picture's residual [px]. Raises BadView."""
     import cv2
 
-    if len(pictures) < FEWEST_PICTURES:
+    if len(pictures) < MIN_PICTURES:
         raise BadView(
-            f"{len(pictures)} picture(s) of a board are too few for a lens; at least {FEWEST_PICTURES} are needed, 12 "
+            f"{len(pictures)} picture(s) of a board are too few for a lens; at least {MIN_PICTURES} are needed, 12 "
             "are good, with the board tilted by 20 to 40 degrees to all sides, and in all corners of the picture"
         )
     rows, columns = image_shape
@@ -148,25 +148,25 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
     )
     residual, matrix, distortion, turns, _, doubt, _, each = answer
     found = dict(zip(pictures, np.ravel(each).tolist(), strict=True))
-    if not residual <= LARGEST_RESIDUAL:
+    if not residual <= MAX_RESIDUAL:
         worst = max(found, key=found.__getitem__)
         raise BadView(
             f"the pictures do not fit one lens and one flat board: {residual:.2f} px root mean square, "
-            f"{LARGEST_RESIDUAL:g} at most (worst: {worst}, {found[worst]:.2f} px). Is the board flat, its size right, "
+            f"{MAX_RESIDUAL:g} at most (worst: {worst}, {found[worst]:.2f} px). Is the board flat, its size right, "
             "and the focus fixed?"
         )
     tilt = _tilt(Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2])
-    if not tilt >= LEAST_TILT:
+    if not tilt >= MIN_TILT:
         raise BadView(
             f"the board is tilted by only {np.degrees(tilt):.1f} degrees between pictures (root mean square), "
-            f"{np.degrees(LEAST_TILT):.0f} are needed to tell its distance from the focal length: tilt the board more, "
+            f"{np.degrees(MIN_TILT):.0f} are needed to tell its distance from the focal length: tilt the board more, "
             "by 20 to 40 degrees to all sides"
         )
-    unsure = float(np.max(np.ravel(doubt)[:2] / np.diag(matrix)[:2]))
-    if not unsure <= LARGEST_DOUBT:
+    uncertainty = float(np.max(np.ravel(doubt)[:2] / np.diag(matrix)[:2]))
+    if not uncertainty <= MAX_FOCAL_DEVIATION:
         raise BadView(
-            f"the focal length is unsure by {unsure:.0%} ({LARGEST_DOUBT:.0%} at most): tilt the board more, by 20 to "
-            "40 degrees to all sides"
+            f"the focal length is uncertain by {uncertainty:.0%} ({MAX_FOCAL_DEVIATION:.0%} at most): "
+            "tilt the board more, by 20 to 40 degrees to all sides"
         )
     k = [float(value) for value in np.ravel(distortion)[:5]]
     lens = Lens(
@@ -195,7 +195,7 @@ def board_pose(lens: Lens, points: Points) -> tuple[Pose, float]:
     known = (lens.matrix, np.array(lens.distortion))
     done, turn, shift = cv2.solvePnP(on_board, points.image, *known, flags=cv2.SOLVEPNP_IPPE)
     if not done:
-        raise BadView("the board's points tell no pose")
+        raise BadView("the board's points determine no pose")
     turn, shift = cv2.solvePnPRefineLM(on_board, points.image, *known, turn, shift)
     again, _ = cv2.projectPoints(on_board, turn, shift, *known)
     missed = np.asarray(again).reshape(-1, 2) - points.image
@@ -219,8 +219,8 @@ def fit_view(
 
     Raises BadView.
     """
-    if len(points.board) < FEWEST_POINTS:
-        raise BadView(f"{len(points.board)} points tell no plane; at least {FEWEST_POINTS} are needed")
+    if len(points.board) < MIN_POINTS:
+        raise BadView(f"{len(points.board)} points determine no plane; at least {MIN_POINTS} are needed")
     rows, columns = image_shape
     if lens is not None and (lens.height, lens.width) != image_shape:
         raise BadView(
@@ -230,15 +230,15 @@ def fit_view(
     middle = points.board.mean(axis=0)
     local: FloatArray = np.asarray(points.board - middle, dtype=np.float64)
     if lens is not None:
-        perspective, missed = _plane(lens, local, points.image), np.zeros(0)
+        perspective = _plane(lens, local, points.image)
     else:
         lens, perspective = _distorted(local, points.image, image_shape)
     missed = lens.project(_seen(perspective, local)) - points.image
     residual = float(np.sqrt((missed**2).sum(axis=1).mean()))
-    if not residual <= LARGEST_MISFIT * points.spacing:
+    if not residual <= MAX_MISFIT * points.spacing:
         raise BadView(
             f"the points lie on no plane that this camera could see: {residual:.2f} px root mean square, where "
-            f"neighbours are {points.spacing:.0f} px apart ({LARGEST_MISFIT:.0%} at most). Is the board flat on the "
+            f"neighbours are {points.spacing:.0f} px apart ({MAX_MISFIT:.0%} at most). Is the board flat on the "
             "gel, and its number of rows and columns right?"
         )
     back: FloatArray = np.asarray(np.linalg.inv(perspective), dtype=np.float64)
@@ -315,7 +315,7 @@ def _plane(lens: Lens, on_board: FloatArray, pixels: FloatArray) -> FloatArray:
     unit = float(np.abs(on_board).max())
     found, _ = cv2.findHomography(on_board / unit, lens.directions(pixels), 0)
     if found is None:
-        raise BadView("the points tell no plane; they lie on a line")
+        raise BadView("the points determine no plane; they lie on a line")
     perspective: FloatArray = np.asarray(found, dtype=np.float64) @ np.diag([1 / unit, 1 / unit, 1.0])
     return perspective
 

@@ -16,13 +16,13 @@ Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Entry = TypeVar("Entry", bound=np.generic)
 
-TILE = 32  # pixels, each way; what is wider is drift, not noise
-DARK = 2  # at or below, a channel has lost its noise [grey levels]
-FEWEST_TILES = 4
+TILE = 32  # side of the tiles; what is wider is drift, not noise [px]
+DARK = 2  # a channel at or below this has lost its noise [grey levels]
+MIN_TILES = 4
 
 
 class NoiseUnknown(ValueError):
-    """Noise cannot be told from these pictures: why, and what to do."""
+    """Noise cannot be measured in these pictures: why, and what to do."""
 
 
 def measure_noise(frames: Sequence[Image]) -> CameraNoise:
@@ -45,10 +45,10 @@ def measure_noise(frames: Sequence[Image]) -> CameraNoise:
     if not pairs:
         raise NoiseUnknown("the pictures without contact are all the same one; take them from the running camera")
     tiles = np.concatenate([_tiles(*pair) for pair in pairs])
-    if len(tiles) < FEWEST_TILES:
+    if len(tiles) < MIN_TILES:
         raise NoiseUnknown(
             f"only {len(tiles)} parts of {TILE} x {TILE} px are neither black nor saturated in all pictures without "
-            f"contact; {FEWEST_TILES} are needed"
+            f"contact; {MIN_TILES} are needed"
         )
     size = tiles.shape[1] * tiles.shape[2]
     square = np.einsum("nyxc,nyxd->ncd", tiles, tiles) / (2 * (size - 1))  # 2: both pictures are noisy

@@ -11,15 +11,18 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-LEVELS = (0.2, 0.35, 0.5)  # a dot takes at least such a share of the light round it; the higher part it from others
-FAINT = 0.15  # share of the light that the blurred edge of a dot takes at least
-LEAST_FILLED = 0.4  # share of its bounding box that a dot fills
-LARGEST = 2.5  # radius of the largest dot that is one, in radii of the usual one
-LEAST_AREA, LARGEST_AREA = 0.2, 7.0  # of one dot, in areas of the usual one: dots are painted over, and half hidden
-LONGEST = 2.0  # length of a dot in its breadth
-BLUR = 0.35  # of the picture before its dots are sought [radii]
-SMALLEST = 1.2  # radius of a dot that can be found [px]
-FIRST_KERNEL = 14  # the largest dot that is looked for where none is known: this part of the picture's shorter side
+DARKNESS = (
+    0.2,
+    0.35,
+    0.5,
+)  # share of the light round it that a dot takes at least; the higher ones part it from others
+EDGE_DARKNESS = 0.15  # the same of the blurred edge of a dot
+MIN_FILLED = 0.4  # share of its bounding box that a dot fills
+MAX_RADIUS = 2.5  # [radii]
+MIN_AREA, MAX_AREA = 0.2, 7.0  # of a dot, half hidden or painted over [areas of a disc]
+MAX_ELONGATION = 2.0  # length over breadth
+BLUR = 0.35  # of the picture [radii]
+MIN_RADIUS = 1.2  # of a dot that can be found [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,22 +43,22 @@ class DotFinder:
 
     The light that dots take is what a closing (the bright frame of each place) has beyond the picture itself, as a
     share: unlike a difference of Gaussians it sees no dot in the shadow side of a step of brightness, as every rim of
-    a contact has one. A centre is the mean of the dot's pixels, each weighted with its share beyond DARK.
+    a contact has one. A centre is the mean of the dot's pixels, each weighted with its darkness beyond its threshold.
     """
 
     def __init__(self, radius: float) -> None:
         """Raises ValueError for dots too small to be found."""
-        if not radius >= SMALLEST:
-            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {SMALLEST:g} px are needed")
+        if not radius >= MIN_RADIUS:
+            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
         self._area = np.pi * radius**2
         self._blur = BLUR * radius
-        self._side = 2 * int(np.ceil(LARGEST * radius)) + 1
+        self._side = 2 * int(np.ceil(MAX_RADIUS * radius)) + 1
 
     def __call__(self, image: Image) -> Dots:
         """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
         taken = light_taken(image, self._side, self._blur)
         found = []
-        for level in LEVELS:
+        for level in DARKNESS:
             dots, rest = self._blobs(taken, level)
             found.append(dots)
             if rest is None:
@@ -72,9 +75,11 @@ class DotFinder:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=kind)
         area = stats[:, cv2.CC_STAT_AREA]
         width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
-        large = area > LEAST_AREA * self._area
-        compact = (area < LARGEST_AREA * self._area) & (np.maximum(width, height) < LONGEST * np.minimum(width, height))
-        compact &= area > LEAST_FILLED * width * height
+        large = area > MIN_AREA * self._area
+        compact = (area < MAX_AREA * self._area) & (
+            np.maximum(width, height) < MAX_ELONGATION * np.minimum(width, height)
+        )
+        compact &= area > MIN_FILLED * width * height
         large[0] = False  # what is no blob
         good = large & compact
         where = np.flatnonzero(mask)
@@ -107,14 +112,14 @@ class DotEraser:
 
     def __init__(self, radius: float) -> None:
         """Raises ValueError for dots too small to be found."""
-        if not radius >= SMALLEST:
-            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {SMALLEST:g} px are needed")
-        self._side, self._blur = 2 * int(np.ceil(LARGEST * radius)) + 1, BLUR * radius
+        if not radius >= MIN_RADIUS:
+            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
+        self._side, self._blur = 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
 
     def __call__(self, image: Image) -> Image:
         """The picture (H, W, 3) without its dots."""
         import cv2
 
-        inked = (light_taken(image, self._side, self._blur) > FAINT).astype(np.uint8)
+        inked = (light_taken(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
         wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
         return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.lens.rectification import Rectification, seen_box
-from calibration.markers.dots import SMALLEST, DotFinder
+from calibration.markers.dots import MIN_RADIUS, DotFinder
 from calibration.markers.lattice import Lattice, NoLattice, find_lattice, spread, usual_pitch
 from calibration.markers.tracker import DotTracker
 from calibration.reference import UnusableReference
@@ -26,12 +26,12 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-RADIUS = 2.5  # of a dot on the grid on which dots are sought [px]
-MOST_MISSING = 0.3  # share of the dots in view that a reference may lack
-MOST_STRAY = 0.1  # dots beyond the lattice's rows and columns, in shares of its own
-PINHOLE_STEPS = 4
-FULL = 0.75  # share of its dots that a lattice nobody asked for must show
-LEAST_KEPT = 0.25  # share of the dots that must be seen for a flow
+DOT_RADIUS = 2.5  # on the grid on which dots are sought [px]
+MAX_MISSING = 0.3  # share of the dots in view that a reference may lack
+MAX_SURPLUS = 0.1  # dots beyond the lattice's rows and columns [number of its dots]
+PINHOLE_ITERATIONS = 4
+MIN_PRESENT = 0.75  # share of its dots that an unknown lattice must show
+MIN_VISIBLE = 0.25  # share of the dots that must be seen for a flow
 
 
 class NoMarkers(UnusableReference):
@@ -56,10 +56,10 @@ class MarkerFlow:
     ) -> None:
         """Raises ValueError when the image shows the dots too small, or no gel."""
         across = _native_pixels(rectify, grid)
-        if across * markers.radius < SMALLEST:
+        if across * markers.radius < MIN_RADIUS:
             raise ValueError(
                 f"markers of radius {markers.radius * 1e3:g} mm are {across * markers.radius:.2g} px in the image, at "
-                f"least {SMALLEST:g} px are needed to follow them; take a finer image, or markers: null"
+                f"least {MIN_RADIUS:g} px are needed to follow them; take a finer image, or markers: null"
             )
         self._markers, self._distance = markers, distance
         self._native = rectify.image_shape
@@ -98,11 +98,11 @@ class MarkerFlow:
             raise NoMarkers(f"the reference shows {len(points)} dots{apart}, not {expected}: {advice}") from nothing
         visible = self._in_view(lattice.positions)
         shown = int(lattice.present.sum())
-        if shown < max(4.0, (1.0 - MOST_MISSING) * visible.sum()):
+        if shown < max(4.0, (1.0 - MAX_MISSING) * visible.sum()):
             raise NoMarkers(f"the reference shows {shown} of {visible.sum()} dots in view of {expected}: {advice}")
-        if lattice.strays > MOST_STRAY * lattice.present.size:
+        if lattice.surplus > MAX_SURPLUS * lattice.present.size:
             raise NoMarkers(
-                f"the reference shows {lattice.strays} dots more than {expected}: give the true rows and columns"
+                f"the reference shows {lattice.surplus} dots more than {expected}: give the true rows and columns"
             )
         try:
             tracker = DotTracker(lattice.positions[lattice.present], lattice.pitch, self._in_view)
@@ -125,10 +125,10 @@ class MarkerFlow:
         seen = self._present.copy()
         seen[self._present] = tracked.seen
         self._seen = seen
-        if tracked.visible_share < LEAST_KEPT:
-            self._tracker.reset()  # what so few say is no motion to go on from
+        if tracked.visible_share < MIN_VISIBLE:
+            self._tracker.reset()  # so few say nothing of the motion
             raise MarkersLost(
-                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {LEAST_KEPT:.0%} are needed "
+                f"{tracked.seen.sum()} of {len(tracked.seen)} markers are seen, at least {MIN_VISIBLE:.0%} are needed "
                 "for a flow: is the light on, and the gel whole? If so, take a fresh reference"
             )
         moved = np.zeros_like(self._rest)
@@ -168,7 +168,7 @@ class MarkerFlow:
 
         assert self._distance is not None
         nothing, at = np.empty(0, dtype=np.float32), apparent
-        for _ in range(PINHOLE_STEPS):  # height is known where the dot is, not where it appears
+        for _ in range(PINHOLE_ITERATIONS):  # the height is that where the dot is, not where it appears
             pixel = ((at - (grid.x0, grid.y0)) / grid.pitch).astype(np.float32)
             deep = cv2.remap(height, pixel, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             at = apparent * (1.0 - np.asarray(deep, dtype=np.float64) / self._distance)[..., None]
@@ -176,8 +176,8 @@ class MarkerFlow:
 
 
 def marker_grid(markers: Markers, gel_size: tuple[float, float]) -> PixelGrid:
-    """All of the gel (x, y [m]), so fine that a dot's radius is RADIUS pixels."""
-    pitch = markers.radius / RADIUS
+    """All of the gel (x, y [m]), so fine that a dot's radius is DOT_RADIUS pixels."""
+    pitch = markers.radius / DOT_RADIUS
     columns, rows = (max(2, math.ceil(length / pitch)) for length in gel_size)
     return PixelGrid(rows, columns, pitch, -(columns - 1) / 2 * pitch, -(rows - 1) / 2 * pitch)
 
@@ -219,7 +219,7 @@ def find_markers(image: Image) -> tuple[Lattice, float]:
     of its dots [px]: that radius is sought with which most dots fall into rows and columns. Raises NoLattice."""
     best: tuple[Lattice, float] | None = None
     rows, columns, _ = image.shape
-    radius = SMALLEST
+    radius = MIN_RADIUS
     while radius < min(rows, columns) / 12:
         dots = DotFinder(radius)(image)
         try:
@@ -227,7 +227,7 @@ def find_markers(image: Image) -> tuple[Lattice, float]:
         except NoLattice:
             pass
         else:
-            regular = lattice.present.mean() > FULL and min(lattice.present.shape) > 2
+            regular = lattice.present.mean() > MIN_PRESENT and min(lattice.present.shape) > 2
             if regular and (best is None or lattice.present.sum() > best[0].present.sum()):
                 best = lattice, dots.radius
         radius *= 1.3

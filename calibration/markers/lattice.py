@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STEP = 0.3  # a neighbour lies at most so far from one step along the lattice [pitches]
-FULL = 0.5  # a row or column belongs to the lattice if it has this share of the dots of the fullest one
-ODD = 0.25  # points at other distances than one pitch are strays [pitches]
+MAX_STEP_ERROR = 0.3  # of a neighbour, from one step along the lattice [pitches]
+MIN_ROW_SHARE = 0.5  # dots of a row or column of the lattice [number of dots of the fullest one]
+MAX_PITCH_ERROR = 0.25  # of the distance of regular neighbours [pitches]
 
 
 class NoLattice(ValueError):
@@ -26,7 +26,7 @@ class Lattice:
 
     positions: Float64  # (rows, columns, 2); where no point is, the lattice's smooth continuation
     present: Mask  # (rows, columns) a point is there
-    strays: int  # points that belong to the same lattice, but beyond its rows and columns
+    surplus: int  # points that belong to the same lattice, but beyond its rows and columns
 
     @property
     def pitch(self) -> float:
@@ -45,7 +45,7 @@ def usual_pitch(points: Float64) -> float:
 
 
 def find_lattice(points: Float64, shape: tuple[int, int] | None = None, pitch: float | None = None) -> Lattice:
-    """The square lattice in `points` (n, 2), turned by less than 45 degrees; strays and gaps may be among them.
+    """The square lattice in `points` (n, 2), turned by less than 45 degrees; outliers and gaps may be among them.
 
     Args:
         points: x, y; the lattice asked for lies as near (0, 0) as its points allow.
@@ -79,7 +79,7 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
     tree = KDTree(points)
     away, near = (np.asarray(found) for found in tree.query(points, k=min(5, len(points))))
     steps = points[near[:, 1:]] - points[:, None, :]
-    regular = np.abs(away[:, 1:] - pitch) < ODD * pitch
+    regular = np.abs(away[:, 1:] - pitch) < MAX_PITCH_ERROR * pitch
     if not regular.any():
         return {}
     angle = np.angle(np.exp(4j * np.arctan2(steps[regular][:, 1], steps[regular][:, 0])).mean()) / 4
@@ -96,7 +96,7 @@ def _labels(points: Float64, pitch: float) -> dict[int, tuple[int, int]]:
         for side, step in (((0, 1), along), ((0, -1), -along), ((1, 0), down), ((-1, 0), -down)):
             there = (row + side[0], column + side[1])
             distance, other = tree.query(points[one] + step)
-            if distance > STEP * pitch or other in labels or there in taken:
+            if distance > MAX_STEP_ERROR * pitch or other in labels or there in taken:
                 continue
             labels[int(other)] = there
             taken.add(there)
@@ -114,7 +114,7 @@ def _window(
     filled = np.zeros(at.max(axis=0) - first + 1, dtype=np.intp)
     filled[tuple((at - first).T)] = 1
     if shape is None:
-        rows, columns = (np.flatnonzero(n >= FULL * n.max()) for n in (filled.sum(axis=1), filled.sum(axis=0)))
+        rows, columns = (np.flatnonzero(n >= MIN_ROW_SHARE * n.max()) for n in (filled.sum(axis=1), filled.sum(axis=0)))
         low = np.array([rows[0], columns[0]])
         return first + low, (int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1))
     best, chosen = (-1, 0.0), first

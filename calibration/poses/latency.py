@@ -19,12 +19,12 @@ from scipy.optimize import isotonic_regression, minimize_scalar
 from tacsim.interface import FloatArray
 
 MIN_CORRELATION = 0.7  # below it the two signals are not of one motion
-MAX_RIVAL = 0.85  # a second peak as high as this part of the best one: which of them is it?
+MAX_SECOND_PEAK = 0.85  # height of a second peak over the best one; higher, and the latency is ambiguous
 MIN_SAMPLES = 30  # pictures whose whole search range the arm's record covers
-BLOCKS = 8  # of the jackknife
-STEP = 1e-3  # of the coarse search [s]
-NEAR = 40e-3  # the fine search looks so far to both sides; peaks beyond are rivals [s]
-ROUNDS = 5  # of fitting the response and the shift in turn
+JACKKNIFE_BLOCKS = 8
+COARSE_STEP = 1e-3  # of the coarse search [s]
+PEAK_HALF_WIDTH = 40e-3  # reach of the fine search; peaks beyond are others [s]
+ITERATIONS = 5  # of fitting the response and the shift in turn
 
 
 class NoLatency(ValueError):
@@ -68,16 +68,16 @@ def estimate_latency(
             f"{MIN_SAMPLES} are needed; record longer, with a pause before and after the taps"
         )
 
-    shifts = np.arange(low, high + 0.5 * STEP, STEP)
+    shifts = np.arange(low, high + 0.5 * COARSE_STEP, COARSE_STEP)
     curve = np.array([_correlation(np.interp(times - shift, arm_times, arm), seen) for shift in shifts])
     best = int(np.argmax(curve))
     _check_peak(shifts, curve, best)
 
     fit = partial(_fit, float(shifts[best]), arm_times, arm)
     shift, likeness = fit(times, seen)
-    parts = np.array_split(np.arange(len(times)), BLOCKS)
+    parts = np.array_split(np.arange(len(times)), JACKKNIFE_BLOCKS)
     without = np.array([fit(np.delete(times, gone), np.delete(seen, gone))[0] for gone in parts])
-    spread = (BLOCKS - 1) / BLOCKS * float(((without - without.mean()) ** 2).sum())
+    spread = (JACKKNIFE_BLOCKS - 1) / JACKKNIFE_BLOCKS * float(((without - without.mean()) ** 2).sum())
     return Latency(seconds=shift, uncertainty=float(np.sqrt(spread)), correlation=likeness, samples=len(times))
 
 
@@ -86,7 +86,7 @@ def _fit(
 ) -> tuple[float, float]:
     """Response and shift in turn, from the coarse `shift` on: the shift [s], and the correlation there."""
     likeness = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         response = _response(np.interp(times - shift, arm_times, arm), seen)
         expected = np.interp(arm, *response)  # the touch that a camera without latency would show
         shift, likeness = _refine(shift, arm_times, expected, times, seen)
@@ -108,7 +108,7 @@ def _refine(
     """The shift near `shift` at which `expected` fits `seen` best [s], and the correlation there."""
     found = minimize_scalar(
         lambda tried: -_correlation(np.interp(times - tried, arm_times, expected), seen),
-        bounds=(shift - NEAR, shift + NEAR),
+        bounds=(shift - PEAK_HALF_WIDTH, shift + PEAK_HALF_WIDTH),
         method="bounded",
         options={"xatol": 1e-6},
     )
@@ -146,7 +146,9 @@ def _check_peak(shifts: FloatArray, curve: FloatArray, best: int) -> None:
         raise NoLatency(f"the best latency is at the edge of the search, {shifts[best]:.3f} s; widen the search")
     inner = curve[1:-1]
     peaks = np.flatnonzero((inner >= curve[:-2]) & (inner >= curve[2:])) + 1
-    rivals = [k for k in peaks if abs(k - best) * STEP > NEAR and curve[k] > MAX_RIVAL * curve[best]]
+    rivals = [
+        k for k in peaks if abs(k - best) * COARSE_STEP > PEAK_HALF_WIDTH and curve[k] > MAX_SECOND_PEAK * curve[best]
+    ]
     if rivals:
         raise NoLatency(
             f"latencies of {shifts[best]:.3f} s and {shifts[rivals[0]]:.3f} s fit alike; tap at uneven intervals"

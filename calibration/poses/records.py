@@ -1,8 +1,8 @@
 """Files of recorded poses, which the frames of a robot are calibrated from, and what is found, as JSON.
 
 YAML (or JSON, which is YAML): lengths and angles with units, or in m and rad. A pose is a position and a rotation
-vector, as UR writes it. What a program has recorded says how many entries there are, and has one a line, in braces: so
-a file that was cut off is told from a whole one wherever the cut is.
+vector, as UR writes it. A recorded file has one entry a line, in braces, and says how many there are, so a file
+that was cut off is recognised wherever the cut is.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from tacsim.pose import rotation
 
 Entry = TypeVar("Entry")
 
-MOST = 1000  # poses of a file
+MAX_ENTRIES = 1000  # of a file
 
-Count = Annotated[int | None, Field(ge=0, le=MOST)]  # entries of a whole file; None: written by hand, not told
+Count = Annotated[int | None, Field(ge=0, le=MAX_ENTRIES)]  # entries of a whole file; None: written by hand, not told
 
 
 def _whole(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...]:
     """Refuses a file that was cut off."""
-    told = info.data.get("count")
-    if told is not None and told != len(entries):
+    count = info.data.get("count")
+    if count is not None and count != len(entries):
         raise PydanticCustomError(
             "cut_off",
             "holds {held} entries, `count` says {told}: the file was cut off, or changed by hand; record again, or "
             "correct `count` if the rest is right",
-            {"held": len(entries), "told": told, "at": ()},
+            {"held": len(entries), "told": count, "at": ()},
         )
     return entries
 
@@ -56,7 +56,7 @@ class TouchFile(Config):
 
     ball_radius: Annotated[Length, Field(gt=0)]
     count: Count = None
-    touches: Annotated[tuple[TouchEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
+    touches: Annotated[tuple[TouchEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_whole)]
 
     def measurements(self) -> list[BallTouch]:
         return [BallTouch(each.tool.pose, each.contact, each.depth) for each in self.touches]
@@ -74,7 +74,7 @@ class BoardPoseFile(Config):
 
     camera: Literal["flange", "fixed"] = "flange"  # rides on the flange before a fixed board, or the other way round
     count: Count = None
-    poses: Annotated[tuple[BoardPoseEntry, ...], Field(max_length=MOST), AfterValidator(_whole)]
+    poses: Annotated[tuple[BoardPoseEntry, ...], Field(max_length=MAX_ENTRIES), AfterValidator(_whole)]
 
     def measurements(self) -> list[BoardPose]:
         return [BoardPose(each.flange.pose, each.board.pose) for each in self.poses]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calibration.drift import THIN, Drift, DriftFinder
+from calibration.drift import STRIDE, Drift, DriftFinder
 from calibration.height.slope_polynomial import to_normal
 from calibration.light.calibrator import normal_angle
 from calibration.normaliser import (
@@ -17,7 +17,7 @@ from calibration.normaliser import (
     normaliser_for_pictures,
     normaliser_for_simulation,
 )
-from calibration.reference import LOST, LOST_COLOUR, STALE, StaleReference, UnusableReference, exchanged
+from calibration.reference import LOST_COLOUR, LOST_SLOPE, STALE_SLOPE, StaleReference, UnusableReference, exchanged
 from tacsim.interface import TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
@@ -75,7 +75,7 @@ def test_a_stale_reference_is_seen_in_contact_and_without(
         assert not normalise.stale and normalise.background < 0.6
         assert normalise.diagnostics()["stale"] == 0.0
         normalise(frame(change(image.astype(float))), 0.0)
-        assert normalise.stale and normalise.background > STALE
+        assert normalise.stale and normalise.background > STALE_SLOPE
         told = normalise.diagnostics()
         assert told["stale"] == 1.0 and told["background"] == normalise.background
         normalise.take_reference(frame(change(sensor.empty().astype(float))))  # a fresh one
@@ -113,7 +113,7 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
     normalise.take_reference(frame(bundle[1]))
     with pytest.raises(StaleReference, match=r"Is a lamp out.*take a fresh reference"):
         normalise(frame(change(sensor.press(0.5e-3, 130, 100).image.astype(float))), 0.0)
-    assert normalise.background > LOST or normalise.drift > LOST_COLOUR
+    assert normalise.background > LOST_SLOPE or normalise.drift > LOST_COLOUR
 
 
 def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
@@ -124,7 +124,7 @@ def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
     normalise.take_reference(frame(render(flat())))
     deep = normalise(frame(render(dent())), 0.0).height.max()
     assert normalise(frame(0.8 * render(dent()).astype(float)), 0.0).height.max() < 0.9 * deep
-    assert normalise.background < STALE and normalise.stale
+    assert normalise.background < STALE_SLOPE and normalise.stale
 
 
 def test_where_too_little_is_untouched_the_last_word_stays(
@@ -187,11 +187,11 @@ def test_the_drift_is_a_quadratic_through_what_is_calm() -> None:
     hidden[:20] = True
     finder = DriftFinder((120, 160))
     drift = finder(planes, hidden)
-    assert drift.told
-    np.testing.assert_allclose(finder.at(drift), true[:, ::THIN, ::THIN].reshape(3, -1).T, atol=2e-4)
+    assert drift.measured
+    np.testing.assert_allclose(finder.at(drift), true[:, ::STRIDE, ::STRIDE].reshape(3, -1).T, atol=2e-4)
     finder.remove(planes, drift)
     assert np.abs(planes[:, ~hidden & ~touched]).max() < 2e-4
-    assert not finder(planes, np.ones_like(hidden)).told
+    assert not finder(planes, np.ones_like(hidden)).measured
 
 
 def _smooth_drift(rows: int, columns: int) -> np.ndarray:
@@ -280,7 +280,7 @@ def test_where_too_little_is_untouched_the_image_keeps_its_drift(normalise: Fram
 def test_a_part_of_a_view_has_the_drift_of_the_whole() -> None:
     planes = np.zeros((3, 120, 160), dtype=np.float32)
     weights = np.random.default_rng(0).normal(0, 0.1, (6, 3)).astype(np.float32)
-    finder, drift = DriftFinder((120, 160)), Drift(weights, told=True)
+    finder, drift = DriftFinder((120, 160)), Drift(weights, measured=True)
     finder.remove(planes, drift)
     np.testing.assert_allclose(finder.part(drift, (0, 0), (120, 160)), -np.moveaxis(planes, 0, -1), atol=1e-6)
     np.testing.assert_allclose(

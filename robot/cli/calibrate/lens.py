@@ -108,14 +108,14 @@ def _take_views(
 ) -> Path:
     """Pictures taken now: the folder that keeps them, or the only one. A signal ends the command; what was taken is
     kept then, too. Raises CannotCalibrate, DeviceError."""
-    from calibration.lens.view import FEWEST_PICTURES
+    from calibration.lens.view import MIN_PICTURES
     from robot.camera.camera import Camera
     from robot.procedures.board_views import BoardViewPlan, record_board_views
     from robot.procedures.session import CannotCalibrate
 
-    if 1 < views < FEWEST_PICTURES:
+    if 1 < views < MIN_PICTURES:
         raise typer.BadParameter(
-            f"{views}: a lens needs {FEWEST_PICTURES} views, 12 are good; the board on the gel needs 1",
+            f"{views}: a lens needs {MIN_PICTURES} views, 12 are good; the board on the gel needs 1",
             param_hint="--views",
         )
     config, sensor = named_camera(camera, overrides)

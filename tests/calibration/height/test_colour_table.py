@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calibration.height.colour_table import STEEPEST, from_lighting, from_model
+from calibration.height.colour_table import MAX_SLOPE, from_lighting, from_model
 from tacsim.models.sensor import Light, Lighting, SensorModel
 from tacsim.optics.render import shade
 
@@ -68,7 +68,7 @@ def test_colours_beyond_the_light_are_clipped_and_flagged() -> None:
     found, beyond = from_model(SensorModel())(change)
     assert beyond.tolist() == [[True, True, False]]
     assert np.isfinite(found).all()
-    assert np.abs(found).max() <= STEEPEST
+    assert np.abs(found).max() <= MAX_SLOPE
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ def test_rows_and_columns_are_found_whatever_the_order_and_the_turn(angle: float
         lattice = find_lattice(shuffled(true), shape, pitch)
         np.testing.assert_allclose(lattice.positions, true, atol=1e-9)
         assert lattice.present.all()
-        assert lattice.strays == 0
+        assert lattice.surplus == 0
         assert lattice.pitch == pytest.approx(2.0)
 
 
@@ -42,7 +42,7 @@ def test_of_a_larger_lattice_the_part_nearest_the_middle_is_taken() -> None:
     true = lattice_points(9, 11, 1.0)
     lattice = find_lattice(shuffled(true), (5, 5), 1.0)
     np.testing.assert_allclose(lattice.positions, true[2:7, 3:8], atol=1e-9)
-    assert lattice.strays == 99 - 25
+    assert lattice.surplus == 99 - 25
 
 
 def test_what_is_no_lattice_is_refused() -> None:

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from benchmarks.cases.real.labels import BadData, Image, Positive
+from benchmarks.cases.real.labels import BadData, Image, Positive, read_picture
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
 from tacsim.models.quantity import Config
-from tacsim.record.episode import EpisodeError
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -203,7 +202,7 @@ def _of_pictures(folder: Path, of: BallSet) -> tuple[Image, Frames]:
     background = next((path for name in of.backgrounds if (path := home / name).is_file()), None)
     if background is None:
         raise BadData(f"{home} has no frame without contact; looked for {', '.join(of.backgrounds)}")
-    return _read(background), tuple((path.name, _read(path)) for path in paths if path != background)
+    return read_picture(background), tuple((path.name, read_picture(path)) for path in paths if path != background)
 
 
 def _of_archive(folder: Path, of: BallSet) -> tuple[Image, Frames]:
@@ -228,12 +227,3 @@ def _of_archive(folder: Path, of: BallSet) -> tuple[Image, Frames]:
         np.ascontiguousarray(reference[..., ::step]),
         tuple((f"press {k}", np.ascontiguousarray(image[..., ::step])) for k, image in enumerate(images)),
     )
-
-
-def _read(path: Path) -> Image:
-    from tacsim.record.images import read_image
-
-    try:
-        return read_image(path)
-    except EpisodeError as error:
-        raise BadData(str(error)) from None

@@ -34,14 +34,14 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
     """Balls pressed to the depths of real presses: radius of the contact, ours against the real one."""
     labels = read_labels(folder)
     background, frames = read_frames(folder, labels)
-    scene = ball_scene(labels, ball, thickness, element)
-    press(ball_scene(labels, ball, 2e-3, 1e-3), 0.05e-3)  # compiles
+    scene = ball_scene((*labels.gel_size, thickness), ball, element)
+    press(ball_scene((*labels.gel_size, 2e-3), ball, 1e-3), 0.05e-3)  # compiles
     world = make_world(scene)
     camera = RenderedSensor(labels, background)
     before = camera.see(world)
     rows = []
     for at in sorted((p for p in labels.presses if p.ball_radius == ball), key=lambda p: p.depth):
-        timing, stats = timed(partial(_press_to, world, ball, at.depth), 1, warm=lambda: None)
+        timing, stats = timed(partial(press_to, world, ball, at.depth), 1, warm=lambda: None)
         pressed = pressed_radius(world) / labels.pixel_pitch
         figures = {
             "ball_radius_mm": ball * 1e3,
@@ -72,18 +72,19 @@ def contact_radius(folder: Path, ball: float, thickness: float, element: float, 
     return rows
 
 
-def ball_scene(labels: PressLabels, ball: float, thickness: float, element: float) -> Scene:
-    """The default gel in the size of the labels, under a ball."""
+def ball_scene(gel_size: tuple[float, float, float], ball: float, element: float) -> Scene:
+    """The default gel in this size, under a ball [m]."""
     return Scene(
         body=None,
         indenter=Indenter(geometry=Sphere(radius=ball)),
-        gel=Gel(size=(*labels.gel_size, thickness)),
+        gel=Gel(size=gel_size),
         element_size=element,
         settling=Settling(mach=0.05),
     )
 
 
-def _press_to(world: World, ball: float, depth: float) -> MoveStats:
+def press_to(world: World, ball: float, depth: float) -> MoveStats:
+    """Moves the ball's tip to `depth` below the untouched gel [m]."""
     pose = world.pose("indenter")
     return world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)})
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet, Frames
+from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene
 from benchmarks.cases.real.known_depth import GRID, light_of
 from benchmarks.cases.real.labels import BadData, Image, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case, missing_case
-from tacsim.models.scene import Gel, Indenter, Scene, Settling, Sphere
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 CASE = "invariance"
 FOLDS = 5
 MIN_PRESSES = 10
-ELEMENT = 0.5e-3  # [m]
 
 
 def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], repeat: int) -> list[Measurement]:
@@ -118,13 +117,7 @@ def _fold(
         raise BadData(f"{of.name}: {error}") from None
     calibration = balls.bundle(of, fit)
     real = FrameSet("real", reference, "as labelled", tuple(Frame(name, image) for name, image in test))
-    scene = Scene(
-        body=None,
-        indenter=Indenter(geometry=Sphere(radius=of.ball_radius)),
-        gel=Gel(size=gel_size),
-        element_size=ELEMENT,
-        settling=Settling(mach=0.05),
-    )
+    scene = ball_scene(gel_size, of.ball_radius, ELEMENT)
     wall, cpu = perf_counter(), process_time()
     with TemporaryDirectory() as place:
         write_bundle(Path(place), calibration, reference)

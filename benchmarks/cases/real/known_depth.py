@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from benchmarks.cases.real import balls
 from benchmarks.cases.real.balls import BallSet
-from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene
+from benchmarks.cases.real.contact_radius import ELEMENT, ball_scene, press_to
 from benchmarks.cases.real.labels import BadData, Image, PressLabel, PressLabels, read_frames, read_labels
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
-from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, SensorModel
-from tacsim.physics.world import World, make_world
+from tacsim.physics.world import make_world
 
 if TYPE_CHECKING:
     from calibration.light.calibrator import LightFit
@@ -56,7 +55,7 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
     of = light_of(folder, labels)
     reference, frames = read_frames(folder, labels)
     fit, _, _ = balls.calibrated(folder, of)
-    world = make_world(ball_scene(labels, ball, labels.gel_thickness[0], ELEMENT))
+    world = make_world(ball_scene((*labels.gel_size, labels.gel_thickness[0]), ball, ELEMENT))
     camera = CalibratedSensor(of, fit, labels.gel_size, reference)
     rows = []
     for press in sorted((p for p in frames if p.ball_radius == ball), key=lambda p: p.depth):
@@ -65,14 +64,14 @@ def known_depth(folder: Path, ball: float, repeat: int) -> list[Measurement]:
         except NoCircle as error:
             raise BadData(f"the real frame of {press.name}: {error}") from None
         wall, cpu = perf_counter(), process_time()
-        stats = _press_to(world, ball, press.depth)
+        settled = press_to(world, ball, press.depth).settled
         surface = moved(world.surface("lower"), (at.x, at.y), camera.model)
         image = camera.see(surface)
         timing = Timing((perf_counter() - wall,), process_time() - cpu)
         cap = float(np.sqrt(2 * ball * press.depth - press.depth**2)) / labels.pixel_pitch
         mask = circle_mask(reference.shape[:2], at.x, at.y, REACH * cap)
         figures = pictures(image, frames[press], reference, mask) | {"depth_mm": press.depth * 1e3}
-        note = "" if stats else "not settled"
+        note = "" if settled else "not settled"
         rows.append(
             Measurement(
                 timing, figures.pop("grey"), "grey", "the real frame within 1.3 radii of the cap",
@@ -172,11 +171,6 @@ def _height(
         timing, shape, "% of depth", "the simulated surface at this depth, rms within 1.5 radii, median removed",
         f"{press.name}: height", None, figures,
     )  # fmt: skip
-
-
-def _press_to(world: World, ball: float, depth: float) -> bool:
-    pose = world.pose("indenter")
-    return world.move({"indenter": Pose(np.array([*pose.position[:2], ball - depth]), pose.quaternion)}).settled
 
 
 def cases(folder: Path) -> tuple[Case, ...]:

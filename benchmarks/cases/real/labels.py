@@ -107,7 +107,7 @@ def read_frames(folder: Path, labels: PressLabels) -> tuple[Image, dict[PressLab
     """The frame without contact, and those of the presses, (H, W, 3) RGB. Raises BadData that names the file."""
     paths = find_frames(folder, labels)
     background, reference = read_background(next(iter(paths.values())).parent, labels)
-    frames = {press: _read(path) for press, path in paths.items()}
+    frames = {press: read_picture(path) for press, path in paths.items()}
     for press, frame in frames.items():
         if frame.shape != reference.shape:
             raise BadData(f"{paths[press]} and {background} differ in size; they must be of one camera")
@@ -120,7 +120,7 @@ def read_punches(folder: Path, labels: PressLabels) -> dict[PunchLabel, tuple[Pa
     for punch in labels.punches:
         mesh, frame = find(folder, punch.mesh), find(folder, punch.frames)
         if mesh is not None and frame is not None:
-            found[punch] = mesh, _read(frame)
+            found[punch] = mesh, read_picture(frame)
     return found
 
 
@@ -129,10 +129,11 @@ def read_background(home: Path, labels: PressLabels) -> tuple[Path, Image]:
     background = next((path for name in labels.backgrounds if (path := home / name).is_file()), None)
     if background is None:
         raise BadData(f"{home} has no frame without contact; looked for {', '.join(labels.backgrounds)}")
-    return background, _read(background)
+    return background, read_picture(background)
 
 
-def _read(path: Path) -> Image:
+def read_picture(path: Path) -> Image:
+    """(H, W, 3) RGB. Raises BadData."""
     try:
         return read_image(path)
     except EpisodeError as error:

@@ -56,14 +56,9 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
 
 def limit_step(target: Pose, now: Pose, max_step: float, max_turn: float) -> Pose:
     """`target` itself if it is within `max_step` [m] and `max_turn` [rad] of `now`; otherwise the farthest such pose on
-    the straight path to it, translation and rotation in proportion.
-
-    Raises ValueError for limits that are not positive.
-    """
+    the straight path to it, translation and rotation in proportion."""
     from tacsim import pose as se3  # SciPy takes half a second to load; the process that drives an arm needs none of it
 
-    if not max_step > 0 or not max_turn > 0:
-        raise ValueError(f"limit_step: limits must be positive, got {max_step} m and {max_turn} rad")
     metres, radians = se3.distance(now, target)
     excess = max(metres / max_step, radians / max_turn)
     if excess <= 1.0 + 1e-9:  # rounding

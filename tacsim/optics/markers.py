@@ -35,11 +35,6 @@ def marker_flow(surface: GelSurface, markers: Markers) -> NDArray[np.float32]:
     return _displacement(surface, markers)[..., :2].astype(np.float32)
 
 
-def marker_positions(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> NDArray[np.float64]:
-    """(rows, columns, 2) column u, row v of the dots in the image [px]. Raises what :func:`marker_discs` raises."""
-    return marker_discs(surface, markers, geometry)[0]
-
-
 def marker_discs(
     surface: GelSurface, markers: Markers, geometry: SensorGeometry
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

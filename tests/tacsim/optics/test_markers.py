@@ -7,7 +7,6 @@ from tacsim.optics.markers import (
     marker_coverage,
     marker_discs,
     marker_flow,
-    marker_positions,
     rest_positions,
 )
 from tacsim.optics.render import Renderer
@@ -22,7 +21,7 @@ def test_rows_run_along_y_and_columns_along_x() -> None:
     assert rest.shape == (5, 8, 2)
     np.testing.assert_allclose(rest[0, 0], (-5.25e-3, -3e-3))
     np.testing.assert_allclose(rest[1, 0] - rest[0, 0], (0.0, 1.5e-3), atol=1e-12)
-    pixels = marker_positions(flat(), MARKERS, GEOMETRY)
+    pixels = marker_discs(flat(), MARKERS, GEOMETRY)[0]
     np.testing.assert_allclose(pixels[0, 0], (159.5 - 84.0, 119.5 - 48.0))
 
 
@@ -34,7 +33,7 @@ def test_markers_move_with_a_sheared_surface() -> None:
     flow = marker_flow(surface, MARKERS)
     assert flow.dtype == np.float32
     np.testing.assert_allclose(flow, expected, atol=1e-9)
-    moved = marker_positions(surface, MARKERS, GEOMETRY) - marker_positions(flat(), MARKERS, GEOMETRY)
+    moved = marker_discs(surface, MARKERS, GEOMETRY)[0] - marker_discs(flat(), MARKERS, GEOMETRY)[0]
     np.testing.assert_allclose(moved, expected / GEOMETRY.pixel_pitch, atol=1e-4)
 
 
@@ -57,7 +56,7 @@ def test_rendered_dots_are_dark_where_the_surface_carries_them() -> None:
     renderer = Renderer(SensorModel(markers=MARKERS, texture=0.0), (20e-3, 20e-3))
     surface = dent(slide=(0.6e-3, -0.3e-3))
     image = renderer(surface).astype(int).sum(axis=2)
-    for u, v in marker_positions(surface, MARKERS, GEOMETRY).reshape(-1, 2):
+    for u, v in marker_discs(surface, MARKERS, GEOMETRY)[0].reshape(-1, 2):
         assert image[round(v), round(u)] < 80
     plain = Renderer(SensorModel(texture=0.0), (20e-3, 20e-3))(surface).astype(int).sum(axis=2)
     assert (image != plain).mean() == pytest.approx(40 * np.pi * 4.5**2 / image.size, rel=0.15)
@@ -73,15 +72,15 @@ def test_a_pinhole_shows_a_dot_that_is_pressed_towards_it_farther_out_and_larger
     """By similar triangles: at distance H - h instead of H everything is H / (H - h) times as large."""
     near = GEOMETRY.model_copy(update={"camera_distance": 10e-3})
     pressed = make_surface(lambda x, y: (x * 0, x * 0, x * 0 - 1e-3))
-    rest = marker_positions(flat(), MARKERS, near)
-    np.testing.assert_allclose(rest, marker_positions(flat(), MARKERS, GEOMETRY))  # untouched gel lies where it lay
+    rest = marker_discs(flat(), MARKERS, near)[0]
+    np.testing.assert_allclose(rest, marker_discs(flat(), MARKERS, GEOMETRY)[0])  # untouched gel lies where it lay
     centres, radii = marker_discs(pressed, MARKERS, near)
     np.testing.assert_allclose(centres - near.principal, (rest - near.principal) * 10 / 9, rtol=1e-6)
     np.testing.assert_allclose(radii, MARKERS.radius / near.pixel_pitch * 10 / 9, rtol=1e-6)
-    np.testing.assert_allclose(marker_positions(pressed, MARKERS, GEOMETRY), rest)  # parallel rays see none of it
+    np.testing.assert_allclose(marker_discs(pressed, MARKERS, GEOMETRY)[0], rest)  # parallel rays see none of it
 
 
 def test_a_gel_pressed_up_to_the_pinhole_is_refused() -> None:
     near = GEOMETRY.model_copy(update={"camera_distance": 2e-3})
     with pytest.raises(ValueError, match=r"pressed in 2\.50 mm, up to the camera at camera_distance 2 mm"):
-        marker_positions(make_surface(lambda x, y: (x * 0, x * 0, x * 0 - 2.5e-3)), MARKERS, near)
+        marker_discs(make_surface(lambda x, y: (x * 0, x * 0, x * 0 - 2.5e-3)), MARKERS, near)[0]

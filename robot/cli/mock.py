@@ -30,8 +30,8 @@ def mock(
     """Run mock UR controllers and cameras until Ctrl-C: RTDE, script and dashboard ports, MJPEG over HTTP.
 
     Arms move, feel and stop like an arm, but know no dynamics. Any UR client can connect. Cameras send 320 x 240 px,
-    30 times a second, with a strip below that tells number and clock of the frame; nothing stands before them. For arms
-    and cameras with simulated gels before them, open the rig `mock`.
+    30 times a second, with a strip below that holds number and clock of the frame; nothing is in front of them. For
+    arms and cameras with simulated gels, open the rig `mock`.
 
     Example: tacsim mock --arms 2 --cameras 2
     """

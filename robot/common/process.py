@@ -33,7 +33,7 @@ Message = tuple[dict[str, Any], Arrays]  # what is said, and the arrays with it
 LARGEST = 256 * 2**20  # of an array [bytes]
 LONGEST = 2**20  # of a line [bytes]
 PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
-LAST_LINES = 5  # of a dead child's standard error, in the error that tells of it
+LAST_LINES = 5  # of a dead child's standard error, in errors
 
 
 class Child:
@@ -170,7 +170,7 @@ class Child:
         return answer
 
     def _ended(self, what: str) -> DeviceError:
-        """Ends the process; returns the error that tells of it."""
+        """Ends the process; returns the error to raise."""
         failure = self._failure(what)
         self.close(0.0)
         return failure

@@ -12,7 +12,7 @@ import selectors
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast
 
 from robot.common import MOCK_SERIAL
@@ -44,7 +44,7 @@ def serve(configs: Sequence[ControllerConfig], fault_port: int, *, with_parent: 
                 controllers.append(Controller(config, selector))
                 fault_servers.append(FaultServer(controllers[-1], selector, fault_port))
             if with_parent:
-                _watch_input(selector, lambda: ended.append("input"))
+                selector.register(sys.stdin, selectors.EVENT_READ, lambda: ended.append("input"))
             write_message(sys.stdout.buffer, {"ready": [config.host for config in configs]})
             _loop(selector, controllers, fault_servers, ended, os.getppid() if with_parent else None)
         finally:
@@ -52,13 +52,6 @@ def serve(configs: Sequence[ControllerConfig], fault_port: int, *, with_parent: 
                 server.close()
             for controller in controllers:
                 controller.close()
-
-
-def _watch_input(selector: selectors.BaseSelector, work: Callable[[], None]) -> None:
-    try:
-        selector.register(sys.stdin, selectors.EVENT_READ, work)
-    except OSError as error:
-        raise OSError(error.errno, "--with-parent needs a pipe as standard input, not a file") from None
 
 
 def _loop(
@@ -98,7 +91,7 @@ def _for_each(given: list[str], hosts: Sequence[str], what: str) -> list[str]:
 
 
 def _registered(selector: selectors.BaseSelector, key: selectors.SelectorKey) -> bool:
-    """False for a connection that what was served before it in the same round has closed."""
+    """False for a connection that was closed by what was served before it in the same round."""
     try:
         return key.fileobj in selector.get_map()
     except ValueError:  # a closed socket has no number any more
@@ -106,7 +99,7 @@ def _registered(selector: selectors.BaseSelector, key: selectors.SelectorKey) ->
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of the process. Says on standard output, as one line of JSON, that it is ready or why not."""
+    """Entry point of the process. Its first line on standard output is JSON: the hosts that are ready, or an error."""
     parser = argparse.ArgumentParser(prog="python -m robot.mock", description=__doc__)
     parser.add_argument("hosts", nargs="+")
     each = "once for all, or once for each host in their order"

@@ -40,7 +40,7 @@ class MockCameraState:
 
 
 class MockCamera(ChildHandle):
-    """Starts the process, feeds it, breaks it, ends it. Safe to use from several threads."""
+    """Handle of a mock camera: starts the process, gives it pictures, breaks it, ends it. Threads may share one."""
 
     def __init__(
         self,
@@ -104,7 +104,7 @@ class MockCamera(ChildHandle):
         self._ask("brightness", _within(factor, 0.0, 100.0, "brightness"))
 
     def refuse(self, on: bool) -> None:
-        """Nobody listens at the port; clients that are there stay."""
+        """The port refuses new clients; those that are connected stay."""
         self._ask("refuse", bool(on))
 
     def disconnect(self) -> int:

@@ -39,7 +39,7 @@ class Faults:
     corrupt: bool = False  # the second half of each JPEG is noise
     size: tuple[int, int] | None = None  # columns, rows of the picture, other than promised [px]
     brightness: float = 1.0  # factor on the picture; the strip stays readable
-    refuse: bool = False  # nobody listens at the port
+    refuse: bool = False  # the port is closed
 
 
 class FrameSource:
@@ -128,7 +128,7 @@ class FrameSource:
                 self._delayed.append((now + faults.delay, number, jpeg))
 
     def _until(self, tick: float, now: float) -> float | None:
-        """How long there is nothing to do [s]; None: until somebody changes something."""
+        """How long there is nothing to do [s]; None: until `_changed` is notified."""
         due = [] if self._faults.stall else [tick]
         if self._delayed and not self._faults.stall:
             due.append(self._delayed[0][0])
@@ -213,7 +213,7 @@ class Listener:
             return len(self._clients)
 
     def enter(self, client: socket.socket) -> bool:
-        """False when the camera has clients enough."""
+        """Counts a client; False when there are MAX_CLIENTS already."""
         with self._lock:
             if len(self._clients) >= MAX_CLIENTS:
                 return False
@@ -234,7 +234,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__(address, _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that goes away is no news."""
+        """A client that disconnects is no error."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -243,7 +243,7 @@ class _Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Says nothing."""
+        """Logs nothing."""
 
     def do_GET(self) -> None:
         action = {"/?action=stream": self._stream, "/?action=snapshot": self._snapshot}.get(self.path)

@@ -296,11 +296,12 @@ def test_endless_lines_and_programs_are_cut(mock: MockUR, port: int, filling: by
 
 def test_slow_reader_loses_whole_packages_only(mock: MockUR) -> None:
     mock.faults.version(5, 25)  # which has all outputs
+    before = mock.faults.state().packages_dropped
     with RtdeClient(mock.host) as slow, RtdeClient(mock.host) as quick:
-        slow.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        slow.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         streaming(slow, *OUTPUTS)
         streaming(quick, "timestamp")
-        until(lambda: mock.faults.state().packages_dropped > 60, "packages are dropped")
+        until(lambda: mock.faults.state().packages_dropped > before + 60, "packages are dropped")
         times = [slow.receive()["timestamp"][0] for _ in range(2)]
         while times[-1] - times[-2] < 0.1:  # what waited is whole and in order; then some are missing
             times.append(slow.receive()["timestamp"][0])

@@ -93,7 +93,7 @@ class Arm:
         return self._next is not None
 
     def advance(self, deceleration: float = COAST) -> None:
-        """Ends the control period; an arm that nobody commands is braked."""
+        """Ends the control period; an arm without a command is braked."""
         wanted, before, start = self._next, self.target_qd, self.target_q
         self._next = None
         if wanted is not None:

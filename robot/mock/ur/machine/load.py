@@ -1,4 +1,4 @@
-"""What pushes on the tool: wrenches given from outside, a spring wall, a payload nobody told the controller of."""
+"""Loads on the tool: wrenches given from outside, a spring table, a payload that the controller does not know of."""
 
 from __future__ import annotations
 

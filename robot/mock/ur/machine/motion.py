@@ -1,6 +1,6 @@
 """Motions of URScript as generators: one `yield` is one control period.
 
-Where the real thing is not published, the mock does the plain thing, and says so:
+What is not published of a real controller is modelled in the simplest way:
 
 * movej, movel, paths: trapezoidal speed. In movel a turn counts as its angle, so that `a` and `v` are rad/s^2 and rad/s
   when that number is the larger one. A move that begins while the arm moves brakes first.

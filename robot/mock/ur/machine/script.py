@@ -93,7 +93,7 @@ class Program:
     # -- threads -----------------------------------------------------------------------------------------------------
 
     def run(self, name: str, work: MotionSteps, *, tracked: bool = False) -> None:
-        """Starts a thread. `tracked`: the asynchronous word tells of it."""
+        """Starts a thread. `tracked`: its progress is in the asynchronous word."""
 
         def tracking() -> MotionSteps:
             self.signal(0)

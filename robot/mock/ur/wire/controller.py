@@ -68,7 +68,7 @@ class Received:
 
 
 class Controller:
-    """Serves one host. The loop around it calls `tick` once a control period; sockets call back in between."""
+    """Serves one host. The process calls `tick` once a control period; sockets call back in between."""
 
     def __init__(self, config: ControllerConfig, selector: selectors.BaseSelector) -> None:
         self.config, self._selector = config, selector
@@ -126,7 +126,7 @@ class Controller:
         self._boot_at = self.ticks + max(1, round(seconds / PERIOD))
 
     def cut(self, ports: Sequence[int], *, reset: bool) -> int:
-        """Closes the connections to these ports; says how many."""
+        """Closes the connections to these ports; returns how many."""
         chosen = [client for client in self.clients if client.port in ports]
         for client in chosen:
             self._drop(client, reset=reset)

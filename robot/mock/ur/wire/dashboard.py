@@ -7,7 +7,7 @@ from collections.abc import Callable
 from robot.mock.ur.machine.machine import Machine, Runtime, Safety
 
 GREETING = "Connected: Universal Robots Dashboard Server"
-_ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` does not tell the e-Series
+_ROBOT = {"ur3e": "UR3", "ur5e": "UR5", "ur10e": "UR10"}  # `get robot model` leaves the e out
 
 
 def answer(machine: Machine, line: str, serial: str, *, remote: bool) -> str:
@@ -95,4 +95,4 @@ _COMMANDS: dict[str, tuple[Callable[[Machine], object], str]] = {  # what is don
     "close popup": (lambda machine: None, "closing popup"),
     "close safety popup": (lambda machine: None, "closing safety popup"),
 }
-_ATTEMPTS = {"pause": _pause, "play": _play, "unlock protective stop": _unlock}  # whose reply tells how it went
+_ATTEMPTS = {"pause": _pause, "play": _play, "unlock protective stop": _unlock}  # whose reply depends on success

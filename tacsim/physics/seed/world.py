@@ -19,12 +19,14 @@ from tacsim.compute.runtime import launching, start
 from tacsim.geometry.sampling import body_points
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, GelSurface, Scene, lame
+from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
 from tacsim.physics.motion.controller import ForceReading, Motion, StepNumbers, move_and_settle
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, plan, resolve_targets
 from tacsim.physics.move import MoveCommand
+from tacsim.physics.seed.kernels import PAD, Solid, Step, advance
 from tacsim.physics.snapshot import copies, restore_arrays
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.base import BaseWorld
@@ -70,9 +72,6 @@ def gel_lattice(gel: Gel, spacing: float) -> Lattice:
 
 def solid(material: GelMaterial | BodyMaterial, volume: float) -> Any:
     """Kernel constants of a material for particles of `volume` [mm^3]; density lambda + 2 mu makes the wave speed 1."""
-    from tacsim.physics.body.material import ELASTIC
-    from tacsim.physics.seed.kernels import Solid
-
     mu, lam = (modulus * MPA for modulus in lame(material))
     limit = min(material.elastic_limit, ELASTIC) if isinstance(material, BodyMaterial) else ELASTIC
     mass = (lam + 2 * mu) * volume
@@ -219,20 +218,16 @@ class SeedWorld(BaseWorld):
             )
 
     def _advance(self, path: Path, first: int, last: int) -> ForceReading:
-        """Substeps first to last of a path, in one launch."""
         aside = int(self._aside.sum())
         where = path.span(self.sensors, first, last)
         x0, y0 = self._fit_grid(path, first, last, where)
 
-        def launch() -> Health:
-            health = np.zeros((1, NUMBERS), np.float32)
-            Health.clear(health)
-            drive = path.drive(first, last)
-            self._launch(drive, path.step, x0, y0, health[0])
-            return Health.read(health, path.step / self._smallest_cell(drive))
-
-        good = copies(self.arrays())
-        health = check_launch(self.arrays(), good, launch(), where)
+        seen = np.zeros((1, NUMBERS), np.float32)
+        Health.clear(seen)
+        drive, good = path.drive(first, last), copies(self.arrays())
+        self._launch(drive, path.step, x0, y0, seen[0])
+        health = Health.read(seen, path.step / self._smallest_cell(drive))
+        check_launch(self.arrays(), good, health, where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):
@@ -244,8 +239,6 @@ class SeedWorld(BaseWorld):
 
     @launching()
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:
-        from tacsim.physics.seed.kernels import Step, advance
-
         thickness = self.scene.gel.size[2] * MM
         step = Step(  # type: ignore[call-arg]  # a Taichi dataclass
             dt=dt, dx=self._dx, x0=x0, y0=y0, thickness=thickness, reach=REACH * self._dx, cells=int(self._layers[0]),
@@ -259,8 +252,6 @@ class SeedWorld(BaseWorld):
 
     def _fit_grid(self, path: Path, first: int, last: int, where: LaunchSpan) -> tuple[float, float]:
         """Makes the grid cover what the particles can reach; returns x, y of node (0, 0), whole multiples of dx."""
-        from tacsim.physics.seed.kernels import PAD
-
         faces = path.drive(first, last)[:, :, 3, 2]
         gels, body = self._x[: 2 * self._gels, :2], self._body_points()[:, :2]
         low, high = gels.min(axis=0), gels.max(axis=0)

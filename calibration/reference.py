@@ -76,9 +76,10 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
         raise UnusableReference("reference is not finite")
     mean = gel.mean(axis=0)
     if (mean < MIN_MEAN_LEVEL).any():
+        levels = ", ".join(f"{level:.1f}" for level in mean)
         raise UnusableReference(
-            f"reference is dark: mean R, G, B over the gel {_levels(mean)}, at least {MIN_MEAN_LEVEL:g} each; are the "
-            "sensor's lights on, and is the exposure right?"
+            f"reference is dark: mean R, G, B over the gel {levels}, at least {MIN_MEAN_LEVEL:g} each; are the sensor's "
+            "lights on, and is the exposure right?"
         )
     saturated = float((gel >= SATURATED).any(axis=1).mean())
     if saturated > MAX_SATURATED_SHARE:
@@ -111,7 +112,3 @@ def _pattern(image: Float32, valid: NDArray[np.bool_]) -> Float32:
     whole = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     parts = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))[whole]
     return np.asarray(parts / parts.mean(axis=0) - 1.0, dtype=np.float32)
-
-
-def _levels(colour: Float32) -> str:
-    return ", ".join(f"{value:.1f}" for value in colour)

@@ -101,25 +101,15 @@ class Report:
 
 
 def invariance(
-    comparison: Comparison,
-    calibration_b: Calibration | None = None,
-    grid: CanonicalGrid = GRID,
-    on_step: Callable[[int, int], None] = lambda done, total: None,
-) -> Report:
-    """Of a finished comparison. Gradient and height need surfaces on both sides, the drift table B's calibration.
-
-    Raises BadFrames for fewer than MIN_PRESSES presses with contact in B.
-    """
-    return pooled_invariance([(comparison, calibration_b)], grid, on_step)
-
-
-def pooled_invariance(
     folds: Sequence[tuple[Comparison, Calibration | None]],
     grid: CanonicalGrid = GRID,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
-    """The same of several comparisons, each with B's calibration: parts of one set of presses, of which each was left
-    out of the calibration that it is seen through. Raises BadFrames for fewer than MIN_PRESSES with contact in B."""
+    """Of finished comparisons, each with B's calibration (needed for drifts): one, or parts of one set of presses, each
+    left out of the calibration that it is seen through. Gradient and height need surfaces on both sides.
+
+    Raises BadFrames for fewer than MIN_PRESSES with contact in B.
+    """
     touched = [
         {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
         for comparison, _ in folds

@@ -137,10 +137,10 @@ def contact_region(change: NDArray[np.floating]) -> Mask:
     smooth = np.asarray(cv2.GaussianBlur(np.asarray(change, dtype=np.float32), (0, 0), CONTACT_BLUR), dtype=np.float32)
     red, green, blue = (np.abs(smooth[..., k] - level) for k, level in enumerate(untouched_change(smooth)))
     strength = np.maximum(np.maximum(red, green), blue)
-    limit = max(
-        MIN_CHANGE, MIN_CHANGE_TO_NOISE * _noise(strength), MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
-    )
-    found = strength > limit
+    # the noise is the spread of the half of the pixels that changes least
+    noise = 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
+    share = MIN_CHANGE_SHARE * float(np.percentile(strength, 99.8))
+    found = strength > max(MIN_CHANGE, MIN_CHANGE_TO_NOISE * noise, share)
     padded = np.pad(found, CLOSING)  # closing erodes what touches the border
     closed = binary_closing(padded, iterations=CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
     parts, _ = label(binary_fill_holes(closed | found))
@@ -171,11 +171,6 @@ def patch_of(region: Mask) -> Patch | None:
     if len(rows) == 0:
         return None
     return Patch(float(columns.mean()), float(rows.mean()), math.sqrt(len(rows) / math.pi))
-
-
-def _noise(strength: NDArray[np.floating]) -> float:
-    """Spread of the half of the pixels that changes least, taken for that of noise."""
-    return 1.4826 * float(np.median(strength[strength <= np.median(strength)]))
 
 
 def _require_alike(one: NDArray[np.generic], other: NDArray[np.generic]) -> None:

@@ -26,7 +26,10 @@ class Integrator:
         inverse = pitch / eigenvalue
         inverse[0, 0] = 0.0  # slopes determine no constant
         self._inverse = inverse.astype(np.float32)
-        self._rim = np.flatnonzero(_border(shape, max(1, round(UNTOUCHED_RIM / pitch))))
+        width = max(1, round(UNTOUCHED_RIM / pitch))
+        rim = np.ones(shape, dtype=np.bool_)
+        rim[width:-width, width:-width] = False
+        self._rim = np.flatnonzero(rim)
 
     def __call__(self, gradient: Float32) -> Float32:
         """(rows, columns) height [m] of slopes (rows, columns, 2) along x, y [-].
@@ -49,9 +52,3 @@ class Integrator:
         height: Float32 = idctn(spectrum, norm="ortho", overwrite_x=True)
         height -= np.median(height.ravel()[self._rim])
         return height
-
-
-def _border(shape: tuple[int, int], width: int) -> NDArray[np.bool_]:
-    rim = np.ones(shape, dtype=np.bool_)
-    rim[width:-width, width:-width] = False
-    return rim

@@ -155,7 +155,10 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
             f"{MAX_RESIDUAL:g} at most (worst: {worst}, {found[worst]:.2f} px). Is the board flat, its size right, "
             "and the focus fixed?"
         )
-    tilt = _tilt(Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2])
+    normals = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2]
+    mean = normals.mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    tilt = float(np.sqrt((np.arccos(np.clip(normals @ mean, -1.0, 1.0)) ** 2).mean()))
     if not tilt >= MIN_TILT:
         raise BadView(
             f"the board is tilted by only {np.degrees(tilt):.1f} degrees between pictures (root mean square), "
@@ -178,13 +181,6 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
         residual=float(residual),
     )
     return lens, found
-
-
-def _tilt(normals: FloatArray) -> float:
-    """Root mean square of the angles between normals (n, 3) and their mean [rad]."""
-    mean = normals.mean(axis=0)
-    mean /= np.linalg.norm(mean)
-    return float(np.sqrt((np.arccos(np.clip(normals @ mean, -1.0, 1.0)) ** 2).mean()))
 
 
 def board_pose(lens: Lens, points: Points) -> tuple[Pose, float]:

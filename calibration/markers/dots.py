@@ -48,11 +48,8 @@ class DotFinder:
 
     def __init__(self, radius: float) -> None:
         """Raises ValueError for dots too small to be found."""
-        if not radius >= MIN_RADIUS:
-            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
+        self._side, self._blur = _filters(radius)
         self._area = np.pi * radius**2
-        self._blur = BLUR * radius
-        self._side = 2 * int(np.ceil(MAX_RADIUS * radius)) + 1
 
     def __call__(self, image: Image) -> Dots:
         """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
@@ -93,6 +90,13 @@ class DotFinder:
         return dots, np.where(clumps[labels], taken, np.float32(0.0)) if clumps.any() else None
 
 
+def _filters(radius: float) -> tuple[int, float]:
+    """Side of the closing and deviation of the blur for dots of a radius [px]. Raises ValueError."""
+    if not radius >= MIN_RADIUS:
+        raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
+    return 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
+
+
 def light_taken(image: Image, side: int, blur: float) -> Float32:
     """(H, W) share of the light that is missing against the frame of `side` x `side` px round each place."""
     import cv2
@@ -112,9 +116,7 @@ class DotEraser:
 
     def __init__(self, radius: float) -> None:
         """Raises ValueError for dots too small to be found."""
-        if not radius >= MIN_RADIUS:
-            raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
-        self._side, self._blur = 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
+        self._side, self._blur = _filters(radius)
 
     def __call__(self, image: Image) -> Image:
         """The picture (H, W, 3) without its dots."""

@@ -76,7 +76,8 @@ def robust_fit(residuals: Residuals, starts: Sequence[FloatArray], what: str) ->
     everything = residuals(found)
     jacobian = np.asarray(_plain(residuals, found, used).jac, dtype=np.float64)
     information: FloatArray = jacobian.T @ jacobian
-    if np.linalg.matrix_rank(_scaled(information), tol=1e-10) < len(found):
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))  # so that the rank does not depend on units
+    if np.linalg.matrix_rank(information / np.outer(scale, scale), tol=1e-10) < len(found):
         raise BadMeasurements(f"{what} do not determine all of the transform: vary places and tilts more")
     bound: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
     free = everything[used].size - len(found)
@@ -101,13 +102,6 @@ def _plain(residuals: Residuals, start: FloatArray, keep: NDArray[np.bool_]) -> 
         return residuals(parameters)[keep].ravel()
 
     return least_squares(flat, start, method="lm", x_scale="jac")
-
-
-def _scaled(information: FloatArray) -> FloatArray:
-    """The information matrix with ones on its diagonal: its rank then does not depend on units."""
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled: FloatArray = information / np.outer(scale, scale)
-    return scaled
 
 
 def angular_spread(rotations: FloatArray) -> float:

@@ -206,7 +206,7 @@ def _check_invariance(result: Comparison, calibration: Calibration | None) -> Re
     from calibration.compare.invariance import invariance
 
     with counted("invariance") as on_step:
-        return invariance(result, calibration, on_step=on_step)
+        return invariance([(result, calibration)], on_step=on_step)
 
 
 def _limits(texts: list[str] | None, option: str) -> list[Limit]:

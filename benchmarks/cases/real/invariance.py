@@ -56,9 +56,9 @@ def invariance(folder: Path, of: BallSet, gel_size: tuple[float, float, float], 
 def _rows(
     source: str, folds: list[tuple[Comparison, Calibration | None]], timing: Timing, note: str
 ) -> list[Measurement]:
-    from calibration.compare.invariance import pooled_invariance
+    from calibration.compare.invariance import invariance as invariance_of
 
-    report = pooled_invariance(folds, GRID)
+    report = invariance_of(folds, GRID)
     rows = [
         Measurement(
             timing, view.rho, "x", "the distance of two real presses that are neighbours in size; 1 is as far",

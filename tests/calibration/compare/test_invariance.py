@@ -101,7 +101,7 @@ def good(real: FrameSet, calibration: Calibration) -> Comparison:
 
 @pytest.fixture(scope="module")
 def report(good: Comparison, calibration: Calibration) -> Report:
-    return invariance(good, calibration)
+    return invariance([(good, calibration)])
 
 
 def test_a_good_simulation_is_nearer_than_the_next_press(report: Report) -> None:
@@ -120,7 +120,8 @@ def test_another_light_is_seen_in_the_picture_but_hardly_in_the_surface(
     """The claim of all this: each source's own calibration brings them together."""
     sensor = HiddenSensor(8)
     own, _ = calibrated(HiddenSensor(8))
-    found = invariance(compare_frames(replace(side(sensor, 6), untouched=()), real, own, calibration), calibration)
+    result = compare_frames(replace(side(sensor, 6), untouched=()), real, own, calibration)
+    found = invariance([(result, calibration)])
     views = {view.view: view for view in found.views}
     assert views["raw"].rho > 1 and views["raw"].auc == 1.0
     assert views["difference"].rho > 1
@@ -135,7 +136,7 @@ def test_a_fresh_reference_saves_from_a_change_of_gain(report: Report) -> None:
 
 
 def test_surfaces_and_drift_are_left_out_with_a_word(real: FrameSet) -> None:
-    found = invariance(compare_frames(replace(real, untouched=()), real))
+    found = invariance([(compare_frames(replace(real, untouched=()), real), None)])
     assert [view.view for view in found.views] == ["raw", "difference"]
     assert found.drifts == () and math.isnan(found.angle)
     assert len(found.notes) == 2
@@ -144,8 +145,9 @@ def test_surfaces_and_drift_are_left_out_with_a_word(real: FrameSet) -> None:
 
 
 def test_too_few_presses_are_refused(real: FrameSet) -> None:
+    few = replace(real, frames=real.frames[:3])
     with pytest.raises(BadFrames, match="3 pairs show contact in B; 4 are needed"):
-        invariance(compare_frames(replace(real, frames=real.frames[:3]), replace(real, frames=real.frames[:3])))
+        invariance([(compare_frames(few, few), None)])
 
 
 def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: Path) -> None:

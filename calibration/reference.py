@@ -78,8 +78,8 @@ def make_reference(image: Float32, valid: NDArray[np.bool_], measured: NDArray[n
     if (mean < MIN_MEAN_LEVEL).any():
         levels = ", ".join(f"{level:.1f}" for level in mean)
         raise UnusableReference(
-            f"reference is dark: mean R, G, B over the gel {levels}, at least {MIN_MEAN_LEVEL:g} each; are the sensor's "
-            "lights on, and is the exposure right?"
+            f"reference is dark: mean R, G, B over the gel {levels}, at least {MIN_MEAN_LEVEL:g} each; are the "
+            "sensor's lights on, and is the exposure right?"
         )
     saturated = float((gel >= SATURATED).any(axis=1).mean())
     if saturated > MAX_SATURATED_SHARE:

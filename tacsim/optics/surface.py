@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +122,9 @@ class SurfaceTable:
         import cv2
 
         rows, columns = self.fields.shape[:2]
-        inside = cv2.inRange(points, (-CONVERGED, -CONVERGED), (columns - 1 + CONVERGED, rows - 1 + CONVERGED))
+        first: Any = (-CONVERGED, -CONVERGED)  # OpenCV 4.13 declares arrays only, and takes these too
+        last: Any = (columns - 1 + CONVERGED, rows - 1 + CONVERGED)
+        inside = cv2.inRange(points, first, last)
         return np.asarray(inside, dtype=np.bool_)
 
 

@@ -32,16 +32,18 @@ from tacsim.physics.exec.lanes import (
     add_to,
     bounded,
     copy_of,
-    lanes,
+    four,
+    load_rows,
     opaque,
     overwrite,
     part_range,
+    put,
     slot_of,
     smallest_lane,
+    store_rows,
     strip,
-    vec2,
+    three,
     vec3,
-    vec4,
 )
 
 Strips = ti.types.ndarray(dtype=strip, ndim=1)  # masses, velocities
@@ -112,51 +114,8 @@ def block_range(env: ti.template(), part):
 
 
 @ti.func
-def load(particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template()):
-    """Rows first, ... of a block of particles, `count` of them. In short loops: LLVM cuts a longer one across the rows,
-    and gathers."""
-    for begin in ti.static(range(0, count, 6)):
-        for r in range(begin, min(begin + 6, count)):
-            start = bounded(at + (first + r) * stride, 1)
-            values = lanes([particles[start + lane] for lane in range(LANES)])
-            for lane in ti.static(range(LANES)):
-                rows[r, lane] = values[lane]
-
-
-@ti.func
-def store(
-    particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template(), zero
-):  # fmt: skip
-    for r in range(count):
-        start = bounded(at + (first + r) * stride, 1)
-        values = lanes([overwrite(zero, particles[start + lane], rows[r, lane]) for lane in range(LANES)])
-        for lane in ti.static(range(LANES)):
-            particles[start + lane] = values[lane]
-
-
-@ti.func
-def three(rows: ti.template(), row: ti.template(), lane):
-    return vec3(rows[row, lane], rows[row + 1, lane], rows[row + 2, lane])
-
-
-@ti.func
-def four(rows: ti.template(), row: ti.template(), lane, spare):
-    """Four numbers of one lane. The write between them keeps LLVM from making a gather of them; spare: a row's number
-    that the compiler does not know."""
-    first = vec2(rows[row, lane], rows[row + 1, lane])
-    rows[spare, lane] = first[0]
-    return vec4(first[0], first[1], rows[row + 2, lane], rows[row + 3, lane])
-
-
-@ti.func
 def six(rows: ti.template(), row: ti.template(), lane):
     return vec6([rows[row + d, lane] for d in range(6)])
-
-
-@ti.func
-def put(rows: ti.template(), row: ti.template(), lane, values: ti.template()):
-    for d in ti.static(range(values.n)):
-        rows[row + d, lane] = values[d]
 
 
 @ti.func
@@ -226,9 +185,9 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
         momentum[MOMENTUM + 3, lane] = mass
     for block in range(first_block, last_block):
         start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
-        load(body.particles, start, stride, layout.POSITION, 3, place)
-        load(body.particles, start, stride, layout.STRAIN, 7, old)
-        load(body.particles, start, stride, layout.VELOCITY, 12, rate)
+        load_rows(body.particles, start, stride, layout.POSITION, 3, place)
+        load_rows(body.particles, start, stride, layout.STRAIN, 7, old)
+        load_rows(body.particles, start, stride, layout.VELOCITY, 12, rate)
         for lane in range(LANES):
             stencil(three(place, 0, lane), slab, grid, indices, lane)
         if limit < ELASTIC:
@@ -264,7 +223,7 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
             put(momentum, MOMENTUM_Z, lane, az)
             for i, j in ti.static(ti.ndrange(3, 3)):
                 shares[3 * i + j, lane] = grid[W_X + i, lane] * grid[W_Y + j, lane]
-        store(body.particles, start, stride, layout.STRAIN, 7, new, zero)
+        store_rows(body.particles, start, stride, layout.STRAIN, 7, new, zero)
         for lane in range(ti.min(LANES, env.count(layout.PARTICLES) - block * LANES)):
             lost += indices[OFF, lane]
             q, ax, ay, az = [four(momentum, row, lane, spare) for row in (MOMENTUM, MOMENTUM_X, MOMENTUM_Y, MOMENTUM_Z)]
@@ -345,8 +304,8 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
         extremes[6, lane] = 1e9
     for block in range(first_block, last_block):
         start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
-        load(body.particles, start, stride, layout.PLANE, 6, place)
-        load(body.particles, start, stride, layout.STRAIN, 6, strain)
+        load_rows(body.particles, start, stride, layout.PLANE, 6, place)
+        load_rows(body.particles, start, stride, layout.STRAIN, 6, strain)
         for lane in range(LANES):
             stencil(three(place, 3, lane), slab, grid, indices, lane)
         count = ti.min(LANES, env.count(layout.PARTICLES) - block * LANES)
@@ -395,9 +354,9 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
                 extremes[d, lane] = ti.max(extremes[d, lane], ti.abs(velocity[d]))
                 extremes[3 + d, lane] += velocity[d]
             extremes[6, lane] = ti.min(extremes[6, lane], volume)
-        store(body.particles, start, stride, layout.PLANE, 6, place, zero)
-        store(body.particles, start, stride, layout.STRAIN, 6, strain, zero)
-        store(body.particles, start, stride, layout.VELOCITY, 12, rate, zero)
+        store_rows(body.particles, start, stride, layout.PLANE, 6, place, zero)
+        store_rows(body.particles, start, stride, layout.STRAIN, 6, strain, zero)
+        store_rows(body.particles, start, stride, layout.VELOCITY, 12, rate, zero)
     record_least(env, slot, layout.SMALLEST_STEP_VOLUME, smallest_lane(extremes, 6))
     fastest = 0.0
     for lane in ti.static(range(LANES)):

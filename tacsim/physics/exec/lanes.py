@@ -97,6 +97,49 @@ def store_lanes(array: ti.template(), at, values, zero):
 
 
 @ti.func
+def load_rows(particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template()):
+    """Rows first, ... of a block of LANES particles, `count` of them. In short loops: LLVM cuts a longer one across the
+    rows, and gathers."""
+    for begin in ti.static(range(0, count, 6)):
+        for r in range(begin, min(begin + 6, count)):
+            start = bounded(at + (first + r) * stride, 1)
+            values = lanes([particles[start + lane] for lane in range(LANES)])
+            for lane in ti.static(range(LANES)):
+                rows[r, lane] = values[lane]
+
+
+@ti.func
+def store_rows(
+    particles: ti.template(), at, stride, first: ti.template(), count: ti.template(), rows: ti.template(), zero
+):  # fmt: skip
+    for r in range(count):
+        start = bounded(at + (first + r) * stride, 1)
+        values = lanes([overwrite(zero, particles[start + lane], rows[r, lane]) for lane in range(LANES)])
+        for lane in ti.static(range(LANES)):
+            particles[start + lane] = values[lane]
+
+
+@ti.func
+def three(rows: ti.template(), row: ti.template(), lane):
+    return vec3(rows[row, lane], rows[row + 1, lane], rows[row + 2, lane])
+
+
+@ti.func
+def four(rows: ti.template(), row: ti.template(), lane, spare):
+    """Four numbers of one lane. The write between them keeps LLVM from making a gather of them; spare: a row's number
+    that the compiler does not know."""
+    first = vec2(rows[row, lane], rows[row + 1, lane])
+    rows[spare, lane] = first[0]
+    return vec4(first[0], first[1], rows[row + 2, lane], rows[row + 3, lane])
+
+
+@ti.func
+def put(rows: ti.template(), row: ti.template(), lane, values: ti.template()):
+    for d in ti.static(range(values.n)):
+        rows[row + d, lane] = values[d]
+
+
+@ti.func
 def smallest_lane(rows: ti.template(), row: ti.template()):
     """Smallest number of a row of lanes."""
     least = rows[row, 0]

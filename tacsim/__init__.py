@@ -78,6 +78,7 @@ if TYPE_CHECKING:
     from tacsim.optics.render import Renderer as Renderer
     from tacsim.optics.surface import surface_map as surface_map
     from tacsim.physics.failure.health import SimulationDiverged as SimulationDiverged
+    from tacsim.physics.motion.load import LoadNotReached as LoadNotReached
     from tacsim.physics.move import MoveStats as MoveStats
     from tacsim.physics.world import World as World
     from tacsim.physics.world import make_world as make_world

@@ -183,7 +183,8 @@ class Worker:
             if self.servo.status != before:
                 self._publish(self.servo.status)
                 if before == ArmStatus.CONNECTING:
-                    parent.send({"connected": True})
+                    with contextlib.suppress(BrokenPipeError):  # the driver has died: the next period sees it
+                        parent.send({"connected": True})
             self.servo.on_command(*self.channel.commands.newest())
             if ending is None and (orphan or self.servo.close_requested):
                 ending = now + (PARENTLESS if orphan else CLOSING)

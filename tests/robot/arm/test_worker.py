@@ -15,7 +15,9 @@ import pytest
 from robot.arm import shared_ring, worker
 from robot.arm.channel import ArmStatus, Channel, WorkerConfig
 from robot.arm.worker_config import worker_config as config_of
+from robot.mock import MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
+from tests.robot.arm.mocked import HOST, PATIENCE, until
 
 ROOT = Path(worker.__file__).parents[2]
 NOBODY = f"127.223.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
@@ -95,3 +97,26 @@ def test_without_memory_to_write_to_it_says_so() -> None:
     done = start(worker_config("tacsim-0-missing"))
     assert done.returncode == worker.FAILED
     assert "No such file" in json.loads(done.stdout)["error"]
+
+
+def test_a_driver_that_died_while_it_connected_leaves_nothing(mock: MockUR) -> None:
+    """Nobody reads the worker's first message: it ends its program and removes the memory all the same."""
+    segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "widow"), Channel.SIZE)
+    try:
+        given = json.dumps(dataclasses.asdict(worker_config(segment.name, host=HOST, parent=1)))  # not this process
+        reader, writer = os.pipe()
+        os.close(reader)
+        with subprocess.Popen(
+            [sys.executable, "-m", "robot.arm.worker"],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdin=subprocess.PIPE,
+            stdout=writer,
+            stderr=subprocess.PIPE,
+        ) as process:
+            os.close(writer)
+            _, errors = process.communicate(given.encode() + b"\n", timeout=PATIENCE)
+        assert (process.returncode, errors.decode()) == (0, "")
+        assert not (shared_ring.FOLDER / segment.name).exists()
+        until(lambda: not mock.faults.state().program, "end of the program")
+    finally:
+        segment.close()

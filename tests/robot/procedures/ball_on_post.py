@@ -19,7 +19,8 @@ SPACING = 0.25e-3
 
 
 class BallOnPost:
-    """While open, draws what the camera in the gel sees of the ball, wherever the arm is.
+    """While open, draws what the camera in the gel sees of the ball where the arm rests; no picture comes while it moves,
+    nor before the new one is drawn, so that no other is taken for it, however slow the machine is.
 
     host: of the mock controller, whose TCP is the flange; base_from_ball: (3,) [m]; flange_from_sensor: the truth.
     """
@@ -58,21 +59,23 @@ class BallOnPost:
         return self._render(GelSurface(values, SPACING, (-GEL[0] / 2, -GEL[1] / 2)))
 
     def _draw(self) -> None:
-        faults, last = FaultClient(self._host), None
+        faults, shown = FaultClient(self._host), None  # the pose of the TCP that the picture belongs to
         while not self._over.is_set():
             try:
-                pose = faults.state().pose
+                state = faults.state()
             except RuntimeError:  # the controller comes and goes with the rig
                 self._over.wait(0.02)
                 continue
-            flange = Pose(np.array(pose[:3]), Rotation.from_rotvec(pose[3:]).as_quat())
+            flange = Pose(np.array(state.pose[:3]), Rotation.from_rotvec(state.pose[3:]).as_quat())
             x, y, z = se3.transform(se3.inverse(se3.compose(flange, self._sensor)), self._ball)
-            depth = self._radius - z
-            self.deepest = max(self.deepest, depth)
-            seen = (x, y, depth) if depth > 0 else None
-            if seen != last:
-                self._camera.push(self.picture(x, y, depth))
-                last = seen
+            self.deepest = max(self.deepest, self._radius - z)
+            if not state.rests or state.pose != shown:
+                self._camera.stall(True)
+                shown = None
+                if state.rests:
+                    self._camera.push(self.picture(x, y, self._radius - z))
+                    self._camera.stall(False)
+                    shown = state.pose
             self._over.wait(2e-3)
         faults.close()
 

@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import sys
-from enum import StrEnum
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from robot.cli.errors import UNUSABLE, complain
 from robot.cli.output import busy, notes
 
-
-class Groups(StrEnum):
-    """What is measured."""
-
-    all = "all"
-    press = "press"
-    squeeze = "squeeze"
-    materials = "materials"
-    scenes = "scenes"
-    real = "real"
-    robot = "robot"
+Group = Literal["all", "press", "squeeze", "materials", "scenes", "real", "robot"]
 
 
 def bench(
-    group: Annotated[Groups, typer.Argument(help="Which cases; all: all but robot.")] = Groups.all,
+    group: Annotated[Group, typer.Argument(help="Which cases; all: all but robot.")] = "all",
     json_: Annotated[
         Path | None,
         typer.Option(
@@ -89,12 +78,12 @@ def bench(
         if docs is not None:
             reports = bench.for_a_page(reports, from_)
     else:
-        if docs is not None and group is not Groups.robot:
+        if docs is not None and group != "robot":
             bench.require_cpu_for_a_page()
         if renew:
             with busy("computing the limit of fine meshes"):
                 bench.renew(notes.print)
-        reports = [bench.measure(group.value, repeat, baselines=baselines, long=long, data=data)]
+        reports = [bench.measure(group, repeat, baselines=baselines, long=long, data=data)]
     bench.show(reports)
     bench.write(reports, json_, docs)
     if any(report.failures for report in reports):

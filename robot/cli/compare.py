@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from robot.cli.errors import complain
-from robot.cli.output import (
-    Out,
-    Overrides,
-    busy,
-    counted,
-    make,
-    new_directory,
-    notes,
-    results,
-    say_files,
-    show_table,
-    warn,
-    writing,
-)
+from robot.cli.options import Out, Overrides
+from robot.cli.output import busy, counted, new_directory, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -32,15 +19,8 @@ if TYPE_CHECKING:
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 LENGTHS = ("height_rmse", "surface_radius", "surface_centroid", "marker_error")  # figures that may carry a unit
+Pair = Literal["auto", "name", "order"]
 Limit = tuple[str, float, bool]  # name, value, True: above it is a failure
-
-
-class Pair(StrEnum):
-    """Which frames belong together."""
-
-    auto = "auto"
-    name = "name"
-    order = "order"
 
 
 def compare(
@@ -61,7 +41,7 @@ def compare(
     corners_b: Annotated[str | None, typer.Option(metavar="U,V U,V U,V U,V", help="The same in B.")] = None,
     sensor_a: Annotated[str, typer.Option(help="Sensor of A, if its episode has more than one.")] = "",
     sensor_b: Annotated[str, typer.Option(help="The same for B.")] = "",
-    pair: Annotated[Pair, typer.Option(help="auto: by name where all names are the same, else in order.")] = Pair.auto,
+    pair: Annotated[Pair, typer.Option(help="auto: by name where all names are the same, else in order.")] = "auto",
     shift: Annotated[bool, typer.Option("--shift/--no-shift", help="Find the shift between A and B.")] = True,
     invariance: Annotated[
         bool, typer.Option("--invariance", help="Also: can a policy tell A from B? (rho, AUC, drift of the light)")
@@ -86,6 +66,7 @@ def compare(
     with busy("loading"):
         from calibration.compare.compare import Options, Pairing
         from calibration.compare.compare import compare_frames as run
+        from calibration.compare.invariance import invariance as measure_invariance
         from calibration.compare.report import figures, write
         from calibration.errors import BadFrames
         from calibration.lens.view import BadCorners
@@ -107,13 +88,16 @@ def compare(
         bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
         made, truth = _rectify_corners(made, truth, (corners_a, corners_b), bundles)
         with counted("comparing") as on_step:
-            result = run(made, truth, bundles[0], bundles[1], Options(Pairing(pair.value), shift), on_step)
-        report = _check_invariance(result, bundles[1]) if invariance else None
+            result = run(made, truth, bundles[0], bundles[1], Options(Pairing(pair), shift), on_step)
+        report = None
+        if invariance:
+            with counted("invariance") as on_step:
+                report = measure_invariance([(result, bundles[1])], on_step=on_step)
     except (BadFrames, BadCorners) as error:
         raise typer.BadParameter(str(error), param_hint="A B") from None
     values = figures(result, report)
     _require_known(limits, values)
-    with writing(make(folder)), busy("writing"):
+    with writing(folder, new=True), busy("writing"):
         written = write(folder, result, report)
     _show(result, report)
     say_files(*written)
@@ -200,13 +184,6 @@ def _corners(text: str) -> Corners:
             param_hint="--corners-a, --corners-b",
         )
     return tuple(points)  # type: ignore[return-value]
-
-
-def _check_invariance(result: Comparison, calibration: Calibration | None) -> Report:
-    from calibration.compare.invariance import invariance
-
-    with counted("invariance") as on_step:
-        return invariance([(result, calibration)], on_step=on_step)
 
 
 def _limits(texts: list[str] | None, option: str) -> list[Limit]:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.bench import require_checkout
-from robot.cli.output import Overrides, busy
+from robot.cli.options import Overrides
+from robot.cli.output import busy
 
 if TYPE_CHECKING:
     from robot.doctor import machine

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -15,15 +14,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 results = Console(highlight=False, soft_wrap=True)  # stdout: what the command found
 notes = Console(stderr=True, highlight=False, soft_wrap=True)  # stderr: what it is doing
-
-Out = Annotated[
-    Path | None,
-    typer.Option("--out", help="New folder for the results; by default one below runs/.", show_default=False),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the configuration; may be repeated."),
-]
 
 
 def new_directory(out: Path | None, what: str) -> Path:
@@ -48,22 +38,12 @@ def new_directory(out: Path | None, what: str) -> Path:
     return folder
 
 
-def make(folder: Path) -> Path:
-    """Makes the folder. Raises FileExistsError when someone else just did, OSError."""
-    folder.mkdir(parents=True)
-    return folder
-
-
-def made(folder: Path) -> Path:
-    """The folder, made unless this command has put something into it already. Raises what :func:`make` does."""
-    return folder if folder.exists() else make(folder)
-
-
 @contextmanager
-def writing(folder: Path) -> Iterator[Path]:
-    """Makes an OSError name `folder` when it names no file: a disk that fills up in the middle of a write says
-    nothing of where."""
+def writing(folder: Path, *, new: bool = False) -> Iterator[Path]:
+    """Makes `folder` where it is missing; `new`: raises FileExistsError when someone else just made it. An OSError in
+    the block that names no file names it: a disk that fills up in the middle of a write says nothing of where."""
     try:
+        folder.mkdir(parents=True, exist_ok=not new)
         yield folder
     except OSError as failure:
         if failure.filename is None:
@@ -136,39 +116,3 @@ def show_table(
     for row in rows:
         table.add_row(*row)
     Console(width=width, highlight=False).print(table)
-
-
-def quantity(kind: str) -> Callable[[str], float]:
-    """Parser of an option that is a length, an angle ... with or without unit."""
-
-    def parse(text: str) -> float:
-        from tacsim.models.quantity import parse as parse_quantity
-
-        try:
-            return parse_quantity(text, kind)
-        except ValueError as error:
-            raise typer.BadParameter(str(error)) from None
-
-    return parse
-
-
-def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
-    """Parser of an option that is `count` lengths, angles ... with commas between."""
-
-    def parse(text: str) -> tuple[float, ...]:
-        parts = text.split(",")
-        if len(parts) != count:
-            raise typer.BadParameter(f"'{text}' has {len(parts)} values, {count} are needed, with commas between")
-        return tuple(quantity(kind)(part.strip()) for part in parts)
-
-    return parse
-
-
-def length(help_: str) -> Any:
-    """An option that is a length."""
-    return typer.Option(parser=quantity("length"), metavar="LENGTH", help=help_)
-
-
-def angle(help_: str) -> Any:
-    """An option that is an angle."""
-    return typer.Option(parser=quantity("angle"), metavar="ANGLE", help=help_)

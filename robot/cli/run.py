@@ -12,7 +12,8 @@ import typer
 
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import Out, Overrides, ask, busy, make, new_directory, notes, progress, results, writing
+from robot.cli.options import Out, Overrides
+from robot.cli.output import ask, busy, new_directory, notes, progress, results, writing
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
@@ -93,7 +94,7 @@ def _run(
 
             def record(meta: EpisodeMeta) -> Recorder:
                 nonlocal recorder
-                with writing(make(folder)):
+                with writing(folder, new=True):
                     file = Recorder(folder / "episode.mcap", meta, pitch=loaded.config.canonical.pitch)
                     recorder = stack.enter_context(file)
                 return recorder
@@ -161,7 +162,7 @@ def replay(
         notes.print(f"The recording ended without its footer; {len(episode.steps)} steps could be read.")
     if not episode.steps:
         raise EpisodeError(f"{file}: no step can be read, there is nothing to show")
-    make(folder)
+    folder.mkdir(parents=True)
     _report(episode, folder, [])
 
 

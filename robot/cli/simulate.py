@@ -3,47 +3,18 @@
 from __future__ import annotations
 
 import json
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import (
-    Out,
-    Overrides,
-    angle,
-    busy,
-    length,
-    make,
-    new_directory,
-    notes,
-    progress,
-    quantities,
-    results,
-    say_files,
-    writing,
-)
+from robot.cli.options import Out, Overrides, angle, length, quantities
+from robot.cli.output import busy, new_directory, notes, progress, results, say_files, writing
 
 if TYPE_CHECKING:
-    from tacsim.models.scene import Scene, Shape
+    from tacsim.models.scene import Shape
     from tacsim.report.figure4 import Trial
-
-
-class Preset(StrEnum):
-    """Resolution of a simulation."""
-
-    draft = "draft"
-    standard = "standard"
-
-
-class Physics(StrEnum):
-    """Which schemes the reproduction runs."""
-
-    both = "both"
-    hybrid = "hybrid"
-    seed = "seed"
 
 
 def press(
@@ -59,7 +30,7 @@ def press(
         Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
     ] = "5 mm, 5 mm, 5 mm",
     scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
-    preset: Annotated[Preset, typer.Option(help="Resolution.")] = Preset.standard,
+    preset: Annotated[Literal["draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -73,7 +44,9 @@ def press(
 
     folder = new_directory(out, "press")
     scene = load_scene("press", [f"preset={preset}", *(set_ or [])])
-    scene = _with_indenter(scene, _geometry(indenter, radius, height, size, scale))
+    if scene.indenter is not None:  # else the press refuses the scene
+        shape = _geometry(indenter, radius, height, size, scale)
+        scene = scene.model_copy(update={"indenter": scene.indenter.model_copy(update={"geometry": shape})})
     sensor = load_sensor("ideal")
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
         from robot.studies import press as presses
@@ -83,7 +56,7 @@ def press(
         with dumps_in(folder / "diverged"):
             pressed = presses.press(scene, sensor, motion)
     config = presses.press_report(scene, motion, pressed, sensor)
-    with writing(make(folder)):
+    with writing(folder, new=True):
         presses.write(folder, pressed, config)
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
@@ -116,14 +89,10 @@ def _geometry(indenter: str, radius: float, height: float, size: tuple[float, ..
     return shape
 
 
-def _with_indenter(scene: Scene, geometry: Shape) -> Scene:
-    if scene.indenter is None:
-        raise typer.BadParameter("this scene has no indenter; press needs one", param_hint="--set")
-    return scene.model_copy(update={"indenter": scene.indenter.model_copy(update={"geometry": geometry})})
-
-
 def reproduce(
-    physics: Annotated[Physics, typer.Option(help="The seed's scheme, ours (hybrid), or both.")] = Physics.both,
+    physics: Annotated[
+        Literal["both", "hybrid", "seed"], typer.Option(help="The seed's scheme, ours (hybrid), or both.")
+    ] = "both",
     out: Out = None,
 ) -> None:
     """Repeat the seed paper's experiment: fig4.png and fig4.json; exit code 1 if its result does not come out.
@@ -134,7 +103,7 @@ def reproduce(
     Example: tacsim reproduce --physics hybrid --out fig4
     """
     folder = new_directory(out, "reproduce")
-    schemes = ["seed", "hybrid"] if physics is Physics.both else [physics.value]
+    schemes = ["seed", "hybrid"] if physics == "both" else [physics]
     with busy("loading"):
         from robot.studies import experiment
         from tacsim.physics.failure.dump import dumps_in
@@ -151,10 +120,9 @@ def reproduce(
             complain("stopped by a signal; nothing is written")
             raise typer.Exit(interrupt.exit_code) from None
     trials = {task: {scheme: found[task, scheme] for scheme in schemes} for task in experiment.EXPERIMENTS}
-    make(folder)
     picture, table = folder / "fig4.png", folder / "fig4.json"
-    table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    with busy("drawing"):
+    with writing(folder, new=True), busy("drawing"):
+        table.write_text(json.dumps(experiment.as_json(trials), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         figure4(trials, picture)
     say_files(picture, table)
     if _judge(trials):

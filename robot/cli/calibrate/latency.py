@@ -8,7 +8,8 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import Overrides, ask, busy, length, notes, results
+from robot.cli.options import Overrides, length
+from robot.cli.output import ask, busy, notes, results
 
 
 def latency(
@@ -16,8 +17,8 @@ def latency(
     arm: Annotated[str, typer.Option("--arm", help="The arm that taps.")],
     sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries.")],
     taps: Annotated[int, typer.Option(min=3, max=100, help="How many; more make it surer.")] = 8,
-    depth: Annotated[Any, length("How deep, beyond the first touch.")] = "0.2 mm",
-    lift: Annotated[Any, length("How far back between taps.")] = "1 mm",
+    depth: Annotated[Any, length("How deep, beyond the first touch.", 1e-6, 5e-3)] = "0.2 mm",
+    lift: Annotated[Any, length("How far back between taps.", 1e-6, 5e-3)] = "1 mm",
     set_: Overrides = None,
 ) -> None:
     """Measure how late a camera is: its arm taps on something firm, and both records are laid over each other.
@@ -33,9 +34,6 @@ def latency(
     from robot.procedures.taps import TapPlan, latency_entries, record_taps, without_latency
     from tacsim.config import load_rig
 
-    for option, value in (("--depth", depth), ("--lift", lift)):
-        if not 0.0 < value <= 5e-3:
-            raise typer.BadParameter(f"{1e3 * value:g} mm; allowed: above 0, at most 5 mm", param_hint=option)
     config = load_rig(rig, overrides=set_ or []).config
     opened = without_latency(config, arm, sensor)
     with Interrupt() as interrupt:

@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import led, named_camera, picture_keeper
-from robot.cli.output import (
-    Out,
-    Overrides,
-    busy,
-    made,
-    new_directory,
-    progress,
-    quantities,
-    results,
-    say_files,
-    show_table,
-    writing,
-)
+from robot.cli.options import Out, Overrides, quantities
+from robot.cli.output import busy, new_directory, progress, results, say_files, show_table, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -169,7 +158,7 @@ def _fit_lens(pictures: Path, board: Board, folder: Path) -> None:
         f"focal length {lens_.focal[0]:.1f}, {lens_.focal[1]:.1f} px; centre {lens_.centre[0]:.1f}, "
         f"{lens_.centre[1]:.1f} px; residual {lens_.residual:.2f} px"
     )
-    with writing(made(folder)):
+    with writing(folder):
         say_files(_write(folder / "lens.yaml", lens_))
 
 
@@ -215,7 +204,7 @@ def _report_view(view: GelView, image: NDArray[np.uint8], folder: Path) -> None:
         f"pixel on the sensor's axis; the gel, {1e3 * view.size[0]:.2f} x {1e3 * view.size[1]:.2f} mm, becomes "
         f"{geometry.width} x {geometry.height} px"
     )
-    with writing(made(folder)):
+    with writing(folder):
         (folder / "rectified.png").write_bytes(encode_png(np.rint(to_metric(view)(image)).astype(np.uint8)))
         say_files(_write(folder / "view.yaml", view), folder / "rectified.png")
 

@@ -13,19 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import confirm_motion, led, tell_left_out
-from robot.cli.output import (
-    Out,
-    Overrides,
-    angle,
-    busy,
-    length,
-    made,
-    new_directory,
-    results,
-    say_files,
-    show_table,
-    writing,
-)
+from robot.cli.options import Out, Overrides, angle, length
+from robot.cli.output import busy, new_directory, results, say_files, show_table, writing
 
 if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise
@@ -45,15 +34,17 @@ def touch(
     rig: Rig = None,
     arm: Annotated[str, typer.Option("--arm", help="The arm that touches; with --rig.")] = "",
     sensor: Annotated[str, typer.Option("--sensor", help="The sensor that it carries; with --rig.")] = "",
-    ball_radius: Annotated[Any, length("Of the ball; with --rig.")] = None,
+    ball_radius: Annotated[Any, length("Of the ball; with --rig.", 0.5e-3, 50e-3)] = None,
     number: Annotated[int, typer.Option("--touches", min=6, max=200, help="How many; more make it surer.")] = 24,
-    tilt: Annotated[Any, angle("Largest tilt of the sensor.")] = "25 deg",
-    spread: Annotated[Any, length("How far from the middle of the gel the ball is met.")] = "3 mm",
-    depth: Annotated[Any, length("How deep the ball is pressed into the gel.")] = "0.4 mm",
-    lift: Annotated[Any, length("How far back along the sensor's axis between touches.")] = "6 mm",
-    noise_centre: Annotated[Any, length("Standard deviation of the contact's centre, each axis.")] = "0.03 mm",
-    noise_depth: Annotated[Any, length("Standard deviation of the depth.")] = "0.05 mm",
-    noise_robot: Annotated[Any, length("Standard deviation of the arm's position, each axis.")] = "0.05 mm",
+    tilt: Annotated[Any, angle("Largest tilt of the sensor.", 0.15, 0.8)] = "25 deg",
+    spread: Annotated[Any, length("How far from the middle of the gel the ball is met.", 0.5e-3, 20e-3)] = "3 mm",
+    depth: Annotated[Any, length("How deep the ball is pressed into the gel.", 0.05e-3, 2e-3)] = "0.4 mm",
+    lift: Annotated[Any, length("How far back along the sensor's axis between touches.", 2e-3, 50e-3)] = "6 mm",
+    noise_centre: Annotated[
+        Any, length("Standard deviation of the contact's centre, each axis.", 1e-6, 1e-2)
+    ] = "0.03 mm",
+    noise_depth: Annotated[Any, length("Standard deviation of the depth.", 1e-6, 1e-2)] = "0.05 mm",
+    noise_robot: Annotated[Any, length("Standard deviation of the arm's position, each axis.", 0.0, 1e-2)] = "0.05 mm",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -68,11 +59,7 @@ def touch(
     from calibration.poses.ball_touch import TouchNoise
     from calibration.poses.records import read_touches
 
-    noise = TouchNoise(
-        _within(noise_centre, 1e-6, 1e-2, "--noise-centre"),
-        _within(noise_depth, 1e-6, 1e-2, "--noise-depth"),
-        _within(noise_robot, 0.0, 1e-2, "--noise-robot"),
-    )
+    noise = TouchNoise(noise_centre, noise_depth, noise_robot)
     _one_source(touches, rig)
     folder = new_directory(out, "touch")
     if touches is not None:
@@ -83,14 +70,7 @@ def touch(
     assert rig is not None
     if not (arm and sensor and ball_radius):
         raise typer.BadParameter("with --rig, give --arm, --sensor and --ball-radius")
-    plan = BallTouchPlan(
-        ball_radius=_within(ball_radius, 0.5e-3, 50e-3, "--ball-radius"),
-        touches=number,
-        tilt=_within(tilt, 0.15, 0.8, "--tilt"),
-        spread=_within(spread, 0.5e-3, 20e-3, "--spread"),
-        depth=_within(depth, 0.05e-3, 2e-3, "--depth"),
-        lift=_within(lift, 2e-3, 50e-3, "--lift"),
-    )
+    plan = BallTouchPlan(ball_radius, number, tilt, spread, depth, lift)
     _report_touch(_take_touches(rig, arm, sensor, plan, set_ or [], folder), noise, folder, arm)
 
 
@@ -124,7 +104,7 @@ def _recording(
     from calibration.poses.records import write_record
 
     def write(record: TouchFile | BoardPoseFile) -> None:
-        with writing(made(path.parent)):
+        with writing(path.parent):
             write_record(path, record)
 
     again = f"tacsim calibrate {command} {shlex.quote(str(path))}"
@@ -175,10 +155,10 @@ def hand_eye(
     board: Annotated[str, typer.Option(help="charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]; with --rig.")] = "",
     fixed: Annotated[bool, typer.Option("--fixed", help="The camera stands, the board rides; with --rig.")] = False,
     number: Annotated[int, typer.Option("--poses", min=6, max=200, help="How many; more make it surer.")] = 20,
-    tilt: Annotated[Any, angle("Largest tilt about each axis.")] = "30 deg",
-    pivot: Annotated[Any, length("How far before the sensor the point is that it turns about.")] = "0 mm",
-    noise_board: Annotated[Any, length("Standard deviation of the board's place, each axis.")] = "0.5 mm",
-    noise_turn: Annotated[Any, angle("The same of its direction.")] = "0.15 deg",
+    tilt: Annotated[Any, angle("Largest tilt about each axis.", 0.1, 1.0)] = "30 deg",
+    pivot: Annotated[Any, length("How far before the sensor the point is that it turns about.", 0.0, 2.0)] = "0 mm",
+    noise_board: Annotated[Any, length("Standard deviation of the board's place, each axis.", 1e-6, 0.1)] = "0.5 mm",
+    noise_turn: Annotated[Any, angle("The same of its direction.", 1e-6, math.radians(20.0))] = "0.15 deg",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -196,10 +176,7 @@ def hand_eye(
     from calibration.poses.hand_eye import HandEyeNoise
     from calibration.poses.records import read_board_poses
 
-    noise = HandEyeNoise(
-        board=_within(noise_board, 1e-6, 0.1, "--noise-board"),
-        board_turn=_within(noise_turn, 1e-6, math.radians(20.0), "--noise-turn"),
-    )
+    noise = HandEyeNoise(board=noise_board, board_turn=noise_turn)
     _one_source(poses, rig)
     folder = new_directory(out, "hand-eye")
     if poses is not None:
@@ -215,13 +192,7 @@ def hand_eye(
     described = parse_board(board)
     if described.kind == "dots":
         raise CalibrationError("a lattice of dots looks the same from two sides: use a ChArUco board for hand-eye")
-    plan = BoardPosePlan(
-        board=described,
-        lens=load(Lens, lens),
-        poses=number,
-        tilt=_within(tilt, 0.1, 1.0, "--tilt"),
-        pivot=_within(pivot, 0.0, 2.0, "--pivot"),
-    )
+    plan = BoardPosePlan(described, load(Lens, lens), number, tilt, pivot)
     _report_hand_eye(_take_board_poses(rig, arm, camera, plan, set_ or [], folder, fixed=fixed), noise, folder)
 
 
@@ -284,12 +255,6 @@ def _one_source(file: Path | None, rig: str | None) -> None:
         raise typer.BadParameter("give either a file of recorded poses, or --rig to measure now")
 
 
-def _within(value: float, low: float, high: float, option: str) -> float:
-    if not low <= value <= high:
-        raise typer.BadParameter(f"{value:g}; allowed: {low:g} to {high:g} (SI units)", param_hint=option)
-    return value
-
-
 def _show_fit(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]], used: tuple[bool, ...]) -> None:
     marked = ((*row, "" if good else "disagrees, left out") for row, good in zip(rows, used, strict=True))
     show_table(title, (*columns, ""), marked)
@@ -307,6 +272,6 @@ def _placement(pose: Pose) -> str:
 
 def _write_report(folder: Path, name: str, report: dict[str, Any]) -> None:
     path = folder / name
-    with writing(made(folder)):
+    with writing(folder):
         path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     say_files(path)

@@ -9,20 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
-from robot.cli.output import (
-    Out,
-    Overrides,
-    busy,
-    length,
-    made,
-    new_directory,
-    notes,
-    results,
-    say_files,
-    show_table,
-    warn,
-    writing,
-)
+from robot.cli.options import Out, Overrides, length
+from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.bundle import Calibration
@@ -189,7 +177,7 @@ def _write(
         )
     noise = _noise(read)
     bundle = _bundle(fit, serial, ball, pitch, [frame.name for frame in read.frames], found, view, noise)
-    with writing(made(folder)):
+    with writing(folder):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
             written.append(folder / "residuals.png")

@@ -12,7 +12,7 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import ask, made, notes, progress, writing
+from robot.cli.output import ask, notes, progress, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,7 +81,7 @@ def picture_keeper(folder: Path) -> Callable[[tuple[str, NDArray[np.uint8]]], No
     from tacsim.record.images import encode_png
 
     def keep(picture: tuple[str, NDArray[np.uint8]]) -> None:
-        with writing(made(folder)):
+        with writing(folder):
             (folder / picture[0]).write_bytes(encode_png(picture[1]))
 
     return keep

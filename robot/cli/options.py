@@ -1,0 +1,58 @@
+"""Options that several commands have, and how a quantity on the command line is read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", help="New folder for the results; by default one below runs/.", show_default=False),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the configuration; may be repeated."),
+]
+
+
+def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
+    """Parser of an option that is a length, an angle ... with or without unit, `low` to `high` in SI units."""
+
+    def parse(text: str) -> float:
+        from tacsim.models.quantity import parse as parse_quantity
+
+        try:
+            value = parse_quantity(text, kind)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+        if not low <= value <= high:
+            raise typer.BadParameter(f"{value:g}; allowed: {low:g} to {high:g} (SI units)")
+        return value
+
+    return parse
+
+
+def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
+    """Parser of an option that is `count` lengths, angles ... with commas between."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        parts = text.split(",")
+        if len(parts) != count:
+            raise typer.BadParameter(f"'{text}' has {len(parts)} values, {count} are needed, with commas between")
+        return tuple(quantity(kind)(part.strip()) for part in parts)
+
+    return parse
+
+
+def length(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
+    """An option that is a length, `low` to `high` [m]."""
+    return typer.Option(parser=quantity("length", low, high), metavar="LENGTH", help=help_)
+
+
+def angle(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
+    """An option that is an angle, `low` to `high` [rad]."""
+    return typer.Option(parser=quantity("angle", low, high), metavar="ANGLE", help=help_)

@@ -19,8 +19,10 @@ SPACING = 0.25e-3
 
 
 class BallOnPost:
-    """While open, draws what the camera in the gel sees of the ball where the arm rests. No picture comes while it moves,
-    nor before the new one is drawn: none of another pose is taken for it, however slow the machine is.
+    """While open, draws what the camera in the gel sees of the ball where the arm rests.
+
+    No picture comes while it moves, nor before the new one is drawn: none of another pose is taken for it, however slow
+    the machine is.
 
     host: of the mock controller, whose TCP is the flange; base_from_ball: (3,) [m]; flange_from_sensor: the truth.
     """

@@ -60,6 +60,14 @@ class Rig:
         admittance: holds normal forces, whatever the actions ask along the z axis of the sensors.
     """
 
+    # By name; for what needs more than an observation a period: calibration, inspection.
+    sensors: Mapping[str, TactileSource]
+    arms: Mapping[str, Arm]
+    normalisers: Mapping[str, Normaliser]  # by sensor
+    # Native, by sensor; empty before the first.
+    frames: Mapping[str, TactileFrame]  # of the last observation
+    references: Mapping[str, TactileFrame]  # without contact, that the last reset took
+
     def __init__(
         self,
         *,
@@ -79,42 +87,15 @@ class Rig:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
         self.name = name
-        self._sensors, self._arms, self._clock = dict(sensors), dict(arms), clock
-        self._normalisers, self._reset, self._truth = dict(normalisers), reset, truth
-        self._diagnostics, self._gather, self._admittance = diagnostics, gather, admittance
-        self._on_tactile, self._on_close = on_tactile, on_close
+        self.sensors, self.arms, self.normalisers = dict(sensors), dict(arms), dict(normalisers)
+        self._clock, self._reset, self._truth, self._diagnostics = clock, reset, truth, diagnostics
+        self._gather, self._admittance, self._on_tactile, self._on_close = gather, admittance, on_tactile, on_close
         self._arm_states: Mapping[str, ArmState] = {}
-        self._frames: Mapping[str, TactileFrame] = {}
-        self._references: Mapping[str, TactileFrame] = {}
+        self.frames = self.references = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
         self.spec = RigSpec(sensors=specs, arms=tuple(arms), truth=truth is not None, period=clock.period)
         # A sensor that no arm carries may be addressed by its own name: the action is recorded, nothing moves.
         self._addressable = set(arms) | {sensor for sensor, spec in specs.items() if spec.arm is None}
-
-    @property
-    def sensors(self) -> Mapping[str, TactileSource]:
-        """By name; for what needs more than an observation a period: calibration, inspection."""
-        return self._sensors
-
-    @property
-    def arms(self) -> Mapping[str, Arm]:
-        """By name; see `sensors`."""
-        return self._arms
-
-    @property
-    def normalisers(self) -> Mapping[str, Normaliser]:
-        """By sensor; see `sensors`."""
-        return self._normalisers
-
-    @property
-    def frames(self) -> Mapping[str, TactileFrame]:
-        """Native frames of the last observation, by sensor; empty before the first."""
-        return self._frames
-
-    @property
-    def references(self) -> Mapping[str, TactileFrame]:
-        """Native frames without contact that the last reset took, by sensor; empty before the first reset."""
-        return self._references
 
     def require(self, needs: Needs, who: str) -> None:
         """Raises IncompatibleRig with the difference when `who` needs what this rig does not deliver."""
@@ -125,9 +106,9 @@ class Rig:
 
     def reset(self, seed: int = 0) -> Observation:
         """Starts an episode: references without contact, then gentle contact. The same seed gives the same start."""
-        self._references = dict(self._reset.clear(seed))
-        for name, normaliser in self._normalisers.items():
-            normaliser.take_reference(self._references[name])
+        self.references = dict(self._reset.clear(seed))
+        for name, normaliser in self.normalisers.items():
+            normaliser.take_reference(self.references[name])
         self._reset.touch()
         if self._admittance is not None:
             self._admittance.reset()
@@ -138,13 +119,13 @@ class Rig:
 
         Raises TimeoutError without a frame, EndOfEpisode after a recording.
         """
-        reads = [partial(sensor.read, READ_TIMEOUT) for sensor in self._sensors.values()]
-        frames = dict(zip(self._sensors, self._gather(reads), strict=True))
-        exposed = {self._sensors[name].spec.arm: frame.time for name, frame in frames.items()}
-        arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self._arms.items()}
+        reads = [partial(sensor.read, READ_TIMEOUT) for sensor in self.sensors.values()]
+        frames = dict(zip(self.sensors, self._gather(reads), strict=True))
+        exposed = {self.sensors[name].spec.arm: frame.time for name, frame in frames.items()}
+        arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self.arms.items()}
         now = self._clock.now()
-        tactile = {name: self._normalisers[name](frame, now) for name, frame in frames.items()}
-        self._frames, self._arm_states = frames, arms
+        tactile = {name: self.normalisers[name](frame, now) for name, frame in frames.items()}
+        self.frames, self._arm_states = frames, arms
         if self._on_tactile is not None:
             self._on_tactile(tactile)
         return Observation(tactile=tactile, arms=arms, time=now)
@@ -158,7 +139,7 @@ class Rig:
         check_action(action, self._addressable, self.name)
         if self._admittance is not None:
             action = self._admittance(action, self._arm_states)
-        sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self._arms.items()}
+        sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
         if self._admittance is not None:
             self._admittance.sent(sent)
         self._clock.tick()
@@ -172,19 +153,19 @@ class Rig:
         """Numbers about the last control step, e.g. the residual of the simulation's settling; those of a sensor, such
         as `stale_upper`, end in its name."""
         found = dict(self._diagnostics())
-        for name, normaliser in self._normalisers.items():
+        for name, normaliser in self.normalisers.items():
             found |= {f"{key}_{name}": value for key, value in normaliser.diagnostics().items()}
         return found
 
     def stop(self) -> None:
         """Stops all arms, each even when another fails to stop."""
-        _each([arm.stop for arm in self._arms.values()])
+        _each([arm.stop for arm in self.arms.values()])
 
     def close(self) -> None:
         """Stops the arms and closes everything, each even when another fails."""
-        arms = [step for arm in self._arms.values() for step in (arm.stop, arm.close)]
+        arms = [step for arm in self.arms.values() for step in (arm.stop, arm.close)]
         others = [] if self._on_close is None else [self._on_close]
-        _each([*arms, *(sensor.close for sensor in self._sensors.values()), *others])
+        _each([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
 
     def __enter__(self) -> Self:
         return self

@@ -43,13 +43,7 @@ class Admittance:
     """
 
     def __init__(self, loads: Mapping[str, float], longest: float) -> None:
-        """loads: normal force by arm name, positive when pressed [N]; longest: correction of one period [m].
-
-        Raises ValueError for what is not positive.
-        """
-        for name, value in {**loads, "the longest correction": longest}.items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"constant load: {name} must be a positive number, got {value!r}")
+        """loads: normal force by arm name, > 0 when pressed [N]; longest: correction of one period, > 0 [m]."""
         self.loads, self._longest = dict(loads), longest
         self._axes: dict[str, _NormalAxis] = {}
 

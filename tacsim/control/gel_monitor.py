@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,9 +71,8 @@ class GelMonitor:
         seen = min((touch.time for touch in tactile.values()), default=math.nan)
         shown = {name: depth_and_shear(tactile[name]) for name in self._carried if name in tactile}
         for arm, report in self._report.items():
-            own = [shown[name] for name, carrier in self._carried.items() if carrier == arm and name in shown]
-            depth, shear = _worst(depth for depth, _ in own), _worst(shear for _, shear in own)
-            report(GelReading(seen, depth, shear))
+            own = [found for name, found in shown.items() if self._carried[name] == arm] or [(math.nan, math.nan)]
+            report(GelReading(seen, *np.max(own, axis=0).tolist()))  # NaN if any is: what is not measured is not safe
         for name, found in shown.items():
             arm = self._carried[name]
             limits = self._limits.get(arm)
@@ -87,9 +86,3 @@ class GelMonitor:
                         f"gel of sensor '{name}': {what} {shown_as}, limits.{what} of arm '{arm}' is "
                         f"{1e3 * limit:.3g} mm; the arms are stopped. Move them apart, then begin a new episode"
                     )
-
-
-def _worst(values: Iterable[float]) -> float:
-    """The greatest; NaN if there is none, or if any is NaN: what is not measured is not safe."""
-    found = list(values)
-    return math.nan if not found or any(map(math.isnan, found)) else max(found)

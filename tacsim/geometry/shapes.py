@@ -88,8 +88,6 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     Raises ValueError when the lattice misses the shape's size (or a mesh's volume) by more than 10 %, holds no
     particle, or more than 5,000,000; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
     """
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise ValueError(f"particle spacing must be a positive length [m], got {spacing}")
     size = extent(geometry)
     estimate, lattice = volume(geometry) / spacing**3, np.prod(size / spacing)
     if estimate > MAX_PARTICLES or lattice > MAX_NODES:
@@ -101,11 +99,7 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     _check_layers(geometry, size, spacing, layers)
     axes = tuple((np.arange(n) - (n - 1) / 2) * spacing for n in layers)
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    if isinstance(geometry, Box):
-        return nodes
-    if isinstance(geometry, Cylinder):  # layers along z fit already; the disc decides
-        inside = np.hypot(nodes[:, 0], nodes[:, 1]) <= geometry.radius
-    elif isinstance(geometry, Mesh):
+    if isinstance(geometry, Mesh):
         surface = make_surface(centred(geometry))
         inside = signed_distance_on_grid(surface, (axes[0], axes[1], axes[2]), 2 * spacing).ravel() <= 0
     else:
@@ -146,11 +140,9 @@ def _check_layers(geometry: Shape, size: FloatArray, spacing: float, layers: NDA
 def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
     """Signed distance (n,) [m] of `points` (n, 3) [m] from the surface: exact, Euclidean, negative inside.
 
-    Raises ValueError on another shape or non-finite points; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    Raises what :func:`tacsim.geometry.mesh.load_mesh` raises.
     """
     at = np.asarray(points, dtype=np.float64)
-    if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
-        raise ValueError(f"points must be finite with shape (n, 3) [m], got shape {at.shape}")
     match geometry:
         case Sphere():
             return np.asarray(np.linalg.norm(at, axis=1) - geometry.radius, dtype=np.float64)
@@ -216,11 +208,8 @@ def distance_grid(geometry: Mesh, spacing: float) -> DistanceGrid:
     It takes a second or more, so the process remembers the latest: asked again for the same spacing and the same bytes
     of the same file, it gives the same object, whose arrays are read-only.
 
-    Raises ValueError on a bad spacing, or more than 20,000,000 nodes; and what :func:`tacsim.geometry.mesh.load_mesh`
-    raises.
+    Raises ValueError for more than 20,000,000 nodes, and what :func:`tacsim.geometry.mesh.load_mesh` raises.
     """
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise ValueError(f"grid spacing must be a positive length [m], got {spacing}")
     return _mesh_grid(geometry, fingerprint(geometry.path), spacing)
 
 

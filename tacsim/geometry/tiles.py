@@ -82,6 +82,4 @@ def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:
     return _remembered(geometry, fingerprint(geometry.path), spacing)
 
 
-@lru_cache(maxsize=REMEMBERED)
-def _remembered(geometry: Mesh, content: str, spacing: float) -> TiledDistance:
-    return TiledDistance(geometry, content, spacing)
+_remembered = lru_cache(maxsize=REMEMBERED)(TiledDistance)

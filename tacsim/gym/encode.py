@@ -90,11 +90,6 @@ def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
     return spaces.Box(-bound, bound, value.shape, np.float32)
 
 
-def action_space(axes: Sequence[Axis]) -> spaces.Space[NDArray[np.float32]]:
-    """Box(-1, 1) with one component for each free axis."""
-    return spaces.Box(-1.0, 1.0, (len(axes),), np.float32)
-
-
 def action_from(
     vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
 ) -> Action:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tacsim.gym import encode
 from tacsim.gym.plugin import register_envs
-from tacsim.interface import Needs, Observation, Pose, Truth
+from tacsim.interface import Needs, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
@@ -43,7 +43,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self.rig, self.task, self.render_mode = rig, task, render_mode
         self._begin(seed=0)
         self.observation_space = encode.space_of(self._flat)
-        self.action_space = encode.action_space(task.axes)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(task.axes),), np.float32)
         self._finished = True  # until the user's own reset
 
     def _begin(self, seed: int) -> None:
@@ -53,10 +53,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._truth_at_start = self._truth()
         self._count = 0
         self._finished = False
-        self._encode(observation)
-
-    def _encode(self, observation: Observation) -> None:
-        self._flat = encode.flatten(observation, self._start)
+        self._flat: encode.Flat = encode.flatten(observation, self._start)
 
     def _truth(self) -> Truth:
         truth = self.rig.truth()
@@ -89,7 +86,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             flat = {key: value.copy() for key, value in self._flat.items()}
             return flat, reward, exceeded, not exceeded, info | {"limit" if exceeded else "diverged": str(failure)}
         self._targets |= {name: pose for name, pose in sent.items() if pose is not None}
-        self._encode(observation)
+        self._flat = encode.flatten(observation, self._start)
         reward, info = self._judged()
         return self._flat, reward, False, self._count >= self.task.config.steps, info
 

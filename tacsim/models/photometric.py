@@ -11,6 +11,7 @@ No term is constant: the flat gel shows I0. Degree 1 at position 0 is the most t
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Self
 
 import numpy as np
@@ -47,7 +48,7 @@ class PhotometricModel(Config):
 
 def term_count(degree: int, position: int) -> int:
     """Number of terms, that is of weights a channel."""
-    return len(_powers(degree)) * len(_places(position))
+    return math.comb(degree + 2, 2) * math.comb(position + 2, 2)
 
 
 def normal_terms(gradient: NDArray[np.floating], degree: int) -> NDArray[np.floating]:
@@ -119,13 +120,3 @@ class PhotometricLight:
         at_places = self._weights @ normal_terms(slopes, self._model.degree).reshape(self._terms, -1)
         change = np.einsum("pcn,pn->cn", at_places.reshape(len(places), 3, -1), places)
         return np.asarray(cv2.merge(list(change)), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
-
-
-def _powers(degree: int) -> list[tuple[int, int]]:
-    """Powers of nx, ny of the terms; (0, 0) stands for 1 - nz."""
-    higher = [(order - b, b) for order in range(2, degree + 1) for b in range(order + 1)]
-    return [(1, 0), (0, 1), (0, 0), *higher]
-
-
-def _places(position: int) -> list[tuple[int, int]]:
-    return [(order - b, b) for order in range(position + 1) for b in range(order + 1)]

@@ -117,39 +117,27 @@ class RigConfig(Config):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for name, sensor in self.sensors.items():
-            if sensor.arm is not None and sensor.arm not in self.arms:
-                raise PydanticCustomError(
-                    "no_such_arm",
-                    "no arm '{arm}'; allowed: {arms}",
-                    # `at`: the wrong entry, as pydantic writes locations (tacsim.config shows its line)
-                    {
-                        "arm": sensor.arm,
-                        "arms": ", ".join(self.arms) or "(none)",
-                        "at": ("sensors", name, sensor.driver, "arm"),
-                    },
-                )
+            if sensor.arm is not None:
+                self._require_arm(sensor.arm, "sensors", name, sensor.driver, "arm")
         for index, apart in enumerate(self.keep_out):
             for name in apart.arms:
-                if name not in self.arms:
-                    raise PydanticCustomError(
-                        "no_such_arm",
-                        "no arm '{arm}'; allowed: {arms}",
-                        {"arm": name, "arms": ", ".join(self.arms) or "(none)", "at": ("keep_out", index, "arms")},
-                    )
+                self._require_arm(name, "keep_out", index, "arms")
         if isinstance(self.task, RepositionConfig):
             for name, load in self.task.loads.items():
                 self._check_load(name, load)
         return self
 
+    def _require_arm(self, arm: str, *at: str | int) -> None:
+        """`at`: the entry that names the arm, as pydantic writes locations (tacsim.config shows its line)."""
+        if arm not in self.arms:
+            context = {"arm": arm, "arms": ", ".join(self.arms) or "(none)", "at": at}
+            raise PydanticCustomError("no_such_arm", "no arm '{arm}'; allowed: {arms}", context)
+
     def _check_load(self, name: str, load: float) -> None:
         """The arm that holds a load of the task must exist, and must not stop at that force."""
         at = ("task", "reposition", "loads", name)
-        arm = self.arms.get(name)
-        if arm is None:
-            arms = ", ".join(self.arms) or "(none)"
-            raise PydanticCustomError(
-                "no_such_arm", "no arm '{arm}'; allowed: {arms}", {"arm": name, "arms": arms, "at": at}
-            )
+        self._require_arm(name, *at)
+        arm = self.arms[name]
         limits = None if isinstance(arm, ReplayArmConfig) else arm.limits
         if limits is not None and not load < limits.force:
             raise PydanticCustomError(

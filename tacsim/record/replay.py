@@ -40,15 +40,11 @@ class ReplayClock:
     def __init__(self, period: float) -> None:
         if not period > 0.0:
             raise ValueError(f"the period of a replay must be above 0 s, got {period}")
-        self._period = period
+        self.period = period
         self.index = 0
 
-    @property
-    def period(self) -> float:
-        return self._period
-
     def now(self) -> float:
-        return self.index * self._period
+        return self.index * self.period
 
     def tick(self) -> None:
         self.index += 1

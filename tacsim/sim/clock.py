@@ -23,7 +23,7 @@ class SimClock:
 
     def __init__(self, world: World, period: float, motion: SimMotion = "settled") -> None:
         self._world = world
-        self._period = period
+        self.period = period  # [s]
         self._motion = motion
         self._targets: dict[str, Pose] = {}
         self._limited: dict[str, bool] = {}  # by frame: a guard changed the last command
@@ -33,10 +33,6 @@ class SimClock:
         self.velocities: Mapping[
             str, FloatArray
         ] = {}  # (6,) by frame: mean of the last period, world axes [m/s, rad/s]
-
-    @property
-    def period(self) -> float:
-        return self._period
 
     def now(self) -> float:
         return self._time
@@ -59,15 +55,15 @@ class SimClock:
         targets, self._targets = self._targets, {}
         before = {frame: self._world.pose(frame) for frame in targets}
         if self._motion == "dynamic":
-            self.stats = self._world.move(targets, duration=self._period)
+            self.stats = self._world.move(targets, duration=self.period)
         elif targets or (self.stats is not None and not self.stats.settled):
             self.stats = self._world.move(targets, flow=self._motion == "flowing")
         elif self.stats is not None:
             self.stats = replace(self.stats, substeps=0, hold=0)
         self.velocities = {
-            frame: se3.difference(old, self._world.pose(frame)) / self._period for frame, old in before.items()
+            frame: se3.difference(old, self._world.pose(frame)) / self.period for frame, old in before.items()
         }
-        self._time += self._period
+        self._time += self.period
         self.version += 1
 
     def restart(self, stats: MoveStats | None = None) -> None:

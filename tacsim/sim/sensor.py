@@ -33,15 +33,11 @@ class SimSensor:
         sample: Callable[[GelSurface], SurfaceMap],
         noise: NoiseSource | None = None,
     ) -> None:
-        self._world, self._clock, self._frame, self._spec = world, clock, frame, spec
+        self._world, self._clock, self._frame, self.spec = world, clock, frame, spec
         self._render, self._sample, self._noise = render, sample, noise
         self._newest: TactileFrame | None = None
         self._version = -1  # of the world in the newest frame
         self._index = self._episode = 0
-
-    @property
-    def spec(self) -> SensorSpec:
-        return self._spec
 
     def read(self, timeout: float) -> TactileFrame:
         """The picture of the world now; `timeout` makes no difference."""

@@ -60,24 +60,10 @@ def judge(task: Task, truth: Truth, start: Truth) -> Outcome:
     )
 
 
-def tolerance(
-    x: float, bounds: tuple[float, float] = (0.0, 0.0), margin: float = 0.0, value_at_margin: float = 0.1
-) -> float:
-    """1 for x within `bounds`, falling as a Gaussian to `value_at_margin` at `margin` outside, 0 outside for margin 0.
+def tolerance(x: float, bounds: tuple[float, float], margin: float) -> float:
+    """1 for x within `bounds` (low, high), falling as a Gaussian to 0.1 at `margin` > 0 outside.
 
     The shaping of Tassa et al. 2018 (DeepMind Control Suite, section 3), Gaussian sigmoid.
-    Raises ValueError for reversed bounds, a negative margin, or value_at_margin outside (0, 1).
     """
-    low, high = bounds
-    if not low <= high:
-        raise ValueError(f"tolerance: bounds must be (low, high) with low <= high, got {bounds}")
-    if not margin >= 0:
-        raise ValueError(f"tolerance: margin must be >= 0, got {margin}")
-    if not 0 < value_at_margin < 1:
-        raise ValueError(f"tolerance: value_at_margin must lie in (0, 1), got {value_at_margin}")
-    outside = max(low - x, x - high, 0.0)
-    if outside == 0.0:
-        return 1.0
-    if margin == 0.0:
-        return 0.0
-    return math.exp(math.log(value_at_margin) * (outside / margin) ** 2)
+    outside = max(bounds[0] - x, x - bounds[1], 0.0)
+    return math.exp(math.log(0.1) * (outside / margin) ** 2)

@@ -128,7 +128,7 @@ def test_sensors_are_read_the_way_they_are_gathered() -> None:
 
     lower.read = dark  # type: ignore[method-assign]
     rig = make_rig(upper, gather=last_first)
-    rig._sensors["thumb"], rig._normalisers["thumb"] = lower, lower
+    rig.sensors["thumb"], rig.normalisers["thumb"] = lower, lower
     rig.observe()
     assert seen == [2]
     assert [rig.frames[name].image.max() for name in ("finger", "thumb")] == [7, 3]

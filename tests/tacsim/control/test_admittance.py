@@ -129,12 +129,6 @@ def test_a_force_that_is_no_number_moves_nothing(felt: float) -> None:
         holding()(Action({}), {"hand": state})
 
 
-@pytest.mark.parametrize("load", [0.0, -1.0, np.nan, np.inf])
-def test_a_load_is_positive(load: float) -> None:
-    with pytest.raises(ValueError, match="positive"):
-        holding(load)
-
-
 def test_only_tasks_that_name_loads_hold_them() -> None:
     assert held_loads(None) is None
     assert held_loads(SqueezeConfig(kind="squeeze")) is None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from tacsim.models.scene import Body, BodyMaterial, Box, GelMaterial, Indenter, Scene, Settling, Sphere
+from tacsim.models.quantity import Config
+from tacsim.models.rig import RepositionConfig, RigConfig, SimArmConfig, SqueezeConfig
+from tacsim.models.scene import Body, BodyMaterial, Box, GelMaterial, Indenter, Mesh, Scene, Settling, Sphere
 from tacsim.models.sensor import CanonicalGrid
 
 
@@ -24,6 +27,28 @@ from tacsim.models.sensor import CanonicalGrid
 def test_a_resolution_that_no_machine_or_no_gel_has_is_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         Scene.model_validate(values)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize(
+    ("model", "key"),
+    [
+        (Scene, "particle_spacing"),
+        (Scene, "element_size"),
+        (Mesh, "scale"),
+        (SqueezeConfig, "success"),
+        (SqueezeConfig, "reward_scale"),
+        (RepositionConfig, "max_step"),
+        (RepositionConfig, "loads"),
+        (RigConfig, "period"),
+        (SimArmConfig, "speed"),
+        (SimArmConfig, "turn_rate"),
+    ],
+)
+def test_what_must_be_positive_is_refused_where_it_enters(model: type[Config], key: str, value: float) -> None:
+    """Spacing of particles, scale of meshes, bounds of the score, loads, longest step: nothing behind asks again."""
+    with pytest.raises(ValidationError, match=key):
+        model.model_validate({key: {"upper": value} if key == "loads" else value})
 
 
 def test_the_coarsest_gel_has_two_layers() -> None:

@@ -218,7 +218,7 @@ class Normaliser(Protocol):
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation: ...
 
     def diagnostics(self) -> Mapping[str, float]:
-        """How trustworthy the last observation is (tacsim.report.trust). Empty for sources that know their surface."""
+        """How trustworthy the last observation is (tacsim.report). Empty for sources that know their surface."""
         ...
 
 

@@ -22,7 +22,7 @@ from tacsim.control.gel_monitor import GelMonitor
 from tacsim.interface import Normaliser, Pose, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.report.timing import ALIGNMENT, LIMITS
+from tacsim.report.diagnostics import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
 
 Confirm = Callable[[str], bool]

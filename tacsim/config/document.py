@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 import yaml
 
-from tacsim.config.errors import ConfigError, Place, Problem, printable
+from tacsim.config.errors import Place, Problem, printable
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
@@ -77,11 +77,6 @@ class LoadState:
 
     def report(self, place: Place, key: str, text: str) -> None:
         self.problems.append(Problem(place, key, text))
-
-    def raise_problems(self) -> None:
-        """Raises ConfigError when there is any problem."""
-        if self.problems:
-            raise ConfigError(self.problems)
 
 
 class _Forbidden(yaml.MarkedYAMLError):
@@ -143,34 +138,30 @@ def read_text(path: Path, refuse: Callable[[str], None], state: LoadState) -> st
     """
     try:
         mode = path.stat()
-        if stat.S_ISDIR(mode.st_mode):
-            raise _Unreadable("is a folder; give a YAML file")
         if not stat.S_ISREG(mode.st_mode):
-            raise _Unreadable("is no regular file; give a YAML file")
-        if mode.st_size > MAX_BYTES:
-            raise _Unreadable(f"has {mode.st_size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:.0f} MB is allowed")
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise _Unreadable(f"grew over {MAX_BYTES / 1e6:.0f} MB while it was read")
+            what = "is a folder" if stat.S_ISDIR(mode.st_mode) else "is no regular file"
+            refuse(f"'{shown(path)}' {what}; give a YAML file")
+            return None
+        size = mode.st_size
+        if size <= MAX_BYTES:
+            with path.open("rb") as file:
+                content = file.read(MAX_BYTES + 1)
+            size = len(content)  # it may have grown
+        if size > MAX_BYTES:
+            refuse(f"'{shown(path)}' has {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:.0f} MB is allowed")
+            return None
         state.sources.append(path)
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         what = f"byte 0x{content[error.start]:02x} is not UTF-8; save the file as UTF-8 text"
         state.report(Place(shown(path), line), "", what)
-    except _Unreadable as error:
-        refuse(f"'{shown(path)}' {error}")
     except FileNotFoundError:
         refuse(f"there is no file '{shown(path)}'")
     except (OSError, ValueError) as error:
         what = getattr(error, "strerror", None) or str(error)
         refuse(f"cannot read '{shown(path)}': {what}")
     return None
-
-
-class _Unreadable(Exception):
-    """Why a file is not opened."""
 
 
 def shown(path: Path) -> str:

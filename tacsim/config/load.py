@@ -14,8 +14,7 @@ from tacsim.config.document import LoadState, Node, as_json, dump, from_plain
 from tacsim.config.errors import ConfigError, Place, Problem
 from tacsim.config.kinds import NotFound, is_name, kind_of, shipped_file
 from tacsim.config.messages import report_errors
-from tacsim.config.overrides import Override, apply, parse_override
-from tacsim.config.references import read_file
+from tacsim.config.references import Override, apply, parse_override, read_file
 from tacsim.models.hardware import UrArmConfig, weakened_limits
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
@@ -201,5 +200,6 @@ def _validate(annotation: Any, root: Node, state: LoadState) -> Any:
             config = TypeAdapter(annotation).validate_json(as_json(root), strict=True)
         except ValidationError as error:
             report_errors(error, root, annotation, state)
-    state.raise_problems()
+    if state.problems:
+        raise ConfigError(state.problems)
     return config

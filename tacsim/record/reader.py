@@ -1,21 +1,43 @@
-"""Reads episodes, finished or cut off: as a whole, or step by step."""
+"""Reads episodes, finished or cut off: as a whole, or step by step.
+
+The readers of the `mcap` package need a finished file and trust the lengths in it. Here each length is checked
+against the size of the file before anything is read; `mcap` parses the records themselves.
+Format: https://mcap.dev/spec
+"""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+import io
+import struct
+import zlib
+from collections.abc import Callable, Container, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 
-from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
 
 from tacsim.interface import TactileFrame
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.messages import decode_step
-from tacsim.record.recovery import read_records
 from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, unsealed
 
 MAX_MEMORY = 4 << 30  # [bytes] of arrays in one episode in memory
+MAX_RECORD = 256 << 20  # [bytes]
+_HEAD = struct.Struct("<BQ")  # opcode, length
+_PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.METADATA: Metadata.read,
+}
 
 
 def read_episode(path: Path | str, *, max_memory: int = MAX_MEMORY) -> Episode:
@@ -64,7 +86,7 @@ class EpisodeFile:
         except OSError as failure:
             raise EpisodeError(f"{self.path}: cannot be opened: {failure.strerror}") from failure
         try:
-            self._records = read_records(self._file, self.path.stat().st_size, str(self.path))
+            self._records = _read_records(self._file, self.path.stat().st_size, str(self.path))
             self.meta = self._read_meta()
         except BaseException:
             self._file.close()
@@ -146,3 +168,73 @@ def _memory(frame: TactileFrame) -> int:
         return frame.image.nbytes
     flow = 0 if frame.surface.flow is None else frame.surface.flow.nbytes
     return frame.image.nbytes + frame.surface.height.nbytes + frame.surface.gradient.nbytes + flow
+
+
+class _BadRecord(Exception):
+    """The readable part of the file ends here."""
+
+
+def _read_records(file: BinaryIO, size: int, what: str) -> Iterator[McapRecord]:
+    """Records in file order, chunks unpacked, without indexes and statistics.
+
+    Ends without an exception at the first record that is cut off or damaged. The last record is a Footer only if the
+    file was finished. Raises EpisodeError for a file that is not MCAP or has compressed chunks.
+    """
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
+    try:
+        for record in _records(file, size - len(MCAP0_MAGIC)):
+            if isinstance(record, Chunk):
+                yield from _open_chunk(record, what)
+            elif isinstance(record, Footer):
+                if file.read(len(MCAP0_MAGIC) + 1) == MCAP0_MAGIC:
+                    yield record
+                return
+            else:
+                yield record
+    except _BadRecord:
+        return
+
+
+def _records(stream: BinaryIO, size: int) -> Iterator[McapRecord]:
+    """Parsed records of the next `size` bytes."""
+    left = size
+    while left >= _HEAD.size:
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            raise _BadRecord
+        opcode, length = _HEAD.unpack(head)
+        left -= _HEAD.size + length
+        if left < 0 or length > MAX_RECORD or opcode not in Opcode.__members__.values():
+            raise _BadRecord
+        body = stream.read(length)
+        if len(body) < length:
+            raise _BadRecord
+        record = _parse(opcode, body)
+        if record is not None:
+            yield record
+    if left:
+        raise _BadRecord
+
+
+def _parse(opcode: int, body: bytes) -> McapRecord | None:
+    """The record; None for kinds that episodes do not need. No read reaches beyond `body`."""
+    stream = ReadDataStream(io.BytesIO(body))
+    try:
+        if opcode == Opcode.MESSAGE:
+            message: McapRecord = Message.read(stream, len(body))
+            return message
+        if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]).to_bytes(4, "little") != body[-4:]:
+            raise _BadRecord
+        parse = _PARSERS.get(opcode)
+        return None if parse is None else parse(stream)
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError, ValueError) as failure:
+        raise _BadRecord from failure
+
+
+def _open_chunk(chunk: Chunk, what: str) -> Iterator[McapRecord]:
+    if chunk.compression in ("zstd", "lz4"):
+        raise EpisodeError(f"{what}: compressed chunks ({chunk.compression}); run 'mcap decompress' on it first")
+    if chunk.compression or zlib.crc32(chunk.data) != chunk.uncompressed_crc:
+        raise _BadRecord
+    yield from _records(io.BytesIO(chunk.data), len(chunk.data))

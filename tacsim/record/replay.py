@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from tacsim.interface import ArmState, EndOfEpisode, Pose, SensorSpec, TactileFrame
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig
 from tacsim.record.episode import EpisodeError
-from tacsim.record.gripper import finger_states, read_columns
 from tacsim.record.images import read_image, reference_image
 from tacsim.record.sources import (
     EPISODES,
@@ -25,9 +24,11 @@ from tacsim.record.sources import (
     episode_frames,
     episode_meta,
     episode_states,
+    finger_states,
     folder_images,
     list_pictures,
     only_or_named,
+    read_columns,
     unknown_source,
     video_images,
     video_rate,
@@ -120,7 +121,7 @@ class ReplayArm:
     """Recorded states as an Arm that executes nothing.
 
     The source is an episode (the arm of this name, or its only one), or the CSV file of a parallel gripper with one row
-    for each frame (frames and signs: :func:`tacsim.record.gripper.finger_states`). The arm called "lower" is the lower
+    for each frame (frames and signs: :func:`tacsim.record.sources.finger_states`). The arm called "lower" is the lower
     finger, any other the upper one.
 
     Raises EpisodeError when the source is missing, empty, unreadable, or has no such arm or column.

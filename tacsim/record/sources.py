@@ -1,23 +1,26 @@
-"""Reads recordings frame by frame: episodes, folders of pictures, videos."""
+"""Reads recordings frame by frame: episodes, folders of pictures, videos; and the CSV record of a parallel gripper."""
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.interface import ArmState, EndOfEpisode, TactileFrame
+from tacsim.interface import ArmState, EndOfEpisode, Pose, TactileFrame
 from tacsim.record.episode import EpisodeError, EpisodeMeta
 from tacsim.record.images import FORMATS, MAX_SIDE, image_size, read_image
 from tacsim.record.reader import EpisodeFile
 
 EPISODES = (".mcap",)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+MAX_CSV = 64 << 20  # [bytes]
 VIDEOS = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
 if TYPE_CHECKING:
@@ -101,8 +104,7 @@ def list_pictures(folder: Path) -> list[Path]:
         raise EpisodeError(f"{folder}: no pictures in this folder ({', '.join(PICTURES)})")
     rows, columns = image_size(paths[0])
     for path in paths[1:]:
-        if image_size(path) != (rows, columns):
-            other = image_size(path)
+        if (other := image_size(path)) != (rows, columns):
             raise EpisodeError(
                 f"{path}: {other[1]} x {other[0]} pixels, but {paths[0].name} has {columns} x {rows}; "
                 "all pictures of a folder must have one size"
@@ -119,11 +121,8 @@ def video_rate(path: Path) -> float | None:
     """Frames per second of a video; None when it does not contain that. Raises EpisodeError."""
     import cv2
 
-    capture = _open_video(path)
-    try:
+    with _opened_video(path) as capture:
         rate = capture.get(cv2.CAP_PROP_FPS)
-    finally:
-        capture.release()
     return rate if math.isfinite(rate) and 0 < rate <= 1000 else None
 
 
@@ -131,32 +130,29 @@ def video_images(path: Path) -> Iterator[NDArray[np.uint8]]:
     """(H, W, 3) RGB pictures of a video, decoded one by one. Raises EpisodeError, also for a video without frames."""
     import cv2
 
-    capture = _open_video(path)
-    try:
-        count = 0
-        while True:
-            there, image = capture.read()
-            if not there:
-                break
-            count += 1
-            yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        if count == 0:
+    with _opened_video(path) as capture:
+        there, image = capture.read()
+        if not there:
             raise EpisodeError(f"{path}: a video without frames")
-    finally:
-        capture.release()
+        while there:
+            yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            there, image = capture.read()
 
 
-def _open_video(path: Path) -> cv2.VideoCapture:
+@contextmanager
+def _opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
     import cv2
 
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # other backends may take a name for a device or a pipeline
-    if not capture.isOpened():
-        raise EpisodeError(f"{path}: no readable video, or one without frames")
-    columns, rows = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    if not (0 < columns <= MAX_SIDE and 0 < rows <= MAX_SIDE):
+    try:
+        if not capture.isOpened():
+            raise EpisodeError(f"{path}: no readable video, or one without frames")
+        columns, rows = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if not (0 < columns <= MAX_SIDE and 0 < rows <= MAX_SIDE):
+            raise EpisodeError(f"{path}: {columns:.0f} x {rows:.0f} pixels; at most {MAX_SIDE} are allowed each way")
+        yield capture
+    finally:
         capture.release()
-        raise EpisodeError(f"{path}: {columns:.0f} x {rows:.0f} pixels; at most {MAX_SIDE} are allowed each way")
-    return capture
 
 
 def _natural(path: Path) -> list[str | int]:
@@ -172,3 +168,74 @@ def unknown_source(path: Path) -> EpisodeError:
         f"{path}: no recording; give an episode ({', '.join(EPISODES)}), a folder of pictures ({', '.join(FORMATS)}) "
         f"or a video ({', '.join(VIDEOS)})"
     )
+
+
+def read_columns(path: Path, names: list[str]) -> list[tuple[float, ...]]:
+    """The named columns of a CSV file with a header, one tuple for each row.
+
+    Raises EpisodeError for a file that is missing or too large, a missing column, a value that is not a finite number,
+    and a column `frame` that does not count the rows from 0.
+    """
+    try:
+        if path.stat().st_size > MAX_CSV:
+            raise EpisodeError(f"{path}: {path.stat().st_size} bytes; at most {MAX_CSV} are read")
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return _rows(csv.DictReader(file, skipinitialspace=True), path, names)
+    except (OSError, UnicodeDecodeError, csv.Error) as failure:
+        raise EpisodeError(f"{path}: no readable CSV file: {failure}") from failure
+
+
+def _rows(reader: csv.DictReader[str], path: Path, names: list[str]) -> list[tuple[float, ...]]:
+    header = [column.strip() for column in reader.fieldnames or []]
+    reader.fieldnames = header
+    for name in names:
+        if name not in header:
+            raise EpisodeError(f"{path}: no column '{name}'; it has: {', '.join(header) or '(nothing)'}")
+    rows = []
+    for number, row in enumerate(reader):
+        rows.append(tuple(_number(row[name], path, reader.line_num, name) for name in names))
+        if "frame" in header and _number(row["frame"], path, reader.line_num, "frame") != number:
+            raise EpisodeError(
+                f"{path}:{reader.line_num}: frame {row['frame']} in row {number}; give each frame a row, from 0"
+            )
+    if not rows:
+        raise EpisodeError(f"{path}: a header without rows")
+    return rows
+
+
+def _number(text: str | None, path: Path, line: int, column: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise EpisodeError(f"{path}:{line}: column '{column}': '{text or ''}' is not a finite number")
+    return value
+
+
+def finger_states(rows: list[tuple[float, ...]], period: float, lower: bool) -> list[ArmState]:
+    """Arm states of one finger of a parallel gripper from (force [N],) or (force [N], opening [m]) a row.
+
+    World is the gripper: origin midway between the fingers, z along the closing direction. The fingers close evenly:
+    the upper one sits at z = +opening / 2 and faces down, the lower one at -opening / 2 and faces up. Without an
+    opening the pose stays at the origin. A pressing force pushes the sensor back into its mount: wrench Fz = -force;
+    the other five components were not measured and are 0. Twist: difference to the row before over `period` [s].
+    """
+    side = -1.0 if lower else 1.0
+    quaternion = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x
+    states: list[ArmState] = []
+    before = None
+    for number, (force, *opening) in enumerate(rows):
+        z = side * opening[0] / 2.0 if opening else 0.0
+        speed = 0.0 if before is None else (z - before) / period
+        before = z
+        states.append(
+            ArmState(
+                pose=Pose(np.array([0.0, 0.0, z]), quaternion),
+                twist=np.array([0.0, 0.0, speed, 0.0, 0.0, 0.0]),
+                wrench=np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0]),
+                joints=None,
+                time=number * period,
+            )
+        )
+    return states

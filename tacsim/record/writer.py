@@ -162,7 +162,7 @@ class Recorder:
     def _schema(self, schema: str | type[Message]) -> int:
         if schema not in self._schemas:
             if isinstance(schema, str):
-                text = _json_schema(schema)
+                text = json.dumps({"title": schema, **JSON_SCHEMAS[schema].model_json_schema()}).encode()
                 self._schemas[schema] = self._writer.register_schema(schema, SchemaEncoding.JSONSchema, text)
             else:
                 self._schemas[schema] = register_schema(self._writer, schema)
@@ -196,7 +196,3 @@ def _start(file: BinaryIO, meta: EpisodeMeta) -> Writer:
 def _flush(writer: Writer) -> None:
     """The chunk in progress goes to the file, the file to the operating system."""
     writer.flush()  # type: ignore[no-untyped-call]
-
-
-def _json_schema(name: str) -> bytes:
-    return json.dumps({"title": name, **JSON_SCHEMAS[name].model_json_schema()}).encode()

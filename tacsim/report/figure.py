@@ -77,7 +77,10 @@ def _literal(text: str) -> str:
 
 def sensors_of(episode: Episode) -> list[str]:
     """Sensor names, top to bottom as they stand on the bench: `upper` first, then by name."""
-    names = {name for step in episode.steps for name in step.frames}
+    return _upper_first({name for step in episode.steps for name in step.frames})
+
+
+def _upper_first(names: Collection[str]) -> list[str]:
     return sorted(names, key=lambda name: (name != "upper", name))
 
 
@@ -88,8 +91,7 @@ def moments(count: int, wanted: int) -> list[int]:
 
 def _colours(names: Collection[str]) -> list[tuple[str, str]]:
     """A colour for each name, the same in every plot of an episode; upper first."""
-    ordered = sorted(names, key=lambda name: (name != "upper", name))
-    return [(name, COLOURS[number % len(COLOURS)]) for number, name in enumerate(ordered)]
+    return [(name, COLOURS[number % len(COLOURS)]) for number, name in enumerate(_upper_first(names))]
 
 
 def goal_text(goal: float | tuple[float, ...] | None) -> str:
@@ -236,8 +238,7 @@ def plots(episode: Episode) -> Figure:
     """Reward, distance, force, timing and contact signal over the steps, as far as the episode has them."""
     height = 3.1 * _rows(episode)
     figure = canvas(WIDTH, height)
-    place = figure.add_gridspec(1, 1, left=0.045, right=0.985, bottom=0.5 / height, top=1 - 0.3 / height)[0]
-    _draw_plots(figure, place, episode)
+    _draw_plots(figure, _band(figure, 0.3, height - 0.8), episode)
     return figure
 
 

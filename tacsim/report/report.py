@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tacsim.record.episode import Episode, Step
+from tacsim.record.episode import Episode
+from tacsim.report.diagnostics import timing, timing_rows, trust, trust_rows
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,16 +24,14 @@ def summary(episode: Episode) -> dict[str, Any]:
     """An episode in numbers, as JSON; lists have one entry for each control step (none for the state after reset).
 
     `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
-    `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.report.timing; null unless the rig is
-    live), `trust` (tacsim.report.trust; null if sensors know their surface). Unknown and infinite values are null.
+    `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.report.diagnostics; null unless the
+    rig is live), `trust` (the same; null if sensors know their surface). Unknown and infinite values are null.
     """
     from tacsim.report.figure import contact_signals, normal_force, signal_against_force
-    from tacsim.report.timing import timing
-    from tacsim.report.trust import trust
 
     meta, done = episode.meta, [step for step in episode.steps if step.index > 0]
     signals = contact_signals(Episode(meta, done))
-    settled = _settled(done)
+    settled = [bool(step.info["settled"]) for step in done if "settled" in step.info]
     return {
         "rig": meta.rig,
         "task": meta.task,
@@ -48,7 +47,7 @@ def summary(episode: Episode) -> dict[str, Any]:
         "correlation": {name: _number(pair[2]) for name, pair in signal_against_force(episode).items()},
         "seconds_per_step": _number(statistics.median(step.seconds for step in done)) if done else None,
         "seconds": [_number(step.seconds) for step in done],
-        "settled": settled,
+        "settled": sum(settled) if settled else None,
         "timing": timing(episode),
         "trust": trust(episode),
         "complete": episode.complete,
@@ -94,9 +93,6 @@ def end_table(stats: Mapping[str, Any], paths: Iterable[Path]) -> Table:
 
 
 def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
-    from tacsim.report.timing import timing_rows
-    from tacsim.report.trust import trust_rows
-
     known = [(value, k) for k, value in zip(stats["step"], stats["distance"], strict=True) if value is not None]
     best = min(known, default=None)
     rewards = [value for value in stats["reward"] if value is not None]
@@ -150,11 +146,6 @@ def _headline(stats: Mapping[str, Any], episode: Episode) -> list[tuple[str, str
 
 def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
-
-
-def _settled(done: list[Step]) -> int | None:
-    settled = [step.info["settled"] for step in done if "settled" in step.info]
-    return sum(bool(value) for value in settled) if settled else None
 
 
 def _inline(content: bytes) -> str:

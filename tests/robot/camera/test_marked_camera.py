@@ -23,8 +23,8 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
+from tacsim.report.diagnostics import trust
 from tacsim.report.report import end_table, summary
-from tacsim.report.trust import trust
 from tacsim.rig import Rig
 from tacsim.tasks.grip import Grip
 from tests.tacsim.optics.surfaces import dent, flat

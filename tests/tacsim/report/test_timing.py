@@ -9,7 +9,7 @@ import pytest
 
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.report.timing import timing, timing_rows
+from tacsim.report.diagnostics import timing, timing_rows
 
 IMAGE = np.zeros((4, 4, 3), np.uint8)
 

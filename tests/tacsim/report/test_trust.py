@@ -12,8 +12,8 @@ from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
+from tacsim.report.diagnostics import trust, trust_rows
 from tacsim.report.report import end_table, summary, write_report
-from tacsim.report.trust import trust, trust_rows
 
 IMAGE = np.zeros((40, 40, 3), np.uint8)
 

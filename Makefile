@@ -14,7 +14,7 @@ CORE := .venv/installed-core-$(VERSION)
 DEV := .venv/installed-dev-$(VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-deep test-all test-gpu test-extras lock clean python
+.PHONY: help run test check test-deep test-all test-gpu test-extras reliability lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -24,6 +24,7 @@ help:
 	@echo "make check        the same without the tests"
 	@echo "make test-all     make test, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
+	@echo "make reliability  what is promised of arms and cameras, measured by its tests, for docs/reliability.md"
 	@echo "make test-extras  tests that need heavy extras"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
@@ -57,6 +58,10 @@ test-gpu: $(DEV)
 	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench all --long --json benchmarks/gpu/report.json
 	@$(BIN)/tacsim bench --from benchmarks/reference.json --from benchmarks/gpu/report.json --docs docs
 	@echo "To publish the figures, commit benchmarks/gpu and docs."
+
+# The promises' tests, each several times, and the page of their figures. Wants an idle machine.
+reliability: $(DEV)
+	@$(BIN)/tacsim bench robot --long --json benchmarks/reliability.json --docs docs
 
 test-extras:
 	@echo "No heavy extras yet: nothing to test."

@@ -1,4 +1,4 @@
-"""Opens rigs. The only place that asks what kind of sensors and arms stand behind one."""
+"""Opens rigs: chooses the kind of rig by the drivers that its file names."""
 
 from __future__ import annotations
 

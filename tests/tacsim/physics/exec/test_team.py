@@ -76,6 +76,7 @@ def ask(sync: team.Sync, found: Found):
 
 def test_teams_fit_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tacsim.compute.threads.cores", lambda: 4)
+    monkeypatch.delenv("TACSIM_THREADS", raising=False)
     assert [team.team_size(n) for n in (1, 2, 3, 8)] == [4, 2, 1, 1]
     monkeypatch.setenv("TACSIM_THREADS", "1")
     assert team.team_size(1) == 1

@@ -10,14 +10,7 @@ import numpy as np
 
 from robot.arm import shared_ring
 from robot.common.tcp import ArmFrames
-from robot.errors import (
-    DeviceError,
-    DeviceNotConnectedError,
-    EmergencyStop,
-    LinkLost,
-    ProtectiveStop,
-    SafetyViolation,
-)
+from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, LinkLost, ProtectiveStop, SafetyViolation
 from tacsim.interface import FloatArray
 
 HISTORY = 1024  # state records that are kept: two seconds

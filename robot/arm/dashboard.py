@@ -8,8 +8,8 @@ from __future__ import annotations
 import re
 import socket
 import time
-from typing import Self
 
+from robot.common import Closing
 from robot.errors import DeviceError, DeviceNotConnectedError, EmergencyStop, ProtectiveStop
 
 PORT = 29999
@@ -17,7 +17,7 @@ LONGEST_LINE = 4096
 UNLOCK_PATIENCE = 8.0  # a controller refuses to unlock in the first 5 s after a protective stop [s]
 
 
-class Dashboard:
+class Dashboard(Closing):
     """One session; a context manager. Every failure is a DeviceNotConnectedError that names the host."""
 
     def __init__(self, host: str, timeout: float = 2.0) -> None:
@@ -101,12 +101,6 @@ class Dashboard:
 
     def close(self) -> None:
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def _value(answer: str) -> str:

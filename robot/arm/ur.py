@@ -13,30 +13,18 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Self
 
 import numpy as np
 
 from robot.arm import shared_ring
-from robot.arm.channel import (
-    HISTORY,
-    ArmStatus,
-    Channel,
-    CommandKind,
-    command_record,
-    tactile_record,
-)
+from robot.arm.channel import HISTORY, ArmStatus, Channel, CommandKind, command_record, tactile_record
 from robot.arm.dashboard import Dashboard
 from robot.arm.worker_config import check_host, worker_config
+from robot.common import Closing
 from robot.common.kinematics import Kinematics
 from robot.common.process import Child
 from robot.common.tcp import pose_of
-from robot.errors import (
-    DeviceAlreadyConnectedError,
-    DeviceError,
-    DeviceNotConnectedError,
-    StaleObservationError,
-)
+from robot.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleObservationError
 from tacsim import pose as se3
 from tacsim.control.gel_monitor import GelReading
 from tacsim.interface import Action, ArmState, Pose
@@ -61,7 +49,7 @@ class Timing:
     cycles: int  # periods of this worker
 
 
-class URArm:
+class URArm(Closing):
     """One UR arm, real or mock; implements tacsim.interface.Arm. A context manager.
 
     Args:
@@ -240,12 +228,6 @@ class URArm:
             self._others.clear()
             del self._channel
             self._segment.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     # -- the worker ----------------------------------------------------------------------------------------------
 

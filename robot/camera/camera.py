@@ -11,10 +11,11 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal
 
 from robot.camera.capture import Capture, open_capture, source_kind
 from robot.camera.picture import DamagedFrame, Picture, WrongSource
+from robot.common import Closing
 from robot.common import stamp as strip
 from robot.errors import DeviceError, DeviceNotConnectedError, StaleObservationError
 from tacsim.interface import EndOfEpisode, SensorSpec, TactileFrame
@@ -47,7 +48,7 @@ class CameraStatus:
     error: str | None  # why it is not open, or what ended the last opening
 
 
-class Camera:
+class Camera(Closing):
     """A `TactileSource` that reads the source its configuration names.
 
     `read` gives the newest frame, at once if it is within the age limit. Between two exposures that is the same frame
@@ -145,12 +146,6 @@ class Camera:
         if self._thread is not threading.current_thread():
             self._thread.join(CLOSE_TIMEOUT)
         atexit.unregister(self.close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _await_first(self, timeout: float) -> None:
         with self._changed:

@@ -31,8 +31,8 @@ class Capture(Protocol):
         ...
 
     def interrupt(self) -> None:
-        """Makes a `read` in another thread return soon."""
-        ...
+        """Makes a `read` in another thread return soon; nothing to do where it does so anyway."""
+        return
 
     def close(self) -> None: ...
 
@@ -75,7 +75,7 @@ def source_kind(config: CameraSensorConfig, name: str) -> str:
     return kind
 
 
-class UvcCapture:
+class UvcCapture(Capture):
     """A UVC camera of Linux (V4L2) by its serial path: size, rate, exposure, white balance are set and read back."""
 
     live = True
@@ -141,14 +141,11 @@ class UvcCapture:
         picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         return Picture(picture, arrival, exposure if 0.0 <= arrival - exposure < 1.0 else None)
 
-    def interrupt(self) -> None:
-        """Nothing to do: a read waits READ_TIMEOUT at most."""
-
     def close(self) -> None:
         self._capture.release()
 
 
-class PlayedCapture:
+class PlayedCapture(Capture):
     """A folder of pictures or a video, played once at its rate, as a stand-in for a camera."""
 
     live = False
@@ -187,9 +184,6 @@ class PlayedCapture:
         now = time.monotonic()
         self._due = now + self._period if self._due is None else max(self._due + self._period, now)
         return Picture(image, now, None)
-
-    def interrupt(self) -> None:
-        """Nothing to do: `stop` ends the wait."""
 
     def close(self) -> None:
         close = getattr(self._images, "close", None)

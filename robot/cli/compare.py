@@ -64,68 +64,51 @@ def compare(
     """
     folder = new_directory(out, "compare")
     with busy("loading"):
+        from calibration.bundle import read_bundle
         from calibration.compare.compare import Options, Pairing
         from calibration.compare.compare import compare_frames as run
         from calibration.compare.invariance import invariance as measure_invariance
         from calibration.compare.report import figures, write
         from calibration.errors import BadFrames
-        from calibration.lens.view import BadCorners
     limits = [*_limits(fail_above, "--fail-above"), *_limits(fail_below, "--fail-below")]
-    bundles = [None if path is None else _calibration(path) for path in (calibration_a, calibration_b)]
-    try:
-        truth = _rectify_view(_read(b, reference_b, sensor_b), bundles[1])
-        if _is_scene(a):
-            if corners_a or corners_b or reference_a or sensor_a:
-                raise BadFrames(
-                    f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated"
-                )
-            made = _simulate_presses(a, truth, calibration_b, set_ or [])
-        else:
-            if set_:
-                raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
-            made = _rectify_view(_read(Path(a), reference_a, sensor_a), bundles[0])
-        # from here on all pictures are metric where a calibration says how
-        bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
-        made, truth = _rectify_corners(made, truth, (corners_a, corners_b), bundles)
-        with counted("comparing") as on_step:
-            result = run(made, truth, bundles[0], bundles[1], Options(Pairing(pair), shift), on_step)
-        report = None
-        if invariance:
-            with counted("invariance") as on_step:
-                report = measure_invariance([(result, bundles[1])], on_step=on_step)
-    except (BadFrames, BadCorners) as error:
-        raise typer.BadParameter(str(error), param_hint="A B") from None
+    bundles = [None if path is None else read_bundle(path)[0] for path in (calibration_a, calibration_b)]
+    truth = _read(b, reference_b, sensor_b, bundles[1])
+    if _is_scene(a):
+        if corners_a or corners_b or reference_a or sensor_a:
+            raise BadFrames(f"A is the scene '{a}': it has no corners, reference or sensor, and B must be calibrated")
+        made = _simulate_presses(a, truth, calibration_b, set_ or [])
+    else:
+        if set_:
+            raise BadFrames(f"--set changes a scene, but A is no scene: {a}")
+        made = _read(Path(a), reference_a, sensor_a, bundles[0])
+    # from here on all pictures are metric where a calibration says how
+    bundles = [None if each is None else each.model_copy(update={"view": None}) for each in bundles]
+    made, truth = _rectify_corners(made, truth, (corners_a, corners_b), bundles)
+    with counted("comparing") as on_step:
+        result = run(made, truth, bundles[0], bundles[1], Options(Pairing(pair), shift), on_step)
+    report = None
+    if invariance:
+        with counted("invariance") as on_step:
+            report = measure_invariance([(result, bundles[1])], on_step=on_step)
     values = figures(result, report)
-    _require_known(limits, values)
+    beyond = _beyond_limits(limits, values)
     with writing(folder, new=True), busy("writing"):
         written = write(folder, result, report)
     _show(result, report)
     say_files(*written)
-    if _beyond_limits(limits, values):
+    for words in beyond:
+        complain(words)
+    if beyond:
         raise typer.Exit(1)
 
 
-def _calibration(path: Path) -> Calibration:
-    from calibration.bundle import BadBundle, read_bundle
-
-    try:
-        return read_bundle(path)[0]
-    except BadBundle as error:
-        raise typer.BadParameter(str(error), param_hint="--calibration-a, --calibration-b") from None
-
-
-def _read(path: Path, reference: Path | None, sensor: str) -> FrameSet:
-    from calibration.frame_set import read_frame_set
+def _read(path: Path, reference: Path | None, sensor: str, bundle: Calibration | None) -> FrameSet:
+    """The frames, through lens and perspective of their calibration where that has a view."""
+    from calibration.frame_set import read_frame_set, rectified_by_view
 
     with busy(f"reading {path}"):
-        return read_frame_set(path, reference, sensor)
-
-
-def _rectify_view(side: FrameSet, bundle: Calibration | None) -> FrameSet:
-    """The side through lens and perspective of its calibration, where that has a view."""
-    from calibration.frame_set import rectified_by_view
-
-    return side if bundle is None or bundle.view is None else rectified_by_view(side, bundle.view)
+        frames = read_frame_set(path, reference, sensor)
+    return frames if bundle is None or bundle.view is None else rectified_by_view(frames, bundle.view)
 
 
 def _is_scene(a: str) -> bool:
@@ -206,8 +189,9 @@ def _limits(texts: list[str] | None, option: str) -> list[Limit]:
     return found
 
 
-def _require_known(limits: list[Limit], values: dict[str, float]) -> None:
-    """A limit of a figure that could not be measured must not pass."""
+def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
+    """In words, which figures are beyond their limits. A limit of a figure that could not be measured must not pass:
+    raises BadParameter."""
     unknown = [name for name, _, _ in limits if values[name] != values[name]]
     if unknown:
         raise typer.BadParameter(
@@ -215,17 +199,11 @@ def _require_known(limits: list[Limit], values: dict[str, float]) -> None:
             "recordings of simulations), rho, auc and drift need --invariance",
             param_hint="--fail-above, --fail-below",
         )
-
-
-def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> bool:
-    beyond = [
+    return [
         f"{name} is {values[name]:.4g}, {'above' if above else 'below'} {limit:g}"
         for name, limit, above in limits
         if (values[name] > limit if above else values[name] < limit)
     ]
-    for words in beyond:
-        complain(words)
-    return bool(beyond)
 
 
 def _show(result: Comparison, report: Report | None) -> None:

@@ -1,3 +1,20 @@
 """What drivers and mocks must both know, so that neither imports the other."""
 
+from __future__ import annotations
+
+from typing import Self
+
 MOCK_SERIAL = "00000000001"  # of mock controllers; no real arm has it, so a driver can tell
+
+
+class Closing:
+    """A context manager that closes itself at the end of its block."""
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -226,14 +226,7 @@ class Kinematics:
         """The frame of the TCP; c1, s1, then points and axes of the joints: o2, o3, o4, axis 5, o5, axis 6."""
         q1, q2, q3, q4, q5, q6 = q.tolist() if isinstance(q, np.ndarray) else q
         k = self.lengths
-        c1, s1, c5, s5, c6, s6 = (
-            math.cos(q1),
-            math.sin(q1),
-            math.cos(q5),
-            math.sin(q5),
-            math.cos(q6),
-            math.sin(q6),
-        )
+        c1, s1, c5, s5, c6, s6 = math.cos(q1), math.sin(q1), math.cos(q5), math.sin(q5), math.cos(q6), math.sin(q6)
         c, s = math.cos(q2 + q3 + q4), math.sin(q2 + q3 + q4)
         # In the plane of the arm: u outwards, z up; w along the axes of joints 2 to 4.
         u2, z2 = k.a2 * math.cos(q2), k.d1 + k.a2 * math.sin(q2)

@@ -19,12 +19,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robot import errors
+from robot.common import Closing
 from robot.errors import DeviceError, DeviceNotConnectedError
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -36,7 +37,7 @@ PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
 LAST_LINES = 5  # of a dead child's standard error, in errors
 
 
-class Child:
+class Child(Closing):
     """A process `python -m module`. A context manager; several threads may use it.
 
     Args:
@@ -128,12 +129,6 @@ class Child:
         finally:
             self._lock.release()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def _exchange(self, request: dict[str, Any] | None, arrays: Arrays, timeout: float) -> Message:
         with self._lock:
             if self._closed:
@@ -184,7 +179,7 @@ class Child:
         return self._error(text)
 
 
-class ChildHandle:
+class ChildHandle(Closing):
     """What the handles of child processes share. A context manager."""
 
     _child: Child
@@ -205,12 +200,6 @@ class ChildHandle:
     def close(self) -> None:
         """Ends the process; a second call does nothing."""
         self._child.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 class Parent:

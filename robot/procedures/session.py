@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
+from robot.arm.ur import URArm
 from robot.errors import DeviceError
 from robot.rig.commanded_arm import CommandedArm
 from tacsim import pose as se3
-from tacsim.interface import ArmState, EndOfEpisode, Pose, TactileFrame
+from tacsim.interface import Arm, EndOfEpisode, Pose, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig
 
@@ -52,14 +53,6 @@ class FrameSource(Protocol):
     """What is needed of a camera."""
 
     def read(self, timeout: float) -> TactileFrame: ...
-
-
-class MovableArm(Protocol):
-    """What is needed of an arm."""
-
-    def command(self, target: Pose | None) -> Pose | None: ...
-    def state(self) -> ArmState: ...
-    def stop(self) -> None: ...
 
 
 @dataclass(slots=True)
@@ -133,7 +126,7 @@ def _part(config: RigConfig, parts: Mapping[str, object], name: str, kind: type[
     return part
 
 
-def move_to(arm: MovableArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:
+def move_to(arm: Arm | URArm, name: str, target: Pose, timeout: float = TRAVEL_TIMEOUT) -> None:
     """Moves an arm to a pose of its sensor and waits for standstill. Raises OutsideLimits, ActionError for what is out
     of reach, DeviceError after `timeout` [s] and for what stops an arm."""
     if isinstance(arm, CommandedArm):
@@ -151,11 +144,6 @@ def move_to(arm: MovableArm, name: str, target: Pose, timeout: float = TRAVEL_TI
         if time.monotonic() > deadline:
             raise DeviceError(f"arm '{name}' did not come to its target within {timeout:g} s")
         time.sleep(POLL)
-
-
-def along_z(pose: Pose, distance: float) -> Pose:
-    """`pose`, shifted along its own z axis [m]."""
-    return se3.compose(pose, Pose(np.array([0.0, 0.0, distance])))
 
 
 def frame_after(camera: FrameSource, wait: float, timeout: float = PICTURE_TIMEOUT) -> TactileFrame:

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.poses.latency import Latency
 from robot.camera.camera import Camera, ClockSource
-from robot.procedures.session import POLL, CannotCalibrate, along_z, camera_sensor, hardware_arm
+from robot.procedures.session import POLL, CannotCalibrate, camera_sensor, hardware_arm
 from robot.rig.commanded_arm import CommandedArm
 from tacsim import pose as se3
 from tacsim.interface import Arm, Pose
@@ -94,7 +94,7 @@ def record_taps(
     mover.suspend_tactile_guard()  # pictures are looked at one by one here, not observed
     start = mover.state().pose
     axis = se3.rotation(start).apply([0.0, 0.0, 1.0])
-    above, below = along_z(start, -plan.lift), along_z(start, plan.depth)
+    above, below = se3.along_z(start, -plan.lift), se3.along_z(start, plan.depth)
     travel = (plan.lift + plan.depth) / limits.speed + 2.0 * limits.speed / limits.acceleration
     reference = rig.references[sensor].image[::STRIDE, ::STRIDE].astype(np.int16)
     record = TapRecord()

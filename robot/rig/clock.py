@@ -15,32 +15,34 @@ ARRIVE = 10.0  # longest motion of a control period in lock step [s]
 SETTLED = 10e-3  # a force given to a mock controller is in its packages after this time [s]
 
 
-class WallClock:
+class _MonotonicClock:
+    def __init__(self, period: float) -> None:
+        self.period = period  # [s]
+
+    def now(self) -> float:
+        return time.monotonic()
+
+
+class WallClock(_MonotonicClock):
     """Ticks at a fixed rate. Missed periods are skipped, and counted.
 
     catch_up: waits until the simulation of a mock cell, if there is one, has followed the arms.
     """
 
     def __init__(self, period: float, catch_up: Callable[[], None] | None = None) -> None:
-        self._period, self._catch_up = period, catch_up
+        super().__init__(period)
+        self._catch_up = catch_up
         self._deadline: float | None = None
         self.periods: list[float] = []  # of the last ticks [s]
         self.late = 0
         self._last: float | None = None
 
-    @property
-    def period(self) -> float:
-        return self._period
-
-    def now(self) -> float:
-        return time.monotonic()
-
     def tick(self) -> None:
         now = time.monotonic()
-        if self._deadline is None or now > self._deadline + self._period:
+        if self._deadline is None or now > self._deadline + self.period:
             self.late += self._deadline is not None
             self._deadline = now
-        self._deadline += self._period
+        self._deadline += self.period
         time.sleep(max(0.0, self._deadline - time.monotonic()))
         beat = time.monotonic()
         if self._last is not None:
@@ -51,7 +53,7 @@ class WallClock:
         """Waits until packages and pictures of what just happened have arrived: one period, at least 0.1 s."""
         if self._catch_up is not None:
             self._catch_up()
-        time.sleep(max(0.1, self._period))
+        time.sleep(max(0.1, self.period))
 
     def restart(self) -> None:
         """The next tick ends one period from then."""
@@ -64,20 +66,14 @@ class WallClock:
         return {"period_median": median, "period_p99": p99, "period_max": longest, "periods_late": float(self.late)}
 
 
-class LockStep:
+class LockStep(_MonotonicClock):
     """A period ends when the arms rest at their targets and the cell has drawn the pictures of just that pose."""
 
     def __init__(
         self, period: float, arms: Mapping[str, CommandedArm], cameras: Mapping[str, Camera], cell: MockCell
     ) -> None:
-        self._period, self._arms, self._cameras, self._cell = period, arms, cameras, cell
-
-    @property
-    def period(self) -> float:
-        return self._period
-
-    def now(self) -> float:
-        return time.monotonic()
+        super().__init__(period)
+        self._arms, self._cameras, self._cell = arms, cameras, cell
 
     def tick(self) -> None:
         """Raises DeviceError: an arm does not arrive or is stopped, the cell fails, a picture does not come."""

@@ -17,7 +17,6 @@ from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
 from tacsim.models.rig import RigConfig
 from tacsim.report.figure4 import Moment, Trial
-from tacsim.rig import Rig
 from tacsim.tasks import Task, judge, make_task
 
 MIN_FALL = 5.0  # both ends of a reward curve must lie more than this many times the distance allowed below its peak
@@ -117,8 +116,7 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
     planned = EXPERIMENTS[task]
     overrides = [f"scene.physics={physics}", *SETTLING_OVERRIDES[physics], *planned.overrides, *WHOLE_GEL]
     config = load_rig("sim", task=task, overrides=overrides).config
-    if config.task is None:
-        raise ValueError(f"rig 'sim' with task '{task}' has no task")
+    assert config.task is not None
     goal = make_task(config.task)
     distances: list[float] = []
     differences: list[float] = []
@@ -129,7 +127,8 @@ def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: Non
         observation = rig.reset()
         policy.reset()
         for step in range(planned.steps + 1):
-            truth = _truth(rig)
+            truth = rig.truth()
+            assert truth is not None
             start = truth if start is None else start
             distances.append(judge(goal, truth, start).distance)
             differences.append(image_difference(rig.frames, rig.references))
@@ -168,13 +167,6 @@ def _limited(action: Action, observation: Observation, longest: float) -> Action
     return Action(tool)
 
 
-def _truth(rig: Rig) -> Truth:
-    truth = rig.truth()
-    if truth is None:
-        raise ValueError(f"rig '{rig.name}' has no body whose truth could be judged")
-    return truth
-
-
 def _moment(step: int, frames: Mapping[str, TactileFrame], observation: Observation, truth: Truth) -> Moment:
     heights = {name: touch.height for name, touch in observation.tactile.items() if touch.height is not None}
     return Moment(
@@ -190,8 +182,7 @@ def _moment(step: int, frames: Mapping[str, TactileFrame], observation: Observat
 def _trial(
     config: RigConfig, task: Task, distances: list[float], differences: list[float], moments: list[Moment]
 ) -> Trial:
-    if config.scene is None:
-        raise ValueError(f"rig '{config.name}' simulates nothing")
+    assert config.scene is not None
     shown = key_steps(len(moments), int(np.argmin(distances)))
     return Trial(
         step=list(range(len(distances))),

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.calibrate.session import confirm_motion, led, tell_left_out
+from robot.cli.calibrate.session import confirm_motion, led
 from robot.cli.options import Out, Overrides, angle, length
-from robot.cli.output import busy, new_directory, results, say_files, show_table, writing
+from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, writing
 
 if TYPE_CHECKING:
     from calibration.poses.ball_touch import TouchNoise
@@ -92,7 +92,6 @@ def _take_touches(
     ):
         session.keep = lambda _: write(touch_file(session.taken, plan.ball_radius))
         record_ball_touches(running, opened, arm, sensor, plan, session)
-    tell_left_out(session)
     return touch_file(session.taken, plan.ball_radius)
 
 
@@ -110,6 +109,8 @@ def _recording(
     again = f"tacsim calibrate {command} {shlex.quote(str(path))}"
     with led(what, total, path, f"recorded: {path}; to calibrate from it again, without the arm: {again}") as session:
         yield session, write
+    for why in session.left_out:
+        notes.print(f"left out: {why}", markup=False)
 
 
 def _report_touch(record: TouchFile, noise: TouchNoise, folder: Path, arm: str) -> None:
@@ -215,7 +216,6 @@ def _take_board_poses(
     ):
         session.keep = lambda _: write(board_pose_file(session.taken, fixed=fixed))
         record_board_poses(mover, source, plan, session)
-    tell_left_out(session)
     return board_pose_file(session.taken, fixed=fixed)
 
 

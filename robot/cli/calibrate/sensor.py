@@ -13,7 +13,6 @@ from robot.cli.options import Out, Overrides, length
 from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
-    from calibration.bundle import Calibration
     from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
     from calibration.light.calibrator import LightFit
@@ -88,28 +87,23 @@ def sensor(
         raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
     folder = new_directory(out, "calibration")
     with busy("loading"):
-        from calibration.errors import BadFrames
         from calibration.frame_set import read_folder, rectified_by_view
         from calibration.light.calibrator import calibrate_light
         from calibration.markers.dots import DotEraser
-    try:
-        if camera is not None:
-            read = _take_presses(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
-        else:
-            assert frames is not None
-            read = read_folder(frames, reference, MAX_PRESSES)
-        if seen is not None:
-            read = rectified_by_view(read, seen)
-        if read.estimated:
-            notes.print("no picture without contact: the median of all presses stands for it")
-        found = _markers(read, pitch) if markers else None
-        erase = None if found is None else DotEraser(found.radius / pitch)
-        with busy(f"calibrating from {len(read.frames)} presses"):
-            named = [(frame.name, frame.image) for frame in read.frames]
-            fit = calibrate_light(read.reference, named, ball / pitch, erase)
-    except BadFrames as error:
-        hint = "FRAMES" if camera is None else "--camera"
-        raise typer.BadParameter(str(error), param_hint=hint) from None
+    if camera is not None:
+        read = _take_presses(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
+    else:
+        assert frames is not None
+        read = read_folder(frames, reference, MAX_PRESSES)
+    if seen is not None:
+        read = rectified_by_view(read, seen)
+    if read.estimated:
+        notes.print("no picture without contact: the median of all presses stands for it")
+    found = _markers(read, pitch) if markers else None
+    erase = None if found is None else DotEraser(found.radius / pitch)
+    with busy(f"calibrating from {len(read.frames)} presses"):
+        named = [(frame.name, frame.image) for frame in read.frames]
+        fit = calibrate_light(read.reference, named, ball / pitch, erase)
     _write(folder, fit, read, serial, ball, pitch, found, view=seen)
 
 
@@ -164,19 +158,48 @@ def _write(
     view: GelView | None,
 ) -> None:
     """Shows the calibration and writes its bundle."""
-    from calibration.bundle import write_bundle
-    from calibration.light.residual_picture import draw
+    from datetime import UTC, datetime
+    from importlib import metadata
 
-    _show(fit, pitch)
-    if found is None:
-        _look_for_dots(fit)
-    if found is not None:
-        notes.print(
-            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
-            f"{found.radius * 1e3:.2g} mm"
-        )
-    noise = _noise(read)
-    bundle = _bundle(fit, serial, ball, pitch, [frame.name for frame in read.frames], found, view, noise)
+    from calibration.bundle import FORMAT, Calibration, Provenance, Residual, write_bundle
+    from calibration.light.residual_picture import draw
+    from tacsim.models.sensor import SensorGeometry
+
+    _show(fit, pitch, found)
+    rows, columns, _ = fit.reference.shape
+    bundle = Calibration(
+        format=FORMAT,
+        serial=serial,
+        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch) if view is None else view.geometry,
+        gel_size=(columns * pitch, rows * pitch),
+        forward=fit.forward,
+        inverse=fit.inverse,
+        skirt_length=fit.skirt.length * pitch,
+        skirt_fraction=fit.skirt.fraction,
+        view=view,
+        markers=found,
+        noise=_noise(read),
+        residuals=tuple(
+            Residual(
+                frame=score.name,
+                circle=(score.circle.x, score.circle.y, score.circle.radius),
+                error=score.error,
+                nothing=score.nothing,
+                correlation=score.correlation,
+                angle=score.angle,
+            )
+            for score in fit.scores
+        ),
+        provenance=Provenance(
+            made=datetime.now(UTC).isoformat(timespec="seconds"),
+            software=f"tacsim {metadata.version('tacsim')}",
+            ball_radius=ball,
+            frames=tuple(frame.name for frame in read.frames),
+            left_out=dict(fit.left_out),
+            warnings=fit.warnings,
+        ),
+        reference="0" * 64,  # write_bundle sets it
+    )
     with writing(folder):
         written = [write_bundle(folder, bundle, fit.reference)]
         if fit.scores:
@@ -229,59 +252,7 @@ def _look_for_dots(fit: LightFit) -> None:
         warn("dots seem to be printed on the gel; give --markers, or each will pass for a dent")
 
 
-def _bundle(
-    fit: LightFit,
-    serial: str,
-    ball: float,
-    pitch: float,
-    names: list[str],
-    markers: Markers | None,
-    view: GelView | None,
-    noise: CameraNoise | None,
-) -> Calibration:
-    from datetime import UTC, datetime
-    from importlib import metadata
-
-    from calibration.bundle import FORMAT, Calibration, Provenance, Residual
-    from tacsim.models.sensor import SensorGeometry
-
-    rows, columns, _ = fit.reference.shape
-    return Calibration(
-        format=FORMAT,
-        serial=serial,
-        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch) if view is None else view.geometry,
-        gel_size=(columns * pitch, rows * pitch),
-        forward=fit.forward,
-        inverse=fit.inverse,
-        skirt_length=fit.skirt.length * pitch,
-        skirt_fraction=fit.skirt.fraction,
-        view=view,
-        markers=markers,
-        noise=noise,
-        residuals=tuple(
-            Residual(
-                frame=score.name,
-                circle=(score.circle.x, score.circle.y, score.circle.radius),
-                error=score.error,
-                nothing=score.nothing,
-                correlation=score.correlation,
-                angle=score.angle,
-            )
-            for score in fit.scores
-        ),
-        provenance=Provenance(
-            made=datetime.now(UTC).isoformat(timespec="seconds"),
-            software=f"tacsim {metadata.version('tacsim')}",
-            ball_radius=ball,
-            frames=tuple(names),
-            left_out=dict(fit.left_out),
-            warnings=fit.warnings,
-        ),
-        reference="0" * 64,  # write_bundle sets it
-    )
-
-
-def _show(fit: LightFit, pitch: float) -> None:
+def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
     if fit.scores:
         rows = (
             (
@@ -301,3 +272,10 @@ def _show(fit: LightFit, pitch: float) -> None:
         notes.print(f"left out: {name}: {why}", markup=False)
     for warning in fit.warnings:
         warn(warning)
+    if found is None:
+        _look_for_dots(fit)
+    else:
+        notes.print(
+            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
+            f"{found.radius * 1e3:.2g} mm"
+        )

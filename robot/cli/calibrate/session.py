@@ -85,8 +85,3 @@ def picture_keeper(folder: Path) -> Callable[[tuple[str, NDArray[np.uint8]]], No
             (folder / picture[0]).write_bytes(encode_png(picture[1]))
 
     return keep
-
-
-def tell_left_out(session: Session[Any]) -> None:
-    for why in session.left_out:
-        notes.print(f"left out: {why}", markup=False)

@@ -6,7 +6,7 @@ The driver in `robot.camera.camera` reads it as it reads a real camera behind mj
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,20 @@ MAX_SIDE = 4096  # [px]
 
 
 @dataclass(frozen=True, slots=True)
-class MockCameraState:
+class Faults:
+    """What is wrong with the camera at present."""
+
+    stall: bool = False  # connections stay, no frame comes
+    drop: float = 0.0  # probability that a frame is lost after it was numbered
+    delay: float = 0.0  # from exposure to sending [s]
+    corrupt: bool = False  # the second half of each JPEG is noise
+    size: tuple[int, int] | None = None  # columns, rows of the picture, other than promised [px]
+    brightness: float = 1.0  # factor on the picture; the strip stays readable
+    refuse: bool = False  # the port is closed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MockCameraState(Faults):
     """What a mock camera has done so far, and what is wrong with it at present."""
 
     frames: int  # exposed
@@ -30,13 +43,6 @@ class MockCameraState:
     sent: int  # handed to clients, all together
     skipped: int  # that slow clients did not get, all together
     clients: int  # connected now
-    stall: bool
-    drop: float
-    delay: float  # [s]
-    corrupt: bool
-    size: tuple[int, int] | None  # columns, rows [px]
-    brightness: float
-    refuse: bool
 
 
 class MockCamera(ChildHandle):
@@ -115,7 +121,7 @@ class MockCamera(ChildHandle):
         """Counts and present faults."""
         answer = self._ask("state")
         answer["size"] = None if answer["size"] is None else tuple(answer["size"])
-        return MockCameraState(**{field.name: answer[field.name] for field in fields(MockCameraState)})
+        return MockCameraState(**answer)
 
     def _ask(self, command: str, value: Any = None, **pictures: NDArray[np.uint8]) -> Any:
         return self._child.ask({"do": command, "value": value}, pictures, timeout=ANSWER_TIMEOUT)[0]["result"]

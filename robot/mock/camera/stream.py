@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -22,24 +22,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from robot.common import stamp
+from robot.mock.camera.camera import Faults
 
 BOUNDARY = "boundarydonotcross"
 MAX_CLIENTS = 16
 MAX_DELAYED = 1024  # frames that wait for the delay to pass; beyond it the oldest is lost
 SEND_TIMEOUT = 5.0  # a client that takes nothing for so long is cut [s]
-
-
-@dataclass
-class Faults:
-    """What is wrong with the camera at present."""
-
-    stall: bool = False  # connections stay, no frame comes
-    drop: float = 0.0  # probability that a frame is lost after it was numbered
-    delay: float = 0.0  # from exposure to sending [s]
-    corrupt: bool = False  # the second half of each JPEG is noise
-    size: tuple[int, int] | None = None  # columns, rows of the picture, other than promised [px]
-    brightness: float = 1.0  # factor on the picture; the strip stays readable
-    refuse: bool = False  # the port is closed
 
 
 class FrameSource:
@@ -72,7 +60,7 @@ class FrameSource:
         if name not in Faults.__dataclass_fields__:
             raise ValueError(f"no command '{name}'")
         with self._changed:
-            setattr(self._faults, name, value)
+            self._faults = replace(self._faults, **{name: value})
             self._changed.notify_all()
 
     def state(self) -> dict[str, Any]:
@@ -117,7 +105,7 @@ class FrameSource:
                     return
                 tick = now + self._period if self._fresh else max(tick + self._period, now)
                 self._fresh = False
-                picture, image, faults = self._picture, self.counts["images"], Faults(**vars(self._faults))
+                picture, image, faults = self._picture, self.counts["images"], self._faults
                 self.counts["frames"] += 1
                 number = self.counts["frames"]
             jpeg = self._expose(picture, stamp.Stamp(number, image, time.monotonic_ns() // 1000), faults)

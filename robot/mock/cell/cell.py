@@ -10,12 +10,12 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import Self
 from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robot.common import Closing
 from robot.common.kinematics import Kinematics, matrix
 from robot.common.tcp import ArmFrames, pose_of
 from robot.errors import DeviceError
@@ -33,7 +33,7 @@ POSTURE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)  # seed of the joints at power-on: e
 FREE_RUN = 5e-3  # shortest time between two steps while running free [s]
 
 
-class MockCell:
+class MockCell(Closing):
     """Starts the mocks that a rig file asks for. A context manager; `close` ends every process.
 
     Attributes:
@@ -231,12 +231,6 @@ class MockCell:
         if self._follower is not None:
             self._follower.join(5.0)
         self._mocks.close()  # each is closed even when another fails
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def _camera(name: str, config: CameraSensorConfig) -> MockCamera:

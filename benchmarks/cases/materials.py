@@ -89,7 +89,7 @@ def plasticine_alone(side: float, spacing: float, repeat: int) -> list[Measureme
     timing, _ = timed(lambda: body.advance(substeps), repeat, lambda: body.advance(1))
     momentum = body.state.v().mean(axis=0, dtype=np.float64)
     drift = float(np.linalg.norm(momentum - [0.0, 0.0, 0.01])) / 0.01
-    yielded = float((body.state.flow() > 0.0).mean())
+    yielded = float((body.state.plastic_strain() > 0.0).mean())
     figures = {**step_cost(timing, substeps, len(rest), "particle"), "yielded": yielded}
     return [Measurement(timing, drift, "-", "momentum is kept", "a cube drawn apart", substeps, figures)]
 

@@ -1,4 +1,4 @@
-"""Material laws inside kernels: neo-Hookean gel; Hencky elasticity with von Mises return mapping for the plasticine.
+"""The plasticine's law inside kernels: Hencky elasticity with von Mises return mapping.
 
 Symmetric 3x3 matrices are stored as 6 numbers (xx, yy, zz, xy, xz, yz). Polynomials of one symmetric matrix commute
 and stay symmetric, so products of them need 6 numbers only: no SVD, no eigenvalues, no branch near equal ones.
@@ -11,9 +11,10 @@ vec3 = ti.types.vector(3, ti.f32)
 vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
-ROOT = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the flow
+SQRT_2_3 = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the plastic strain increment
 ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
-SERIES_LOG1P, SERIES_LOG, SERIES_EXP = 0.4, 0.5, 0.2  # arguments up to which the series below are exact enough
+# Largest arguments of the series below: errors under float32's rounding, 1.4e-5 relative, 3e-6 absolute
+SERIES_LOG1P, SERIES_LOG, SERIES_EXP = 0.4, 0.5, 0.2
 
 
 @ti.func
@@ -74,7 +75,7 @@ def frobenius(s):
 def log1p_series(z):
     """ln(1 + x) = 2 artanh(z) with z = x / (2 + x), by its series: accurate in f32 for |x| up to 0.4, however small.
 
-    By pairs of terms (Estrin), not one after the other: lanes wait for each operation before the next.
+    Terms are evaluated in pairs (Estrin) to shorten the dependency chain.
     """
     q = z * z
     q2 = q * q
@@ -173,7 +174,7 @@ def volume_preserving(e, shrink):
 
 
 @ti.func
-def after_flow(growth, shrink):
+def elastic_after_return(growth, shrink):
     """e of growth + I, of which only the part that preserves volume counts, at the volume J = shrink^(-3/2)."""
     excess = growth[0] + growth[1] + growth[2] + minors(growth) + determinant(growth)  # det - 1 of the cut series
     volume = (1.0 - excess / 3.0) / shrink
@@ -209,69 +210,70 @@ def small_strain(e):
 
 @ti.func
 def stress_small_strain(e, mu, bulk):
-    """Kirchhoff stress of a body that never yields, as by `hencky_return`; and 1 beyond `small_strain`, else 0."""
+    """Kirchhoff stress of a body that never yields, and 1 where `small_strain` is wrong, else 0."""
     log_j, strain, _, large = small_strain(e)
     return plus_identity(2.0 * mu * strain, bulk * log_j), large
 
 
 @ti.func
-def return_small_strain(e, flow, mu, bulk, limit, hardening):
-    """`hencky_return` for elastic strain up to some 0.2, without a branch: see `small_strain`.
+def return_small_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
+    """Return mapping (see `hencky_return`) for elastic strain up to some 0.2, without a branch: see `small_strain`.
 
     Returns also 1 where the strain is larger (and all else is wrong), else 0.
     """
     log_j, strain, grow, large = small_strain(e)
     strain2, i2, i3 = product(strain, strain), minors(strain), determinant(strain)
     norm = ti.sqrt(strain2[0] + strain2[1] + strain2[2])
-    now, give = limit + hardening * flow, 1.0 / (1.0 + ROOT * hardening)
-    f = 1.0 - give * ti.max(0.0, 1.0 - now / ti.max(norm, 1e-12))  # of the strain is left
-    # exp(2 f strain) - I by `exponential_series`, of invariants 4 f^2 i2 and 8 f^3 i3
-    j2, j3 = 4.0 * f * f * i2, 8.0 * f * f * f * i3
-    first, second = 2.0 * f * (1.0 - j2 / 6.0 + j3 / 24.0), 4.0 * f * f * (0.5 - j2 / 24.0)
+    yield_limit, hardening_factor = yield_strain + hardening * plastic_strain, 1.0 / (1.0 + SQRT_2_3 * hardening)
+    remaining = 1.0 - hardening_factor * ti.max(0.0, 1.0 - yield_limit / ti.max(norm, 1e-12))  # share of the strain
+    # exp(2 remaining strain) - I by `exponential_series`, of invariants 4 remaining^2 i2 and 8 remaining^3 i3
+    j2, j3 = 4.0 * remaining * remaining * i2, 8.0 * remaining * remaining * remaining * i3
+    first, second = 2.0 * remaining * (1.0 - j2 / 6.0 + j3 / 24.0), 4.0 * remaining * remaining * (0.5 - j2 / 24.0)
     growth = plus_identity(first * strain + second * strain2, j3 / 6.0)
     excess = j2 * j3 / 24.0 + (3.0 * j3 * j3 - 2.0 * j2 * j2 * j2) / 144.0  # det - 1 of the cut series
     volume = (1.0 - excess / 3.0) * grow
     returned = plus_identity(growth * volume, volume - 1.0)
-    yields = norm > now
+    yields = norm > yield_limit
     elastic = vec6([ti.select(yields, returned[c], e[c]) for c in ti.static(range(6))])
-    large = large | ti.select(2.0 * f * norm > SERIES_EXP, 1, 0)
-    return (
-        elastic, flow + ROOT * give * ti.max(0.0, norm - now), plus_identity(2.0 * mu * f * strain, bulk * log_j), large
-    )  # fmt: skip
+    large = large | ti.select(2.0 * remaining * norm > SERIES_EXP, 1, 0)
+    new_plastic_strain = plastic_strain + SQRT_2_3 * hardening_factor * ti.max(0.0, norm - yield_limit)
+    return elastic, new_plastic_strain, plus_identity(2.0 * mu * remaining * strain, bulk * log_j), large
 
 
 @ti.func
-def return_any_strain(e, flow, mu, bulk, limit, hardening):
-    """`hencky_return` for any strain."""
+def return_any_strain(e, plastic_strain, mu, bulk, yield_strain, hardening):
+    """Return mapping (see `hencky_return`) for any strain."""
     log_j = 0.5 * log1p(e[0] + e[1] + e[2] + minors(e) + determinant(e))  # det(I + e) - 1
     shrink = ti.exp(-2.0 / 3.0 * log_j)
     strain = 0.5 * logarithm(volume_preserving(e, shrink))
     strain = plus_identity(strain, -(strain[0] + strain[1] + strain[2]) / 3.0)  # dev(eps)
     norm = frobenius(strain)
     elastic = e
-    now = limit + hardening * flow
-    new_flow = flow
-    if norm > now:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
-        gamma = (norm - now) / (1.0 + ROOT * hardening)
-        new_flow = flow + ROOT * gamma
+    yield_limit = yield_strain + hardening * plastic_strain
+    new_plastic_strain = plastic_strain
+    if norm > yield_limit:  # delta gamma = |dev eps| - sigma_y / (2 mu) > 0: back to the yield surface, volume kept
+        gamma = (norm - yield_limit) / (1.0 + SQRT_2_3 * hardening)
+        new_plastic_strain = plastic_strain + SQRT_2_3 * gamma
         strain *= (norm - gamma) / norm
-        elastic = after_flow(exponential_minus_identity(2.0 * strain, 2.0 * (norm - gamma)), shrink)
-    return elastic, new_flow, plus_identity(2.0 * mu * strain, bulk * log_j)
+        elastic = elastic_after_return(exponential_minus_identity(2.0 * strain, 2.0 * (norm - gamma)), shrink)
+    return elastic, new_plastic_strain, plus_identity(2.0 * mu * strain, bulk * log_j)
 
 
 @ti.func
-def hencky_return(e, flow, mu, bulk, limit, hardening):
+def hencky_return(e, plastic_strain, mu, bulk, yield_strain, hardening):
     """Hencky elasticity with von Mises return mapping (seed paper, eq. 1 and 2), on e = b_e - I.
 
-    e: trial elastic left Cauchy-Green strain minus identity; flow: equivalent plastic strain so far; limit: k =
-    sigma_y / (2 mu), Frobenius norm, which grows by hardening * flow (linear isotropic hardening, Simo & Hughes 1998,
-    box 3.1). Returns the elastic e after the return, the new flow, and the Kirchhoff stress
+    For tests and benchmarks: `grid_to_particles` calls the two halves lane by lane.
+
+    e: trial elastic left Cauchy-Green strain minus identity; plastic_strain: equivalent, so far; yield_strain:
+    sigma_y / (2 mu), Frobenius norm, to which linear isotropic hardening (Simo & Hughes 1998, box 3.1) adds hardening *
+    plastic_strain. Returns the elastic e after the return, the new plastic strain, and the Kirchhoff stress
     tau = 2 mu dev(eps) + K ln(J) I.
     """
-    elastic, new_flow, tau, large = return_small_strain(e, flow, mu, bulk, limit, hardening)
+    elastic, new_plastic_strain, tau, large = return_small_strain(e, plastic_strain, mu, bulk, yield_strain, hardening)
     if large != 0:
-        elastic, new_flow, tau = return_any_strain(e, flow, mu, bulk, limit, hardening)
-    return elastic, new_flow, tau
+        elastic, new_plastic_strain, tau = return_any_strain(e, plastic_strain, mu, bulk, yield_strain, hardening)
+    return elastic, new_plastic_strain, tau
 
 
 @ti.func

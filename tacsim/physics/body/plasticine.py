@@ -104,7 +104,7 @@ class BodyState:
         """Elastic strains b_e - I, (n, 6), a view."""
         return self._rows(environment, layout.STRAIN, 6).T
 
-    def flow(self, environment: int = 0) -> np.ndarray:
+    def plastic_strain(self, environment: int = 0) -> np.ndarray:
         """Equivalent plastic strains, (n,), a view."""
         return self._rows(environment, layout.PLASTIC_STRAIN, 1).reshape(-1)
 

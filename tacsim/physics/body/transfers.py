@@ -165,7 +165,7 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
     """Return mapping; momentum and mass of this part's particles onto their nodes, in its copy of the grid."""
     zero, cell, dt = env.count(layout.ZERO), env.param(layout.BODY_CELL), env.param(layout.STEP)
     mass, mu, bulk = env.param(layout.BODY_MASS), env.param(layout.BODY_MU), env.param(layout.BODY_BULK)
-    limit, hardening = env.param(layout.BODY_LIMIT), env.param(layout.BODY_HARDENING)
+    yield_strain, hardening = env.param(layout.BODY_LIMIT), env.param(layout.BODY_HARDENING)
     impulse, inertia = -dt * env.param(layout.BODY_VOLUME) * 4.0 / cell, mass * cell
     first_block, last_block = block_range(env, part)
     stride = env.count(layout.STRIDE)
@@ -173,7 +173,7 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
     float_zero = ti.cast(zero, ti.f32)  # 0, but a 0 that the compiler knows would make a lane unlike its neighbours
     lost, spare = 0, opaque(zero, 16)
     place = ti.Matrix.zero(ti.f32, 3, LANES)
-    old = ti.Matrix.zero(ti.f32, 7, LANES)  # strain, flow
+    old = ti.Matrix.zero(ti.f32, 7, LANES)  # elastic strain, plastic strain
     new = ti.Matrix.zero(ti.f32, 7, LANES)
     stress = ti.Matrix.zero(ti.f32, 6, LANES)
     rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
@@ -190,14 +190,14 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
         load_rows(body.particles, start, stride, layout.VELOCITY, 12, rate)
         for lane in range(LANES):
             stencil(three(place, 0, lane), slab, grid, indices, lane)
-        if limit < ELASTIC:
+        if yield_strain < ELASTIC:
             for lane in range(LANES):
-                elastic, flow, tau, large = return_small_strain(
-                    six(old, 0, lane), old[6, lane], mu, bulk, limit, hardening
+                elastic, plastic_strain, tau, large = return_small_strain(
+                    six(old, 0, lane), old[6, lane], mu, bulk, yield_strain, hardening
                 )
                 put(new, 0, lane, elastic)
                 put(stress, 0, lane, tau)
-                new[6, lane], indices[LARGE, lane] = flow, large
+                new[6, lane], indices[LARGE, lane] = plastic_strain, large
         else:  # a body that never yields: no return mapping
             for lane in range(LANES):
                 tau, large = stress_small_strain(six(old, 0, lane), mu, bulk)
@@ -206,10 +206,12 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
                 new[6, lane], indices[LARGE, lane] = old[6, lane], large
         for lane in range(LANES):
             if indices[LARGE, lane] != 0:
-                elastic, flow, tau = return_any_strain(six(old, 0, lane), old[6, lane], mu, bulk, limit, hardening)
+                elastic, plastic_strain, tau = return_any_strain(
+                    six(old, 0, lane), old[6, lane], mu, bulk, yield_strain, hardening
+                )
                 put(new, 0, lane, elastic)
                 put(stress, 0, lane, tau)
-                new[6, lane] = flow
+                new[6, lane] = plastic_strain
         for lane in range(LANES):
             tau = six(stress, 0, lane)
             ax = impulse * vec3(tau[0], tau[3], tau[4]) + inertia * three(rate, 3, lane)

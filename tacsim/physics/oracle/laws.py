@@ -9,13 +9,13 @@ Matrix = NDArray[np.float64]
 
 
 def hencky_return(
-    b: Matrix, flow: Matrix, mu: float, bulk: float, limit: float, hardening: float
+    b: Matrix, plastic_strain: Matrix, mu: float, bulk: float, yield_strain: float, hardening: float
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Von Mises return mapping on the Hencky strain of b (..., 3, 3), by eigenvalues; linear isotropic hardening.
 
-    flow: (...) equivalent plastic strain so far: |dev strain| stays below limit + hardening * flow (Simo & Hughes 1998,
-    box 3.1). Returns the elastic left Cauchy-Green tensor after the return (..., 3, 3), the new flow (...), and the
-    Kirchhoff stress (..., 3, 3).
+    plastic_strain: (...) equivalent, so far: |dev strain| stays below yield_strain + hardening * plastic_strain (Simo &
+    Hughes 1998, box 3.1). Returns the elastic left Cauchy-Green tensor after the return (..., 3, 3), the new plastic
+    strain (...), and the Kirchhoff stress (..., 3, 3).
     """
     values, axes = np.linalg.eigh(b)
     strain = 0.5 * np.log(values)  # principal Hencky strains
@@ -23,11 +23,11 @@ def hencky_return(
     deviator = strain - mean
     norm = np.linalg.norm(deviator, axis=-1)
     root = np.sqrt(2.0 / 3.0)
-    lost = np.maximum(norm - (limit + hardening * flow), 0.0) / (1.0 + root * hardening)  # plastic strain, its norm
-    deviator = deviator * (1.0 - lost / np.maximum(norm, 1e-300))[..., None]
+    increment = np.maximum(norm - (yield_strain + hardening * plastic_strain), 0.0) / (1.0 + root * hardening)
+    deviator = deviator * (1.0 - increment / np.maximum(norm, 1e-300))[..., None]
     stress = 2 * mu * deviator + bulk * 3 * mean
     elastic = np.exp(2 * (deviator + mean))
-    return _from_principal(elastic, axes), np.asarray(flow + root * lost), _from_principal(stress, axes)
+    return _from_principal(elastic, axes), np.asarray(plastic_strain + root * increment), _from_principal(stress, axes)
 
 
 def _from_principal(values: Matrix, axes: Matrix) -> Matrix:

@@ -204,7 +204,7 @@ class HybridWorld(FemWorld):
         b = state.particles
         return {
             "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i],
-            "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.flow(i),
+            "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.plastic_strain(i),
             "planes": b.plane(i), "contact": state.contact_history[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
 

@@ -66,7 +66,7 @@ def test_a_body_that_never_yields_runs_no_return_mapping(limit: float, yields: b
     assert params.limit == ELASTIC
     hardening = 2.0**-10  # a power of two: what is left is 0 to the digit
     body = block(replace(params, limit=limit, hardening=hardening), 0.5e-3)
-    body.state.flow()[:] = -limit / hardening
+    body.state.plastic_strain()[:] = -limit / hardening
     body.state.c()[:], body.state.v()[:] = GRADIENT, body.state.x() @ GRADIENT.T
     shear = []
     for _ in range(3):

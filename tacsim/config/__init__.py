@@ -6,9 +6,8 @@ Every problem is a line ``file:line: key: what is wrong; what is allowed; did yo
 """
 
 from tacsim.config.errors import ConfigError
-from tacsim.config.kinds import KINDS, config_root, names
+from tacsim.config.kinds import KINDS, config_root, json_schema, names
 from tacsim.config.load import LoadedRig, load, load_rig, load_scene, load_sensor, load_task
-from tacsim.config.schema import json_schema
 
 __all__ = [
     "KINDS",

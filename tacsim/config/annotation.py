@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
 
 from tacsim.config.document import Node
 from tacsim.config.kinds import kind_of, names
@@ -87,12 +88,9 @@ def default(annotation: Any, node: Node | None, key: str) -> Any:
     """The default of a field as plain data; None if it has none."""
     model = variant(annotation, node)
     field = model.model_fields.get(key) if model is not None else None
-    if model is None or field is None or field.is_required():
+    if field is None or field.is_required():
         return None
-    value = field.get_default(call_default_factory=True, validated_data={})
-    return model.__pydantic_serializer__.to_python(model.model_construct(**{key: value}), mode="json", include={key})[
-        key
-    ]
+    return to_jsonable_python(field.get_default(call_default_factory=True))
 
 
 def keys(annotation: Any, node: Node | None) -> list[str]:

@@ -1,4 +1,4 @@
-"""The kinds of configuration files, their folders, and the path that a name refers to."""
+"""The kinds of configuration files: their folders, the path a name refers to, and their JSON schema for editors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import core_schema
 
 from tacsim.config.errors import did_you_mean
 from tacsim.models.rig import RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
@@ -102,3 +104,48 @@ def resolve(kind: Kind, reference: str, folder: Path) -> Path:
     if not any(path.is_relative_to(home.resolve()) for home in (folder, config_root())):
         raise NotFound(f"{reference!r} leads outside; allowed: files below the referring file's own folder or configs/")
     return path
+
+
+def json_schema(kind: str = "rig") -> dict[str, Any]:
+    """The JSON schema of a kind of file (rig, task, scene, sensor, material), string references and units included.
+
+    For completion and checks while you type, write it to a file and name that in the first line of the YAML file; any
+    editor with yaml-language-server (VS Code's YAML extension, Neovim, Emacs, JetBrains) understands::
+
+        tacsim schema rig > rig.schema.json
+        # yaml-language-server: $schema=rig.schema.json
+
+    Raises KeyError on another kind.
+    """
+    schema = TypeAdapter(KINDS[kind].annotation).json_schema(schema_generator=_Generator, mode="validation")
+    schema["$schema"] = _Generator.schema_dialect
+    schema["title"] = f"tacsim {kind}"
+    return schema
+
+
+class _Generator(GenerateJsonSchema):
+    """Adds what the loader accepts besides a mapping: the name of a file, and ``extends``."""
+
+    def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:
+        mapping = super().model_schema(schema)
+        kind = kind_of([schema["cls"]])
+        if kind is None:
+            return mapping
+        reference = {
+            "description": f"name of a {kind.name}, or path of a .yaml file below this folder",
+            "anyOf": [{"enum": names(kind.name)}, {"type": "string", "pattern": r"\.ya?ml$"}],
+        }
+        mapping["properties"]["extends"] = {
+            **reference,
+            "description": f"{reference['description']}, to change a few keys of",
+        }
+        required = mapping.pop("required", [])
+        if required:
+            mapping["anyOf"] = [{"required": required}, {"required": ["extends"]}]
+        return {"anyOf": [reference, mapping]}
+
+    def tagged_union_schema(self, schema: core_schema.TaggedUnionSchema) -> JsonSchemaValue:
+        union = super().tagged_union_schema(schema)
+        union.pop("discriminator", None)  # a keyword of OpenAPI, not of JSON schema
+        union["anyOf"] = union.pop("oneOf")  # a reference by name fits every variant
+        return union

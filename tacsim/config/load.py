@@ -53,7 +53,7 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
         root = apply(root, RigConfig, override, state)
         if override.path[:2] == ("task", "scene") and _has(root, "scene"):
             what = f"this rig has a scene of its own, which is used; say {'.'.join(override.path[1:])}"
-            state.report(override.place, ".".join(override.path), what)
+            state.report(override.value.place, ".".join(override.path), what)
     own_scene = _has(root, "scene") or any(override.path[0] == "scene" for override in of_rest)
     root = _scene_of_task(root)
     for override in of_rest:

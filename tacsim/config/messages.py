@@ -12,8 +12,6 @@ from tacsim.config.annotation import allowed, child, keys, members, models, spli
 from tacsim.config.document import LoadState, Node
 from tacsim.config.errors import did_you_mean, join, printable
 
-_OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
-
 
 @dataclass(frozen=True, slots=True)
 class Location:
@@ -34,7 +32,9 @@ def report_errors(error: ValidationError, root: Node, annotation: Any, state: Lo
         context = detail.get("ctx", {})
         location = find(root, annotation, (*detail["loc"], *context.get("at", ())))
         if not location.node.broken:
-            state.report(location.node.place, _key(location), _text(detail, location))
+            absent = location.absent
+            key = join(location.key, absent) if isinstance(absent, str) else location.key
+            state.report(location.node.place, key, _text(detail, location))
 
 
 def find(root: Node, annotation: Any, loc: tuple[str | int, ...]) -> Location:
@@ -78,10 +78,6 @@ def _member(annotation: Any, node: Node) -> Any:
     return fitting[0] if len(fitting) == 1 else None
 
 
-def _key(location: Location) -> str:
-    return join(location.key, location.absent) if isinstance(location.absent, str) else location.key
-
-
 def _text(detail: ErrorDetails, location: Location) -> str:
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "extra_forbidden" or location.of_key:
@@ -101,7 +97,7 @@ def _text(detail: ErrorDetails, location: Location) -> str:
         options = [str(option) for part in members(location.annotation) for option in get_args(split(part)[0])]
         hint = did_you_mean(location.node.text, options)
         return f"{location.node.describe()} is unknown; allowed: {allowed(location.annotation)}{hint}"
-    if kind in _OUT_OF_RANGE:
+    if kind.startswith(("greater_than", "less_than")):
         return f"{location.node.text} is out of range; allowed: {allowed(location.annotation)}"
     if location.annotation is None or not members(location.annotation):
         return printable(detail["msg"])

@@ -138,10 +138,6 @@ class Override:
     path: tuple[str, ...]
     value: Node
 
-    @property
-    def place(self) -> Place:
-        return self.value.place
-
 
 def parse_override(text: str, state: LoadState) -> Override | None:
     """``key.sub=value``, the value read as YAML; None after a reported problem."""
@@ -171,20 +167,20 @@ def _put(node: Node, annotation: Any, override: Override, depth: int, state: Loa
     if node.value is not None and not isinstance(node.value, dict):
         where = ".".join(override.path[:depth])
         what = f"'{where}' is {node.describe()}, which has no keys" if where else "the file holds no mapping"
-        state.report(override.place, ".".join(override.path), what)
+        state.report(override.value.place, ".".join(override.path), what)
         return node
     if node.value is None:
-        node = Node({}, override.place, override.value.folder)
+        node = Node({}, override.value.place, override.value.folder)
     entry = node.items.get(step)
     inner = child(annotation, node, step)
     if depth + 1 < len(override.path) and (entry is None or entry.is_empty):
         if inner is None and keys(annotation, node):
             known = keys(annotation, node)
             what = f"unknown key; allowed: {', '.join(known)}{did_you_mean(step, known)}"
-            state.report(override.place, ".".join(override.path[: depth + 1]), what)
+            state.report(override.value.place, ".".join(override.path[: depth + 1]), what)
             return node
-        entry = from_plain(default(annotation, node, step), override.place, override.value.folder)
-    entry = entry or Node(None, override.place, override.value.folder)
+        entry = from_plain(default(annotation, node, step), override.value.place, override.value.folder)
+    entry = entry or Node(None, override.value.place, override.value.folder)
     changed = replace(node, value={**node.items, step: _put(entry, inner, override, depth + 1, state)})
     return drop_foreign_keys(node, changed, annotation, keep={step})
 
@@ -194,7 +190,7 @@ def _put_in_list(node: Node, annotation: Any, override: Override, depth: int, st
     step = override.path[depth]
     if not (step.isascii() and step.isdigit() and len(step) < 6 and int(step) < len(entries)):
         fits = f"an index from 0 to {len(entries) - 1}" if entries else f"(the list is empty) {allowed(annotation)}"
-        state.report(override.place, ".".join(override.path[: depth + 1]), f"no such entry; allowed: {fits}")
+        state.report(override.value.place, ".".join(override.path[: depth + 1]), f"no such entry; allowed: {fits}")
         return node
     index = int(step)
     entries[index] = _put(entries[index], child(annotation, node, index), override, depth + 1, state)

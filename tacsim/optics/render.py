@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tacsim.models.photometric import PhotometricLight, places_in_image
 from tacsim.models.scene import GelSurface
-from tacsim.models.sensor import Light, Lighting, SensorModel
+from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.spline import line_matrices
@@ -126,7 +126,7 @@ def shade(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:
     square = np.asarray(cv2.accumulateSquare(slope_y, slope_x * slope_x), dtype=np.float32)
     cosine = np.float32(1.0) / np.sqrt(square + np.float32(1.0))  # n . v
     channels = np.zeros((3, *slope_x.shape), dtype=np.float32)
-    for light in sorted(lighting.lights, key=_order):
+    for light in sorted(lighting.lights, key=lambda each: (*each.direction, *each.colour, each.diffuse, each.specular)):
         lx, ly, lz = (c / math.hypot(*light.direction) for c in light.direction)
         lit = np.maximum(cv2.addWeighted(slope_x, -lx, slope_y, -ly, -lz) * cosine, np.float32(0.0))  # n . l
         if light.specular > 0:
@@ -211,7 +211,3 @@ def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: 
     gradient = np.stack([by_x, by_y], axis=-1) / TEXTURE_PITCH
     gradient[~grid.within(gel_size)] = 0.0
     return np.ascontiguousarray(gradient, dtype=np.float32)
-
-
-def _order(light: Light) -> tuple[float, ...]:
-    return (*light.direction, *light.colour, light.diffuse, light.specular)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.interface import TactileFrame
 from tacsim.record.episode import EpisodeError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 MAX_SIDE = 4096  # [px] of a picture, each way
 FORMATS = ("PNG", "JPEG", "BMP")
@@ -36,14 +41,21 @@ def decode_image(data: bytes, what: str, formats: tuple[str, ...] = FORMATS) -> 
 
     Raises EpisodeError that names `what`, for unreadable data and for pictures beyond MAX_SIDE (before decoding them).
     """
+    with _opened(io.BytesIO(data), what, formats) as picture:
+        if picture.mode not in ("RGB", "RGBA", "L", "P"):
+            raise EpisodeError(f"{what}: pixel type '{picture.mode}'; 8 bits a channel are read, grey or colour")
+        return np.array(picture.convert("RGB"))
+
+
+@contextmanager
+def _opened(source: Path | io.BytesIO, what: str, formats: tuple[str, ...]) -> Iterator[Image]:
+    """A picture of a size that is allowed, not yet decoded."""
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(data), formats=formats) as picture:
+        with Image.open(source, formats=formats) as picture:
             _check_size(*picture.size, what)
-            if picture.mode not in ("RGB", "RGBA", "L", "P"):
-                raise EpisodeError(f"{what}: pixel type '{picture.mode}'; 8 bits a channel are read, grey or colour")
-            return np.array(picture.convert("RGB"))
+            yield picture
     except EpisodeError:
         raise
     except Exception as failure:  # a decoder that is fed damaged bytes may raise anything
@@ -64,15 +76,8 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(rows, columns) of a picture file, from its header alone. Raises EpisodeError that names the file."""
-    from PIL import Image
-
-    try:
-        with Image.open(path, formats=FORMATS) as picture:
-            columns, rows = picture.size
-    except Exception as failure:  # as above
-        raise EpisodeError(f"{path}: no readable picture ({', '.join(FORMATS)}): {failure}") from failure
-    _check_size(columns, rows, str(path))
-    return rows, columns
+    with _opened(path, str(path), FORMATS) as picture:
+        return picture.height, picture.width
 
 
 def reference_attachments(references: Mapping[str, TactileFrame]) -> dict[str, bytes]:

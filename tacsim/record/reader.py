@@ -78,7 +78,6 @@ class EpisodeFile:
         self.complete = False  # after the last step: the file has its footer and all steps it claims
         self.dropped = 0  # after the last step
         self._sensors = sensors
-        self._closing: dict[str, int] | None = None
         try:
             if not self.path.is_file():
                 raise EpisodeError(f"{self.path}: {'is no file' if self.path.exists() else 'no such file'}")
@@ -114,14 +113,15 @@ class EpisodeFile:
         """The steps in order, up to the end of the file or the first damage."""
         topics: dict[int, str] = {}
         pending: dict[str, bytes] = {}
+        closing: dict[str, int] | None = None
         count = 0
         for record in self._records:
             if isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Metadata) and record.name == CLOSE:
-                self._closing = _closing(record)
-            elif isinstance(record, Footer):
-                self._finish(count)
+                closing = _closing(record)
+            elif isinstance(record, Footer) and closing is not None:
+                self.complete, self.dropped = closing["steps"] == count, closing["dropped"]
             elif isinstance(record, Message):
                 if record.channel_id not in topics:
                     return
@@ -137,11 +137,6 @@ class EpisodeFile:
                     raise EpisodeError(f"{self.path}: step number {count}: {failure}") from failure
                 pending.clear()
                 count += 1
-
-    def _finish(self, count: int) -> None:
-        if self._closing is not None:
-            self.complete = self._closing["steps"] == count
-            self.dropped = self._closing["dropped"]
 
     def close(self) -> None:
         self._file.close()

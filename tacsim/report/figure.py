@@ -245,7 +245,8 @@ def plots(episode: Episode) -> Figure:
 def overview(episode: Episode, title: str, subtitle: str) -> Figure:
     """The whole episode on one page: what each sensor saw at six moments, and the plots below."""
     names = sensors_of(episode)
-    tall = [_aspect(episode, name) * WIDTH * 0.93 / COLUMNS + 0.22 for name in names]
+    shapes = [next(step.frames[name].image.shape for step in episode.steps if name in step.frames) for name in names]
+    tall = [rows / columns * WIDTH * 0.93 / COLUMNS + 0.22 for rows, columns, _ in shapes]
     below, head = 3.1 * _rows(episode), 0.95
     height = head + sum(tall) + below
     figure = canvas(WIDTH, height)
@@ -263,11 +264,6 @@ def _band(figure: Figure, top: float, tall: float) -> SubplotSpec:
     """A full-width band of the page, `top` inches below its upper edge and `tall` inches high."""
     height = float(figure.get_size_inches()[1])
     return figure.add_gridspec(1, 1, left=0.045, right=0.985, top=1 - top / height, bottom=1 - (top + tall) / height)[0]
-
-
-def _aspect(episode: Episode, name: str) -> float:
-    image = next(step.frames[name].image for step in episode.steps if name in step.frames)
-    return float(image.shape[0] / image.shape[1])
 
 
 def _draw_strip(figure: Figure, place: SubplotSpec, episode: Episode, name: str) -> None:

@@ -66,9 +66,8 @@ class SimArm:
         self._check_wrench()
         if target is None:
             return None
-        now, allowed = self._world.pose(self._frame), target
-        if self._region is not None or self._keep_out:
-            allowed, _ = clip_to_region(target, now, self._region, self._spheres())
+        now = self._world.pose(self._frame)
+        allowed, _ = clip_to_region(target, now, self._region, self._spheres())
         allowed = limit_step(allowed, now, self._max_step, self._max_turn)
         self._clock.command(self._frame, allowed, limited=allowed is not target)
         return allowed

@@ -1,4 +1,4 @@
-"""One mock controller for a module; each test finds it as at power-on."""
+"""One mock controller for a module, which each test finds as at power-on; and the machine of one without sockets."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from robot.mock import FaultClient, MockUR
+from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import wire_host
 
 
@@ -26,3 +27,8 @@ def mock(running: MockUR) -> Iterator[MockUR]:
 @pytest.fixture
 def faults(mock: MockUR) -> FaultClient:
     return mock.faults
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()

@@ -1,0 +1,109 @@
+"""A servo without sockets and clocks, on an arm that follows its joints with a lag."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from robot.arm.channel import STATE, CommandKind, WorkerConfig, command_record
+from robot.arm.servo import Servo
+from robot.arm.shared_ring import Record
+from robot.arm.trajectory import PERIOD
+from robot.common.kinematics import Kinematics, pose, rotation
+from robot.common.tcp import pose_of
+from tacsim.interface import FloatArray, Pose
+
+HOME = np.array([0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0])
+KINEMATICS = Kinematics("ur5e")
+EYE = np.eye(4).tolist()
+
+
+def worker_config(**changes: object) -> WorkerConfig:
+    sensor = np.eye(4)
+    sensor[:3, :3], sensor[:3, 3] = rotation([0.0, 0.0, 0.4]), [0.0, 0.01, 0.05]
+    plain: dict[str, object] = {
+        "name": "left",
+        "host": "127.0.0.2",
+        "model": "ur5e",
+        "refused_serial": None,
+        "realtime": False,
+        "parent": 1,
+        "segment": "none",
+        "world_from_base": EYE,
+        "flange_from_tool": EYE,
+        "tool_from_sensor": sensor.tolist(),
+        "tcp": [0.0] * 6,
+        "mass": 0.0,
+        "mass_centre": [0.0] * 3,
+        "lower": [-0.6, -0.3, 0.3],
+        "upper": [-0.3, 0.1, 0.6],
+        "planes": [],
+        "speed": 0.1,
+        "turn_rate": 0.5,
+        "acceleration": 0.5,
+        "turn_acceleration": 5.0,
+        "joint_speed": 1.0,
+        "force": 30.0,
+        "torque": 3.0,
+        "depth": None,
+        "shear": None,
+        "link_timeout": 0.05,
+        "action_timeout": 0.2,
+        "observation_timeout": 0.5,
+        "watchdog": 10.0,
+        "lookahead": 0.03,
+        "gain": 600.0,
+        "partners": [],
+    }
+    return WorkerConfig(**{**plain, **changes})  # type: ignore[arg-type]
+
+
+class Bench:
+    """A servo and an arm whose joints make up a part of their error in each period."""
+
+    def __init__(self, calibration: FloatArray | None = None, **changes: object) -> None:
+        self.servo = Servo(worker_config(**changes))
+        self.q, self.time, self.number = HOME.copy(), 0.0, 0
+        self.calibration = np.eye(4) if calibration is None else calibration  # the true flange, seen from the nominal
+        self.record: Record = np.zeros((), STATE)
+        self.partners: list[Record | None] = [None] * len(self.servo.config.partners)
+        self.sent: list[FloatArray] = []
+        self.look()
+
+    def look(self, force: tuple[float, ...] = (0.0,) * 6) -> None:
+        before = self.record["tcp_pose"].copy()
+        self.record["joints"] = self.q
+        self.record["tcp_pose"] = pose(KINEMATICS.forward(self.q) @ self.calibration)
+        if before.any():
+            self.record["tcp_speed"][:3] = (self.record["tcp_pose"][:3] - before[:3]) / PERIOD
+        self.record["tcp_force"] = force
+        self.now = self.servo.frames.measure(self.record)
+
+    @property
+    def at(self) -> Pose:
+        return pose_of(self.now.sensor)
+
+    def ask(self, target: Pose | np.ndarray, kind: CommandKind = CommandKind.TARGET) -> None:
+        row = target if isinstance(target, np.ndarray) else np.array([*target.position, *target.quaternion])
+        self.number += 1
+        self.servo.on_command(self.number, command_record(self.time, kind, row))
+
+    def run(self, periods: int, force: tuple[float, ...] = (0.0,) * 6) -> None:
+        for _ in range(periods):
+            self.time += PERIOD
+            self.servo.check_faults(self.now, self.partners)
+            joints = self.servo.step(self.time, self.now, self.partners)
+            if joints is not None:
+                self.sent.append(joints)
+                self.q = self.q + 0.2 * (joints - self.q)
+            self.look(force)
+
+    def path(self) -> FloatArray:
+        """(n, 3) origins of the sensor at the joints that were sent."""
+        frames = [KINEMATICS.forward(q) @ self.calibration @ self.servo.frames.tool_from_sensor for q in self.sent]
+        return np.array([frame[:3, 3] for frame in frames])
+
+
+def shifted(start: Pose, x: float, y: float = 0.0, z: float = 0.0) -> Pose:
+    return Pose(start.position + [x, y, z], start.quaternion)

@@ -15,7 +15,7 @@ from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.drift import DriftFinder, size_of
 from calibration.height.colour_table import from_model
 from calibration.height.slope_polynomial import PolynomialSlopes
-from calibration.height.surface_finder import SurfaceFinder, view, window
+from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
 from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view, seen_box
 from calibration.lens.view import GelView
 from calibration.markers.flow import MarkerFlow, marker_grid, require_no_markers
@@ -67,7 +67,7 @@ class FrameNormaliser:
         if min(spare) < 0 or any(extra % (2 * grid.image_scale) for extra in spare) or (find is None and any(spare)):
             raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
         self._rectify, self._grid, self._find, self._markers = rectify, grid, find, markers
-        self._on_image: NDArray[np.bool_] = window(rectify.valid, grid)
+        self._on_image: NDArray[np.bool_] = canonical_part(rectify.valid, grid)
         self._off_image = np.nonzero(~self._on_image)
         self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
         self._valid.flags.writeable = False
@@ -173,7 +173,7 @@ class FrameNormaliser:
         if self._reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
         seen = self._reference.difference(self._rectify(frame.image))
-        change: NDArray[np.float32] = window(seen, self._grid)
+        change: NDArray[np.float32] = canonical_part(seen, self._grid)
         height, gradient, flow, drift = self._surface(frame, seen)
         if drift is not None:
             change = np.subtract(change, drift, out=drift)
@@ -193,7 +193,7 @@ class FrameNormaliser:
         """Pixels of the view whose mean is mean(I0): those of the canonical image, so that what a policy sees does not
         depend on whether height is found."""
         inside = np.zeros_like(self._rectify.valid)
-        window(inside, self._grid)[...] = self._on_image
+        canonical_part(inside, self._grid)[...] = self._on_image
         return inside
 
     def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
@@ -213,10 +213,10 @@ class FrameNormaliser:
         if self._find is not None:
             assert self._reference is not None
             found = self._find(change, self._reference.relative)
-            self._beyond = found.beyond
+            self._beyond = found.beyond_range
             if found.drift is not None:
-                self._drift, self._background = found.drift, found.background
-            height, gradient, removed = found.height, found.gradient, found.removed
+                self._drift, self._background = found.drift, found.drift_slope
+            height, gradient, removed = found.height, found.gradient, found.removed_drift
         self._require_light()
         if self._markers is not None:
             deep = None if height is None else (height, canonical_cells(self._grid))
@@ -264,7 +264,7 @@ def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], g
     """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
     gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
     without inverse, or markers too small for the image."""
-    rectify = from_geometry(model.geometry, gel_size, view(grid, gel_size))
+    rectify = from_geometry(model.geometry, gel_size, extended_view(grid, gel_size))
     find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None)
     return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size))
 
@@ -275,7 +275,7 @@ def normaliser_for_calibration(
     """The normaliser of a sensor that was calibrated: geometry and inverse of its light are those of its bundle.
     untouched: the bundle's (metric) picture, against which the order of colours of each reference is checked."""
     geometry = calibration.geometry
-    wide = view(grid, calibration.gel_size)
+    wide = extended_view(grid, calibration.gel_size)
     # One look-up from the native picture, whether it is metric by itself or seen through lens and perspective.
     if calibration.view is None:
         rectify = from_geometry(geometry, calibration.gel_size, wide)

@@ -80,7 +80,7 @@ CHANGES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class DriftError:
     """Gradient angle error against A where pressed, beyond that without change [degrees]; mean over presses."""
 
     change: Change
@@ -96,7 +96,7 @@ class Report:
     views: tuple[Invariance, ...]
     patch: str  # its size, in words
     angle: float  # gradient angle error against A without any change [degrees]; NaN without surfaces
-    drifts: tuple[Drift, ...]
+    drifts: tuple[DriftError, ...]
     notes: tuple[str, ...]
 
 
@@ -136,7 +136,7 @@ def invariance(
         views.append(_view(name, of_a, of_b, signal, np.argsort(radii)))
     notes = [] if "height" in common else ["gradient and height are left out: no surfaces on both sides"]
     angle = math.nan
-    drifts: list[Drift] = []
+    drifts: list[DriftError] = []
     if any(comparison.surfaces_a is None or calibration is None for comparison, calibration in folds):
         notes.append("no drift table: it needs surfaces of A and the calibration of B")
     else:
@@ -145,7 +145,7 @@ def invariance(
             on_step(len(views) + k, steps)
             fresh = _angle(folds, touched, grid, change, change)
             stale = _angle(folds, touched, grid, change, None)
-            drifts.append(Drift(change, fresh - angle, stale - angle))
+            drifts.append(DriftError(change, fresh - angle, stale - angle))
     return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
 
@@ -303,7 +303,7 @@ def _angle(
         truth = [comparison.surfaces_a[k] for k in one]
         reference = comparison.b.reference if of_reference is None else of_reference(comparison.b.reference)
         real = [comparison.pairs[k].b for k in one]
-        frames = [replace(shot, image=shot.image if change is None else change(shot.image)) for shot in real]
+        frames = [replace(frame, image=frame.image if change is None else change(frame.image)) for frame in real]
         found, _ = estimate_surfaces(replace(comparison.b, reference=reference), frames, calibration, grid)
         assert found is not None  # there is a calibration
         angles += [

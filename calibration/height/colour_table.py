@@ -22,7 +22,7 @@ SLOPE_STEP = 0.02  # between the slopes at which the light is evaluated [-]
 CELLS = 48  # along each colour
 COLOUR_NOISE = 0.02  # standard deviation of the relative change of colour: a camera's noise [-]
 SLOPE_PRIOR = 0.5  # standard deviation of slopes: where colours do not decide, the smaller slope is likelier [-]
-FOREIGN = 0.2  # distance of a colour from all that the light can make, beyond which it belongs to no slope [-]
+MAX_COLOUR_DISTANCE = 0.2  # between a colour and the nearest that the light can make; beyond, no slope has it [-]
 MARGIN = 0.08  # of the table beyond the colours of its light [-]
 
 
@@ -46,7 +46,7 @@ class ColourTable:
     low: Float32  # (3,) colour change at the lower corner of the first cell
     scale: Float32  # (3,) cells per unit of colour change
     maps: Float32  # (CELLS^3, 8) offset (2), then the columns (2,) of the matrix for each colour
-    foreign: NDArray[np.bool_]  # (CELLS^3,)
+    off_gamut: NDArray[np.bool_]  # (CELLS^3,) farther than MAX_COLOUR_DISTANCE from every colour of the light
 
     def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:
         shape = change.shape[:2]
@@ -70,7 +70,7 @@ class ColourTable:
         steep = np.abs(slope)
         beyond |= np.maximum(steep[0], steep[1]) > MAX_SLOPE
         np.clip(slope, -MAX_SLOPE, MAX_SLOPE, out=slope)
-        beyond |= self.foreign.take(flat).reshape(shape)
+        beyond |= self.off_gamut.take(flat).reshape(shape)
         return np.moveaxis(slope, 0, -1), beyond
 
 
@@ -113,7 +113,7 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
     scale = CELLS / (colours.max(axis=(0, 1)) + MARGIN - low)
     lines = ((np.arange(CELLS) + 0.5)[:, None] / scale + low).T
     middles = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-    nearest, foreign = _likeliest(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
+    nearest, off_gamut = _most_likely_slope(colours.reshape(-1, 3), slopes.reshape(-1, 2), middles)
     jacobian = by_slope.reshape(-1, 3, 2)[nearest].astype(np.float64)
     transposed = jacobian.transpose(0, 2, 1)
     matrix = np.linalg.solve(
@@ -121,20 +121,22 @@ def from_lighting(lighting: Lighting, background: tuple[float, float, float]) ->
     )  # (n, 2, 3)
     offset = slopes.reshape(-1, 2)[nearest] - np.einsum("nij,nj->ni", matrix, colours.reshape(-1, 3)[nearest])
     maps = np.concatenate([offset, matrix.transpose(0, 2, 1).reshape(-1, 6)], axis=1).astype(np.float32)
-    return ColourTable(low.astype(np.float32), scale.astype(np.float32), maps, foreign)
+    return ColourTable(low.astype(np.float32), scale.astype(np.float32), maps, off_gamut)
 
 
-def _likeliest(colours: Float32, slopes: Float32, middles: Float32) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """For each cell (n, 3) the index of the likeliest of the slopes (m, 2) with colours (m, 3): near in colour (in
-    units of noise) and small (in units of the prior). Cells far from every colour are foreign: they take their nearest
-    neighbour's, as a search for them would last many times longer."""
+def _most_likely_slope(
+    colours: Float32, slopes: Float32, middles: Float32
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """For each cell (n, 3) the index of the most likely of the slopes (m, 2) with colours (m, 3): near in colour (in
+    units of noise) and small (in units of the prior). Cells beyond MAX_COLOUR_DISTANCE (the mask (n,)) take the
+    slope of their nearest cell within it, as a search for them would last many times longer."""
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import KDTree
 
     tree = KDTree(np.concatenate([colours / COLOUR_NOISE, slopes / SLOPE_PRIOR], axis=1))
     asked = np.concatenate([middles / COLOUR_NOISE, np.zeros((len(middles), 2))], axis=1)
-    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=FOREIGN / COLOUR_NOISE)
-    foreign = ~np.isfinite(distance)
-    where = distance_transform_edt(foreign.reshape(CELLS, CELLS, CELLS), return_distances=False, return_indices=True)
-    native = np.ravel_multi_index(tuple(where.reshape(3, -1)), (CELLS, CELLS, CELLS))
-    return np.asarray(index, dtype=np.intp)[native], np.asarray(foreign)
+    distance, index = tree.query(asked, eps=0.1, distance_upper_bound=MAX_COLOUR_DISTANCE / COLOUR_NOISE)
+    off_gamut = ~np.isfinite(distance)
+    where = distance_transform_edt(off_gamut.reshape(CELLS, CELLS, CELLS), return_distances=False, return_indices=True)
+    nearest_known = np.ravel_multi_index(tuple(where.reshape(3, -1)), (CELLS, CELLS, CELLS))
+    return np.asarray(index, dtype=np.intp)[nearest_known], np.asarray(off_gamut)

@@ -23,7 +23,7 @@ DEGREE = 3
 TERMS = 56
 COLOUR_SCALE = 2.4  # brings changes of colour to about -2..2, the size of x and y
 EXTRAPOLATION = 1.1  # slopes reach up to this times the steepest calibrated one
-RIDGE = 1e-6  # times the number of pixels
+RIDGE = 1e-6  # ridge weight per pixel
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -52,7 +52,7 @@ class PolynomialSlopes:
         """Slopes (H, W, 2) of relative changes (H, W, 3); where they are steeper than calibrated they are clipped."""
         colours = [np.ascontiguousarray(change[..., channel]) for channel in range(3)]
         products: dict[tuple[int, ...], Float32] = {}
-        normal = self._maps[()].copy()  # zeros, unless somebody's weights say otherwise
+        normal = self._maps[()].copy()  # all zero in fitted models
         product = np.empty_like(normal)
         for powers in self._powers[1:]:
             last = colours[powers[-1]]
@@ -70,7 +70,7 @@ class PolynomialSlopes:
 
 
 def inverse_features(change: Float64, x: Float64, y: Float64) -> Float64:
-    """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1; each term lies together in memory."""
+    """(n, TERMS) of relative changes (n, 3) at places x, y (n,) in -1..1; contiguous per term."""
     inputs = np.stack([*(COLOUR_SCALE * change).T, x, y])
     found: dict[tuple[int, ...], int] = {}
     terms = np.empty((TERMS, len(x)))
@@ -90,11 +90,11 @@ def to_normal(gradient: Float64) -> Float64:
     return normal
 
 
-def fit_inverse(sets: Sequence[tuple[Float64, Float64]], *, place: bool) -> Float64:
-    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `place` those of
-    all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The ridge grows
-    with the number of pixels, which the first diagonal element counts."""
-    use = np.array([i for i, (colour, axes) in enumerate(_terms()) if colour and (place or not axes)])
+def fit_inverse(sets: Sequence[tuple[Float64, Float64]], *, with_position: bool) -> Float64:
+    """(TERMS, 2) weights from normal equations, one pair (TERMS, TERMS), (TERMS, 2) a press; without `with_position`
+    those of all terms in x and y are 0. Those without colour always are: no change is no slope, wherever it is. The
+    ridge grows with the number of pixels, which the first diagonal element counts."""
+    use = np.array([i for i, (colour, axes) in enumerate(_terms()) if colour and (with_position or not axes)])
     square = sum((s[np.ix_(use, use)] for s, _ in sets), np.zeros((len(use), len(use))))
     right = sum((r[use] for _, r in sets), np.zeros((len(use), 2)))
     weights = np.zeros((TERMS, 2))

@@ -35,10 +35,10 @@ class FoundSurface:
 
     height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
     gradient: Float32  # (h, w, 2) [-]
-    beyond: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
+    beyond_range: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
     drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it
-    background: float | None  # mean angle of the slopes that this change would look like [degrees]
-    removed: Float32 | None  # (H, W, 3) drift in the canonical image's change; None: not measured, or not removed
+    drift_slope: float | None  # mean angle of the slopes that this change would look like [degrees]
+    removed_drift: Float32 | None  # (H, W, 3) drift taken off the canonical image's change; None: nothing is taken off
 
 
 class SurfaceFinder:
@@ -46,7 +46,7 @@ class SurfaceFinder:
 
     Args:
         slopes: the inverse of its light, on the pixels of :func:`seen_box`.
-        valid: (H, W) of :func:`view`, as the rectification gives it.
+        valid: (H, W) of :func:`extended_view`, as the rectification gives it.
         dots: dots are printed on the gel.
         drifts: the light is real and drifts: the drift, which is measured in any case, is removed.
     """
@@ -58,7 +58,7 @@ class SurfaceFinder:
         self._box = seen_box(valid)
         self._unseen = ~valid[self._box]
         pitch = grid.pitch / grid.image_scale
-        self._drift, self._drifts = DriftFinder(self._unseen.shape), drifts
+        self._drift_finder, self._remove_drift = DriftFinder(self._unseen.shape), drifts
         # the canonical image in the seen box: its first row and column, and its size
         self._image = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         corner = [(there - own) // 2 for there, own in zip(valid.shape, self._image, strict=True)]
@@ -67,11 +67,11 @@ class SurfaceFinder:
         self._integrate = Integrator(self._unseen.shape, pitch)
         self._shape = valid.shape
         self._any_unseen = bool(self._unseen.any())
-        self._known: _Known | None = None
+        self._known: _PreparedReference | None = None
 
     def __call__(self, change: Float32, reference: Float32) -> FoundSurface:
-        """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3), known again by
-        its identity."""
+        """The surface of a view (H, W, 3) of relative changes; `reference`: I0 / mean(I0), (H, W, 3); what
+        follows from it is cached per array object."""
         if self._known is None or self._known.picture is not reference:
             self._known = self._prepared(reference)
         known, hidden = self._known, self._known.hidden
@@ -80,11 +80,11 @@ class SurfaceFinder:
             np.multiply(change[(*self._box, channel)], known.gain[channel], out=planes[channel])
         if self._dots:
             hidden = hidden | _ink(known.planes + planes)
-        drift = self._drift(planes, hidden)
-        changed = self._drift.at(drift) if drift.measured else None
-        if self._drifts:
-            self._drift.remove(planes, drift)
-        gradient, beyond = self._slopes(np.moveaxis(planes, 0, -1))
+        drift = self._drift_finder(planes, hidden)
+        changed = self._drift_finder.at(drift) if drift.measured else None
+        if self._remove_drift:
+            self._drift_finder.remove(planes, drift)
+        gradient, beyond_range = self._slopes(np.moveaxis(planes, 0, -1))
         by_x, by_y = np.ascontiguousarray(gradient[..., 0]), np.ascontiguousarray(gradient[..., 1])
         if self._dots:
             _fill((by_x, by_y), hidden)
@@ -94,11 +94,11 @@ class SurfaceFinder:
         return FoundSurface(
             height=self._cells(height),
             gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),
-            beyond=float(np.count_nonzero(beyond & ~hidden) / beyond.size),
+            beyond_range=float(np.count_nonzero(beyond_range & ~hidden) / beyond_range.size),
             drift=None if changed is None else size_of(changed),
-            background=None if changed is None else self._angle(changed),
-            removed=self._drift.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
-            if self._drifts and drift.measured
+            drift_slope=None if changed is None else self._angle(changed),
+            removed_drift=self._drift_finder.part(drift.scaled(1.0 / known.gain), self._corner, self._image)
+            if self._remove_drift and drift.measured
             else None,
         )
 
@@ -108,25 +108,26 @@ class SurfaceFinder:
         steepness = np.hypot(slope[:, 0], slope[:, 1])[~self._unseen[::STRIDE, ::STRIDE].ravel()]
         return float(np.degrees(np.arctan(steepness)).mean())
 
-    def _prepared(self, picture: Float32) -> _Known:
+    def _prepared(self, picture: Float32) -> _PreparedReference:
         reference = picture[self._box]
         hidden = self._unseen | _ink(np.moveaxis(reference, -1, 0)) if self._dots else self._unseen
         # the light that is known is that of all the gel, without its dots
         gain = (1.0 / reference[~hidden].mean(axis=0)).astype(np.float32)
-        return _Known(picture, np.ascontiguousarray(np.moveaxis(reference * gain, -1, 0)), gain, hidden)
+        return _PreparedReference(picture, np.ascontiguousarray(np.moveaxis(reference * gain, -1, 0)), gain, hidden)
 
     def _cells(self, plane: Float32) -> Float32:
         """(h, w) means over the cells of the canonical grid, of a plane of the seen box; 0 beyond it."""
         import cv2
 
-        view = np.zeros(self._shape, dtype=np.float32)
-        view[self._box] = plane
+        whole = np.zeros(self._shape, dtype=np.float32)
+        whole[self._box] = plane
         size = (self._grid.columns, self._grid.rows)
-        return np.asarray(cv2.resize(window(view, self._grid), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        part = canonical_part(whole, self._grid)
+        return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Known:
+class _PreparedReference:
     """What follows from the reference alone."""
 
     picture: Float32  # itself
@@ -135,7 +136,7 @@ class _Known:
     hidden: Mask  # (H, W) not seen, or under a dot at rest
 
 
-def view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
+def extended_view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
     """The canonical image, extended by whole cells on each side until it covers a gel of `gel_size` (x, y) [m]."""
     extra_y, extra_x = (
         max(0, math.ceil((length / grid.pitch - cells) / 2 - 1e-6))
@@ -144,11 +145,11 @@ def view(grid: CanonicalGrid, gel_size: tuple[float, float]) -> PixelGrid:
     return canonical_image(grid).extended(extra_y * grid.image_scale, extra_x * grid.image_scale)
 
 
-def window(view: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
+def canonical_part(picture: NDArray[Any], grid: CanonicalGrid) -> NDArray[Any]:
     """The canonical image in the middle of a view (H, W, ...); it shares the view's memory."""
     rows, columns = grid.rows * grid.image_scale, grid.columns * grid.image_scale
-    top, left = (view.shape[0] - rows) // 2, (view.shape[1] - columns) // 2
-    return view[top : top + rows, left : left + columns]
+    top, left = (picture.shape[0] - rows) // 2, (picture.shape[1] - columns) // 2
+    return picture[top : top + rows, left : left + columns]
 
 
 def _ink(relative: Float32) -> Mask:

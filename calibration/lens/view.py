@@ -146,7 +146,7 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
     answer: Any = cv2.calibrateCameraExtended(
         on_board, seen, (columns, rows), np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
     )
-    residual, matrix, distortion, turns, _, doubt, _, each = answer
+    residual, matrix, distortion, turns, _, std_intrinsics, _, each = answer
     found = dict(zip(pictures, np.ravel(each).tolist(), strict=True))
     if not residual <= MAX_RESIDUAL:
         worst = max(found, key=found.__getitem__)
@@ -165,7 +165,7 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
             f"{np.degrees(MIN_TILT):.0f} are needed to tell its distance from the focal length: tilt the board more, "
             "by 20 to 40 degrees to all sides"
         )
-    uncertainty = float(np.max(np.ravel(doubt)[:2] / np.diag(matrix)[:2]))
+    uncertainty = float(np.max(np.ravel(std_intrinsics)[:2] / np.diag(matrix)[:2]))
     if not uncertainty <= MAX_FOCAL_DEVIATION:
         raise BadView(
             f"the focal length is uncertain by {uncertainty:.0%} ({MAX_FOCAL_DEVIATION:.0%} at most): "

@@ -10,12 +10,16 @@ import functools
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib import metadata
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.bundle import FORMAT, Calibration, Provenance, Residual
 from calibration.errors import BadFrames
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
+from calibration.lens.view import GelView
 from calibration.light.circle import NoCircle
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, Skirt, dent_gradient, rim_slope
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
@@ -23,6 +27,7 @@ from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, un
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
 from calibration.reference import STALE_COLOUR, exchanged
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
+from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -30,10 +35,11 @@ Image = NDArray[np.uint8]
 BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 REFINEMENT_PIXELS = 2500  # of each press, about
-# A press whose change of colour a dent leaves unexplained is left out [share of the change]
-MAX_UNEXPLAINED = 0.5
-MAX_UNEXPLAINED_RATIO = 5.0  # ... or of so many times the median's share
-GOOD_FIT = 0.05  # ... but not if no more than this is left
+# A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
+MAX_UNEXPLAINED = 0.5  # share of the change
+MAX_UNEXPLAINED_RATIO = 5.0  # times the median press's share, with three presses or more; at least GOOD_FIT
+GOOD_FIT = 0.05  # share of the change: a press that is explained so well always stays
+RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
 # Errors of a press's normals that deserve a warning
@@ -48,7 +54,7 @@ class PressPrediction:
     name: str
     circle: ContactCircle
     error: float  # mean |error| in contact and near it (r < 1.5 a) [grey levels]
-    nothing: float  # the same, if no change were predicted: the background alone
+    null_error: float  # the same, if no change were predicted: the background alone
     correlation: float  # of predicted and real change there
     predicted: NDArray[np.float32]  # (H, W, 3) change of colour [grey levels]
     real: NDArray[np.float32]  # (H, W, 3) the same, as seen, without drift
@@ -64,11 +70,59 @@ class LightFit:
     inverse: InverseModel
     size: ModelSize
     skirt: Skirt  # [px]
-    scores: tuple[PressPrediction, ...]
+    predictions: tuple[PressPrediction, ...]
     left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
     warnings: tuple[str, ...]
     reference: Image
     presses: tuple[BallPress, ...]
+    frames: tuple[str, ...]  # names of all that were given
+
+    def to_calibration(
+        self,
+        serial: str,
+        ball_radius: float,
+        pixel_pitch: float,
+        *,
+        view: GelView | None = None,
+        markers: Markers | None = None,
+        noise: CameraNoise | None = None,
+    ) -> Calibration:
+        """The calibration of sensor `serial`, made now; `ball_radius`, `pixel_pitch` [m]. `write_bundle` sets the
+        checksums."""
+        rows, columns, _ = self.reference.shape
+        return Calibration(
+            format=FORMAT,
+            serial=serial,
+            geometry=view.geometry if view else SensorGeometry(width=columns, height=rows, pixel_pitch=pixel_pitch),
+            gel_size=(columns * pixel_pitch, rows * pixel_pitch),
+            forward=self.forward,
+            inverse=self.inverse,
+            skirt_length=self.skirt.length * pixel_pitch,
+            skirt_fraction=self.skirt.fraction,
+            view=view,
+            markers=markers,
+            noise=noise,
+            residuals=tuple(
+                Residual(
+                    frame=press.name,
+                    circle=(press.circle.x, press.circle.y, press.circle.radius),
+                    error=press.error,
+                    nothing=press.null_error,
+                    correlation=press.correlation,
+                    angle=press.angle,
+                )
+                for press in self.predictions
+            ),
+            provenance=Provenance(
+                made=datetime.now(UTC).isoformat(timespec="seconds"),
+                software=f"tacsim {metadata.version('tacsim')}",
+                ball_radius=ball_radius,
+                frames=self.frames,
+                left_out=dict(self.left_out),
+                warnings=self.warnings,
+            ),
+            reference="0" * 64,
+        )
 
 
 def calibrate_light(
@@ -104,31 +158,32 @@ def calibrate_light(
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     size = choose_size(forward_sets)
-    every = functools.reduce(operator.add, forward_sets)
+    all_equations = functools.reduce(operator.add, forward_sets)
     steepest = max(rim_slope(press.circle, ball) for press in presses)
-    scores = tuple(
+    predictions = tuple(
         _prediction(
             press,
             labels[i],
-            _forward_model(every - forward_sets[i], size, steepest),
-            fit_inverse([*inverse_sets[:i], *inverse_sets[i + 1 :]], place=len(presses) - 1 > FEW_PRESSES),
+            _forward_model(all_equations - forward_sets[i], size, steepest),
+            fit_inverse([*inverse_sets[:i], *inverse_sets[i + 1 :]], with_position=len(presses) - 1 > FEW_PRESSES),
             mean,
             reference,
         )
         for i, press in enumerate(presses)
         if len(presses) > 1
     )
-    inverse = fit_inverse(inverse_sets, place=len(presses) > FEW_PRESSES)
+    inverse = fit_inverse(inverse_sets, with_position=len(presses) > FEW_PRESSES)
     return LightFit(
-        forward=_forward_model(every, size, steepest),
+        forward=_forward_model(all_equations, size, steepest),
         inverse=InverseModel(weights=tuple((float(x), float(y)) for x, y in inverse), steepest=steepest),
         size=size,
         skirt=refined.skirt,
-        scores=scores,
+        predictions=predictions,
         left_out=tuple(left_out),
-        warnings=(*_warnings(presses, ball, mean, len(left_out)), *_badly_predicted(scores)),
+        warnings=(*_warnings(presses, ball, mean, len(left_out)), *_badly_predicted(predictions)),
         reference=shown,
         presses=tuple(presses),
+        frames=tuple(name for name, _ in frames),
     )
 
 
@@ -164,7 +219,10 @@ def _refined(
         worst = int(np.argmax(refined.unexplained))
         if refined.unexplained[worst] <= limit:
             return [replace(p, circle=c) for p, c in zip(found, refined.circles, strict=True)], refined
-        why = f"a ball's dent leaves {refined.unexplained[worst]:.0%} of its change unexplained"
+        why = (
+            f"the fitted ball dent explains only {1 - refined.unexplained[worst]:.0%} of the colour change (at least "
+            f"{1 - limit:.0%} needed)"
+        )
         left_out.append((found.pop(worst).name, why))
     raise BadFrames("no frame can be used. " + "; ".join(f"{name}: {why}" for name, why in left_out))
 
@@ -187,27 +245,27 @@ def _warnings(presses: Sequence[BallPress], ball: float, mean: Float64, left_out
     if left_out > len(presses):
         found.append("most frames were left out: does the picture without contact really show none?")
     if len(presses) == 1:
-        return [*found, "only one press: it says little"]
+        return [*found, "only one press: the fit cannot be checked; press at least five"]
     height, width = presses[0].shape
     if max(np.ptp([p.circle.x for p in presses]) / width, np.ptp([p.circle.y for p in presses]) / height) < MIN_SPREAD:
         found.append("all presses are in one place: nothing is known of light elsewhere on the gel; spread them")
     return found
 
 
-def _badly_predicted(scores: Sequence[PressPrediction]) -> list[str]:
-    if len(scores) < 3:
+def _badly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
+    if len(predictions) < 3:
         return []
-    limit = max(BAD_NORMALS, BAD_NORMALS_RATIO * float(np.median([score.angle for score in scores])))
+    limit = max(BAD_NORMALS, BAD_NORMALS_RATIO * float(np.median([prediction.angle for prediction in predictions])))
     return [
         f"{s.name} is predicted badly by the others, normals off by {s.angle:.0f} degrees: another ball, a bad frame?"
-        for s in scores
+        for s in predictions
         if s.angle > limit
     ]
 
 
 def _near(press: BallPress) -> NDArray[np.bool_]:
     """(H, W) contact and skirt."""
-    return np.asarray(press.distance() < NEAR * press.circle.radius + 5)
+    return np.asarray(press.distance() < NEAR * press.circle.radius + RIM_MARGIN)
 
 
 def _window(press: BallPress) -> Window:
@@ -266,8 +324,8 @@ def _prediction(
     distance = press.distance() / press.circle.radius
     light, _ = PhotometricLight(model).change(gradient.astype(np.float32), *places_in_image(columns, rows))
     predicted = smooth(light.astype(np.float64), BLUR) * mean
-    still = np.float64(reference) + press.drift  # what this frame would show without contact
-    predicted = np.clip(still + predicted, 0.0, 255.0) - still
+    untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
+    predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
     real = press.change * mean
     contact = distance < 1.5
 
@@ -278,7 +336,7 @@ def _prediction(
         press.name,
         press.circle,
         error=float(np.abs(predicted - real)[contact].mean()),
-        nothing=float(np.abs(real)[contact].mean()),
+        null_error=float(np.abs(real)[contact].mean()),
         correlation=float(np.corrcoef(predicted[contact].ravel(), real[contact].ravel())[0, 1]),
         predicted=predicted.astype(np.float32),
         real=real.astype(np.float32),
@@ -290,10 +348,10 @@ def _prediction(
 def normal_angle(one: Float64, other: Float64) -> Float64:
     """(...,) angle [degrees] between unit normals given by their parts (..., 2) in the plane."""
 
-    def whole(parts: Float64) -> Float64:
+    def full_normal(parts: Float64) -> Float64:
         square = (parts**2).sum(axis=-1, keepdims=True)
         shorter = parts * np.minimum(1.0, 0.999 / np.sqrt(np.maximum(square, 1e-12)))
         return np.concatenate([shorter, np.sqrt(1.0 - (shorter**2).sum(axis=-1, keepdims=True))], axis=-1)
 
-    cosine = (whole(one) * whole(other)).sum(axis=-1)
+    cosine = (full_normal(one) * full_normal(other)).sum(axis=-1)
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

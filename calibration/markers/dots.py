@@ -11,11 +11,8 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-DARKNESS = (
-    0.2,
-    0.35,
-    0.5,
-)  # share of the light round it that a dot takes at least; the higher ones part it from others
+# A dot is darker than its surroundings by at least this share of their light; the higher levels part it from others
+MIN_DARKNESS = (0.2, 0.35, 0.5)
 EDGE_DARKNESS = 0.15  # the same of the blurred edge of a dot
 MIN_FILLED = 0.4  # share of its bounding box that a dot fills
 MAX_RADIUS = 2.5  # [radii]
@@ -41,9 +38,9 @@ class Dots:
 class DotFinder:
     """Finds dots of about one radius [px].
 
-    The light that dots take is what a closing (the bright frame of each place) has beyond the picture itself, as a
-    share: unlike a difference of Gaussians it sees no dot in the shadow side of a step of brightness, as every rim of
-    a contact has one. A centre is the mean of the dot's pixels, each weighted with its darkness beyond its threshold.
+    Darkness is how much a picture falls short of its closing (the brightness round each place), as a share of it:
+    unlike a difference of Gaussians it sees no dot in the shadow side of a step of brightness, as every rim of a
+    contact has one. A centre is the mean of the dot's pixels, each weighted with its darkness beyond its threshold.
     """
 
     def __init__(self, radius: float) -> None:
@@ -53,21 +50,21 @@ class DotFinder:
 
     def __call__(self, image: Image) -> Dots:
         """The dots of a picture (H, W, 3) or of one channel of it (H, W)."""
-        taken = light_taken(image, self._side, self._blur)
+        dark = darkness(image, self._side, self._blur)
         found = []
-        for level in DARKNESS:
-            dots, rest = self._blobs(taken, level)
+        for level in MIN_DARKNESS:
+            dots, rest = self._blobs(dark, level)
             found.append(dots)
             if rest is None:
                 break
-            taken = rest
+            dark = rest
         return Dots(np.concatenate([d.centres for d in found]), np.concatenate([d.areas for d in found]))
 
-    def _blobs(self, taken: Float32, level: float) -> tuple[Dots, Float32 | None]:
+    def _blobs(self, dark: Float32, level: float) -> tuple[Dots, Float32 | None]:
         """The dots among the blobs beyond `level`, and what is left in blobs too large or long to be one."""
         import cv2
 
-        mask = (taken > level).astype(np.uint8)
+        mask = (dark > level).astype(np.uint8)
         kind = cv2.CV_16U if mask.size < 1 << 16 else cv2.CV_32S  # room for as many labels as pixels; 16 is faster
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=kind)
         area = stats[:, cv2.CC_STAT_AREA]
@@ -81,13 +78,13 @@ class DotFinder:
         good = large & compact
         where = np.flatnonzero(mask)
         label = labels.ravel()[where].astype(np.intp)
-        weight = taken.ravel()[where].astype(np.float64) - level
+        weight = dark.ravel()[where].astype(np.float64) - level
         rows, columns = np.divmod(where, mask.shape[1])
         total = np.maximum(np.bincount(label, weight, count), 1e-12)
         centres = np.stack([np.bincount(label, weight * at, count) / total for at in (columns, rows)], axis=1)
         dots = Dots(centres[good], area[good].astype(np.float64))
         clumps = large & ~compact
-        return dots, np.where(clumps[labels], taken, np.float32(0.0)) if clumps.any() else None
+        return dots, np.where(clumps[labels], dark, np.float32(0.0)) if clumps.any() else None
 
 
 def _filters(radius: float) -> tuple[int, float]:
@@ -97,7 +94,7 @@ def _filters(radius: float) -> tuple[int, float]:
     return 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
 
 
-def light_taken(image: Image, side: int, blur: float) -> Float32:
+def darkness(image: Image, side: int, blur: float) -> Float32:
     """(H, W) share of the light that is missing against the frame of `side` x `side` px round each place."""
     import cv2
 
@@ -122,6 +119,6 @@ class DotEraser:
         """The picture (H, W, 3) without its dots."""
         import cv2
 
-        inked = (light_taken(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
+        inked = (darkness(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
         wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
         return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)

@@ -27,7 +27,7 @@ Entry = TypeVar("Entry")
 
 MAX_ENTRIES = 1000  # of a file
 
-Count = Annotated[int | None, Field(ge=0, le=MAX_ENTRIES)]  # entries of a whole file; None: written by hand, not told
+Count = Annotated[int | None, Field(ge=0, le=MAX_ENTRIES)]  # entries of a whole file; None: written by hand, not given
 
 
 def _whole(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...]:
@@ -36,9 +36,9 @@ def _whole(entries: tuple[Entry, ...], info: ValidationInfo) -> tuple[Entry, ...
     if count is not None and count != len(entries):
         raise PydanticCustomError(
             "cut_off",
-            "holds {held} entries, `count` says {told}: the file was cut off, or changed by hand; record again, or "
+            "holds {held} entries, `count` says {expected}: the file was cut off, or changed by hand; record again, or "
             "correct `count` if the rest is right",
-            {"held": len(entries), "told": count, "at": ()},
+            {"held": len(entries), "expected": count, "at": ()},
         )
     return entries
 
@@ -97,7 +97,7 @@ def touch_file(touches: Sequence[BallTouch], ball_radius: float) -> TouchFile:
 
 
 def board_pose_file(board_poses: Sequence[BoardPose], *, fixed: bool) -> BoardPoseFile:
-    """What `write_record` shall write of sights."""
+    """What `write_record` shall write of poses of a board."""
     entries = tuple(BoardPoseEntry(flange=placement(s.flange), board=placement(s.board)) for s in board_poses)
     return BoardPoseFile(camera="fixed" if fixed else "flange", count=len(entries), poses=entries)
 

@@ -64,7 +64,7 @@ def match_presses(
         done[name] = Frame(name, image, surface)
         notes += [f"{name}: {warning}"] if warning else []
     untouched = gel.untouched
-    frames = tuple(done.get(shot.name, Frame(shot.name, *untouched)) for shot in real.frames)
+    frames = tuple(done.get(frame.name, Frame(frame.name, *untouched)) for frame in real.frames)
     return FrameSet(f"scene {scene.name}", untouched[0], "the untouched simulated gel", frames), notes
 
 
@@ -115,11 +115,11 @@ def _circles(real: FrameSet, ball: float) -> tuple[dict[str, Circle], list[str]]
     """Contact circles by the frame's name, and where none was found. Raises BadFrames when there is none at all."""
     found: dict[str, Circle] = {}
     notes = []
-    for shot in real.frames:
+    for frame in real.frames:
         try:
-            found[shot.name] = contact_circle(shot.image, real.reference, ball)
+            found[frame.name] = contact_circle(frame.image, real.reference, ball)
         except NoCircle as error:
-            notes.append(f"{shot.name}: not pressed: {error}")
+            notes.append(f"{frame.name}: not pressed: {error}")
     if not found:
         raise BadFrames(f"{real.name}: no frame shows a ball's contact, so there is nothing to press. {notes[0]}")
     return found, notes

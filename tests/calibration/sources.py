@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from calibration.bundle import Calibration, Provenance
+from calibration.bundle import Calibration
 from calibration.frame_set import Frame, FrameSet
 from calibration.light.calibrator import calibrate_light
-from tacsim.models.sensor import SensorGeometry
-from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
+from tests.calibration.presses import BALL, BALL_PX, PITCH, HiddenSensor
 
 PLACES = [(70, 60), (190, 140), (130, 100), (60, 150), (200, 60), (100, 50)]
 DEPTHS = [0.5e-3, 0.35e-3, 0.65e-3, 0.45e-3, 0.55e-3, 0.3e-3]
@@ -29,17 +28,19 @@ def side(
     return FrameSet(name, sensor.empty(), "made up", frames, still)
 
 
-def changed(of: FrameSet, change: object, what: str = "shots") -> FrameSet:
+def changed(of: FrameSet, change: object, what: str = "frames") -> FrameSet:
     """The side with `change` (image -> image) applied to all its pictures; `what`: "all" also changes its reference."""
     assert callable(change)
-    frames = tuple(Frame(shot.name, change(shot.image)) for shot in of.frames)
+    frames = tuple(Frame(frame.name, change(frame.image)) for frame in of.frames)
     reference = change(of.reference) if what == "all" else of.reference
-    return FrameSet(of.name, reference, of.reference_from, frames, of.untouched if what == "shots" else ())
+    return FrameSet(of.name, reference, of.reference_from, frames, of.untouched if what == "frames" else ())
 
 
 def blank(like: FrameSet) -> FrameSet:
     """A simulation that draws no contact at all."""
-    return FrameSet("blank", like.reference, "made up", tuple(Frame(shot.name, like.reference) for shot in like.frames))
+    return FrameSet(
+        "blank", like.reference, "made up", tuple(Frame(frame.name, like.reference) for frame in like.frames)
+    )
 
 
 def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
@@ -55,7 +56,10 @@ def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
 def save(of: FrameSet, folder: Path, reference: str = "background.png") -> Path:
     """Writes a side as a folder of pictures."""
     folder.mkdir(parents=True)
-    for name, image in ((reference, of.reference), *((shot.name, shot.image) for shot in (*of.frames, *of.untouched))):
+    for name, image in (
+        (reference, of.reference),
+        *((frame.name, frame.image) for frame in (*of.frames, *of.untouched)),
+    ):
         Image.fromarray(image).save(folder / name)
     return folder
 
@@ -64,17 +68,4 @@ def calibrated(sensor: HiddenSensor) -> tuple[Calibration, np.ndarray]:
     """The calibration of a made-up sensor from presses of its own, and its reference."""
     frames = [(f"{k}.png", made.image) for k, made in enumerate(sensor.presses(8))]
     fit = calibrate_light(sensor.empty(), frames, BALL_PX)
-    return Calibration(
-        format=1,
-        serial="made",
-        geometry=SensorGeometry(width=COLUMNS, height=ROWS, pixel_pitch=PITCH),
-        gel_size=(COLUMNS * PITCH, ROWS * PITCH),
-        forward=fit.forward,
-        inverse=fit.inverse,
-        skirt_length=fit.skirt.length * PITCH,
-        skirt_fraction=fit.skirt.fraction,
-        provenance=Provenance(
-            made="2026-01-01T00:00:00+00:00", software="tacsim", ball_radius=BALL, frames=tuple(n for n, _ in frames)
-        ),
-        reference="0" * 64,
-    ), fit.reference
+    return fit.to_calibration("made", BALL, PITCH), fit.reference

@@ -22,7 +22,6 @@ from benchmarks.harness.runner import Case
 from tacsim.models.quantity import Config
 
 if TYPE_CHECKING:
-    from calibration.bundle import Calibration
     from calibration.light.calibrator import LightFit, PressPrediction
 
 CASE = "ball_presses"
@@ -103,56 +102,34 @@ def calibrated(folder: Path, of: BallSet) -> tuple[LightFit, float, float]:
     return fit, perf_counter() - wall, process_time() - cpu
 
 
-def bundle(of: BallSet, fit: LightFit) -> Calibration:
-    """What the calibrator would write of a fit."""
-    from calibration.bundle import FORMAT, Calibration, Provenance
-    from tacsim.models.sensor import SensorGeometry
-
-    rows, columns, _ = fit.reference.shape
-    return Calibration(
-        format=FORMAT,
-        serial="bench",
-        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=of.pixel_pitch),
-        gel_size=(columns * of.pixel_pitch, rows * of.pixel_pitch),
-        forward=fit.forward,
-        inverse=fit.inverse,
-        skirt_length=fit.skirt.length * of.pixel_pitch,
-        skirt_fraction=fit.skirt.fraction,
-        provenance=Provenance(
-            made="", software="tacsim", ball_radius=of.ball_radius, frames=tuple(press.name for press in fit.presses)
-        ),
-        reference="0" * 64,
-    )
-
-
 def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
     """Each press of a ball predicted from all others: picture and normals. Seconds: to calibrate, leaving out too."""
     fit, wall, cpu = calibrated(folder, of)
-    if not fit.scores:
+    if not fit.predictions:
         raise BadData(f"{of.name}: one press alone can be used; the others: {fit.left_out}")
-    scores, left = fit.scores, f"{len(fit.left_out)} frames left out" if fit.left_out else ""
+    predictions, left = fit.predictions, f"{len(fit.left_out)} frames left out" if fit.left_out else ""
     timing = Timing((wall,), cpu)
     figures = {
-        "ncc": _mean(scores, "correlation"),
-        "null_grey": _mean(scores, "nothing"),
-        **_interval("grey", [score.error for score in scores]),
-        "presses": float(len(scores)),
+        "ncc": _mean(predictions, "correlation"),
+        "null_grey": _mean(predictions, "null_error"),
+        **_interval("grey", [prediction.error for prediction in predictions]),
+        "presses": float(len(predictions)),
         "left_out": float(len(fit.left_out)),
         "weights": 3.0 * fit.size.terms,
         "steepest": fit.forward.steepest,
     }
     picture = Measurement(
-        timing, _mean(scores, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; light "
-        "by all other presses, circles and skirt by all", f"{of.name}: picture", None, figures, left,
+        timing, _mean(predictions, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; "
+        "light by all other presses, circles and skirt by all", f"{of.name}: picture", None, figures, left,
     )  # fmt: skip
-    flat = [float(np.degrees(np.arctan(_usual_slope(score, of)))) for score in scores]
+    flat = [float(np.degrees(np.arctan(_usual_slope(prediction, of)))) for prediction in predictions]
     figures = {
         "null_deg": float(np.mean(flat)),
-        **_interval("deg", [score.angle for score in scores]),
-        "untouched_deg": _mean(scores, "untouched_angle"),
+        **_interval("deg", [prediction.angle for prediction in predictions]),
+        "untouched_deg": _mean(predictions, "untouched_angle"),
     }
     normals = Measurement(
-        timing, _mean(scores, "angle"), "deg", "normals of ball and skirt inside the contact circle",
+        timing, _mean(predictions, "angle"), "deg", "normals of ball and skirt inside the contact circle",
         f"{of.name}: normals", None, figures, left,
     )  # fmt: skip
     return [picture, normals]
@@ -173,8 +150,8 @@ def cases(folder: Path) -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def _mean(scores: Sequence[PressPrediction], what: str) -> float:
-    return float(np.mean([getattr(score, what) for score in scores]))
+def _mean(predictions: Sequence[PressPrediction], what: str) -> float:
+    return float(np.mean([getattr(prediction, what) for prediction in predictions]))
 
 
 def _interval(unit: str, values: Sequence[float]) -> dict[str, float]:
@@ -185,9 +162,9 @@ def _interval(unit: str, values: Sequence[float]) -> dict[str, float]:
     return {f"median_{unit}": float(np.median(values)), f"low_{unit}": low, f"high_{unit}": high}
 
 
-def _usual_slope(score: PressPrediction, of: BallSet) -> float:
+def _usual_slope(prediction: PressPrediction, of: BallSet) -> float:
     """Slope of the ball half-way between the middle and the rim, by area: what a flat guess misses."""
-    ball, r = of.ball_radius / of.pixel_pitch, score.circle.radius / np.sqrt(2)
+    ball, r = of.ball_radius / of.pixel_pitch, prediction.circle.radius / np.sqrt(2)
     return float(r / np.sqrt(ball**2 - r**2))
 
 

@@ -47,7 +47,7 @@ def made_up(width: int) -> Calibration:
     u, v = np.meshgrid(*place_in_image(shape[1], shape[0]))
     terms = inverse_features(change.reshape(-1, 3).astype(np.float64), 2 * u.ravel(), 2 * v.ravel())
     target = to_normal(slopes.reshape(-1, 2).astype(np.float64))
-    inverse = fit_inverse([(terms.T @ terms, terms.T @ target)], place=True)
+    inverse = fit_inverse([(terms.T @ terms, terms.T @ target)], with_position=True)
     return Calibration(
         format=FORMAT,
         serial="made-up",

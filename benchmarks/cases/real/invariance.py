@@ -115,7 +115,7 @@ def _fold(
         fit = calibrate_light(reference, train, of.ball_radius / of.pixel_pitch)
     except BadFrames as error:
         raise BadData(f"{of.name}: {error}") from None
-    calibration = balls.bundle(of, fit)
+    calibration = fit.to_calibration("bench", of.ball_radius, of.pixel_pitch)
     real = FrameSet("real", reference, "as labelled", tuple(Frame(name, image) for name, image in test))
     scene = ball_scene(gel_size, of.ball_radius, ELEMENT)
     wall, cpu = perf_counter(), process_time()

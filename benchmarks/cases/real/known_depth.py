@@ -91,7 +91,7 @@ class CalibratedSensor:
         from tacsim.interface import TactileFrame
         from tacsim.optics.render import Renderer
 
-        calibration = balls.bundle(of, fit)
+        calibration = fit.to_calibration("bench", of.ball_radius, of.pixel_pitch)
         with TemporaryDirectory() as place:
             write_bundle(Path(place), calibration, reference)
             self.model = read_sensor_model(Path(place))

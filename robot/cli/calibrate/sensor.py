@@ -158,51 +158,14 @@ def _write(
     view: GelView | None,
 ) -> None:
     """Shows the calibration and writes its bundle."""
-    from datetime import UTC, datetime
-    from importlib import metadata
-
-    from calibration.bundle import FORMAT, Calibration, Provenance, Residual, write_bundle
+    from calibration.bundle import write_bundle
     from calibration.light.residual_picture import draw
-    from tacsim.models.sensor import SensorGeometry
 
     _show(fit, pitch, found)
-    rows, columns, _ = fit.reference.shape
-    bundle = Calibration(
-        format=FORMAT,
-        serial=serial,
-        geometry=SensorGeometry(width=columns, height=rows, pixel_pitch=pitch) if view is None else view.geometry,
-        gel_size=(columns * pitch, rows * pitch),
-        forward=fit.forward,
-        inverse=fit.inverse,
-        skirt_length=fit.skirt.length * pitch,
-        skirt_fraction=fit.skirt.fraction,
-        view=view,
-        markers=found,
-        noise=_noise(read),
-        residuals=tuple(
-            Residual(
-                frame=score.name,
-                circle=(score.circle.x, score.circle.y, score.circle.radius),
-                error=score.error,
-                nothing=score.nothing,
-                correlation=score.correlation,
-                angle=score.angle,
-            )
-            for score in fit.scores
-        ),
-        provenance=Provenance(
-            made=datetime.now(UTC).isoformat(timespec="seconds"),
-            software=f"tacsim {metadata.version('tacsim')}",
-            ball_radius=ball,
-            frames=tuple(frame.name for frame in read.frames),
-            left_out=dict(fit.left_out),
-            warnings=fit.warnings,
-        ),
-        reference="0" * 64,  # write_bundle sets it
-    )
+    bundle = fit.to_calibration(serial, ball, pitch, view=view, markers=found, noise=_noise(read))
     with writing(folder):
         written = [write_bundle(folder, bundle, fit.reference)]
-        if fit.scores:
+        if fit.predictions:
             written.append(folder / "residuals.png")
             draw(fit, written[-1])
     say_files(*written)
@@ -253,13 +216,13 @@ def _look_for_dots(fit: LightFit) -> None:
 
 
 def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
-    if fit.scores:
+    if fit.predictions:
         rows = (
             (
-                score.name, f"{score.circle.radius * pitch * 1e3:.3f}", f"{score.error:.1f}", f"{score.nothing:.1f}",
-                f"{score.correlation:.3f}", f"{score.angle:.1f}",
+                press.name, f"{press.circle.radius * pitch * 1e3:.3f}", f"{press.error:.1f}",
+                f"{press.null_error:.1f}", f"{press.correlation:.3f}", f"{press.angle:.1f}",
             )
-            for score in fit.scores
+            for press in fit.predictions
         )  # fmt: skip
         columns = ("frame", "contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]")
         show_table("Each press predicted by all the others", columns, rows, left={0})

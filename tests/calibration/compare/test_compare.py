@@ -150,7 +150,7 @@ def test_surfaces_that_a_simulation_knows_are_compared() -> None:
     def knowing(factor: float, markers: float) -> FrameSet:
         flow = np.full((5, 6, 2), markers, dtype=np.float32)
         surface = SurfaceMap(factor * height, factor * gradient, flow)
-        return replace(plain, frames=tuple(replace(shot, surface=surface) for shot in plain.frames))
+        return replace(plain, frames=tuple(replace(frame, surface=surface) for frame in plain.frames))
 
     result = compare_frames(knowing(0.9, 3e-5), knowing(1.0, 0.0))
     assert result.overall["marker_error"].mean == pytest.approx(3e-5 * math.sqrt(2), rel=1e-5)
@@ -194,15 +194,15 @@ def test_names_pair_before_the_order_does(real: FrameSet) -> None:
 
 
 def test_endings_of_names_do_not_matter(real: FrameSet) -> None:
-    jpeg = replace(real, frames=tuple(replace(shot, name=shot.name.replace(".png", ".JPG")) for shot in real.frames))
+    jpeg = replace(real, frames=tuple(replace(frame, name=frame.name.replace(".png", ".JPG")) for frame in real.frames))
     couples, said = paired(jpeg, real, Pairing.auto)
     assert said == [] and len(couples) == 5
 
 
 def test_other_names_are_paired_in_order_and_it_says_so(real: FrameSet) -> None:
-    named = replace(real, frames=tuple(replace(shot, name=f"x{k}.png") for k, shot in enumerate(real.frames)))
+    named = replace(real, frames=tuple(replace(frame, name=f"x{k}.png") for k, frame in enumerate(real.frames)))
     couples, said = paired(named, real, Pairing.auto)
-    assert [two.name for _, two in couples] == [shot.name for shot in real.frames]
+    assert [two.name for _, two in couples] == [frame.name for frame in real.frames]
     assert said == ["paired in order: the names differ"]
 
 
@@ -271,8 +271,8 @@ def test_the_bootstrap_has_the_width_of_the_mean() -> None:
 def test_a_folder_is_read_with_its_references(real: FrameSet, tmp_path: Path) -> None:
     read = read_frame_set(save(real, tmp_path / "real"))
     assert read.reference_from == "background.png"
-    assert [shot.name for shot in read.frames] == [shot.name for shot in real.frames]
-    assert [shot.name for shot in read.untouched] == ["background_2.png", "background_3.png"]
+    assert [frame.name for frame in read.frames] == [frame.name for frame in real.frames]
+    assert [frame.name for frame in read.untouched] == ["background_2.png", "background_3.png"]
     assert np.array_equal(read.frames[2].image, real.frames[2].image)
 
 
@@ -359,7 +359,7 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
     assert config["overall"]["gradient_angle"]["mean"] is None
     with paths[1].open(encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
-    assert [row["a"] for row in table] == [shot.name for shot in compared.a.frames]
+    assert [row["a"] for row in table] == [frame.name for frame in compared.a.frames]
     assert float(table[2]["contact_mae"]) == compared.pairs[2].numbers["contact_mae"]
     assert float(table[2]["null_contact_mae"]) == compared.pairs[2].null["contact_mae"]
     page = paths[2].read_text(encoding="utf-8")

@@ -106,11 +106,11 @@ def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: t
 
 
 def test_left_out_scores_are_those_of_presses_nobody_has_seen(calibrated: tuple[LightFit, list[Made]]) -> None:
-    for score in calibrated[0].scores:
-        assert score.error < 0.25 * score.nothing
-        assert score.correlation > 0.97
-        assert score.untouched_angle < 0.6
-    assert np.median([score.angle for score in calibrated[0].scores]) < 2.0
+    for prediction in calibrated[0].predictions:
+        assert prediction.error < 0.25 * prediction.null_error
+        assert prediction.correlation > 0.97
+        assert prediction.untouched_angle < 0.6
+    assert np.median([prediction.angle for prediction in calibrated[0].predictions]) < 2.0
 
 
 def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None:
@@ -123,9 +123,9 @@ def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None
     for sensor in (lit, burnt):
         fits.append(calibrate_light(sensor.empty(), named(sensor.presses(6)), BALL_PX))
     shares = [1.0 - press.lit.mean() for press in fits[1].presses]
-    assert min(shares) > 0.001 and len(fits[1].scores) == 6
-    wanted = np.mean([score.error for score in fits[0].scores])
-    assert np.mean([score.error for score in fits[1].scores]) < 1.05 * wanted
+    assert min(shares) > 0.001 and len(fits[1].predictions) == 6
+    wanted = np.mean([prediction.error for prediction in fits[0].predictions])
+    assert np.mean([prediction.error for prediction in fits[1].predictions]) < 1.05 * wanted
     unseen = burnt.press(0.5e-3, 150, 90)
     assert angle_in_contact(fits[1], unseen) < 1.2
 
@@ -133,7 +133,7 @@ def test_a_channel_that_saturates_spoils_neither_itself_nor_the_others() -> None
 def test_one_press_gives_a_plain_model_and_a_warning(sensor: HiddenSensor) -> None:
     fit = calibrate_light(sensor.empty(), named([sensor.press(0.5e-3, 130, 100)]), BALL_PX)
     assert (fit.size.degree, fit.size.position) == (3, 0)
-    assert fit.scores == ()
+    assert fit.predictions == ()
     assert any("only one press" in warning for warning in fit.warnings)
     assert angle_in_contact(fit, sensor.press(0.45e-3, 110, 110)) < 2.0
 
@@ -146,7 +146,7 @@ def test_a_drifting_lamp_does_no_harm(sensor: HiddenSensor) -> None:
     ]
     fit = calibrate_light(sensor.empty(), named(drifted), BALL_PX)
     assert fit.left_out == ()
-    assert fit.scores[2].error < 0.3 * fit.scores[2].nothing
+    assert fit.predictions[2].error < 0.3 * fit.predictions[2].null_error
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_a_drifting_lamp_does_no_harm(sensor: HiddenSensor) -> None:
     [
         (lambda sensor: sensor.empty(), "no ball's contact"),
         (lambda sensor: np.maximum(sensor.press(0.5e-3, 70, 60).image, sensor.press(0.5e-3, 190, 140).image), "second"),
-        (lambda sensor: sensor.press(0.5e-3, 130, 100).image[..., ::-1].copy(), "unexplained|no ball's contact"),
+        (lambda sensor: sensor.press(0.5e-3, 130, 100).image[..., ::-1].copy(), "explains only|no ball's contact"),
         (lambda sensor: np.clip(sensor.press(0.5e-3, 130, 100, drift=160.0).image, 0, 255), "saturated|no ball"),
     ],
     ids=["no contact", "two balls", "swapped colours", "saturated"],
@@ -259,7 +259,7 @@ def test_printed_dots_that_move_are_erased() -> None:
         assert press.circle.radius == pytest.approx(truth.circle[2], abs=1.5)
 
     def left_out_error(fit: LightFit) -> float:
-        return float(np.mean([score.error for score in fit.scores]))
+        return float(np.mean([prediction.error for prediction in fit.predictions]))
 
     assert left_out_error(erased) < 1.5 * left_out_error(plain)
     np.testing.assert_array_equal(erased.reference, reference)

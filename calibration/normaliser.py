@@ -71,51 +71,24 @@ class FrameNormaliser:
         self._off_image = np.nonzero(~self._on_image)
         self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
         self._valid.flags.writeable = False
-        self._reference: Reference | None = None
-        self._beyond = 0.0
         self._find_drift = DriftFinder(shape) if drifts and find is None else None
-        self._background: float | None = None
-        self._drift: float | None = None
         self._untouched = untouched
         self._sought = False  # the last observation was found in a picture
-
-    @property
-    def reference(self) -> Reference | None:
-        """The present reference; None before the first."""
-        return self._reference
-
-    @property
-    def finds_height(self) -> bool:
-        """True when height and gradient are found in pictures of sources that don't know their surface."""
-        return self._find is not None
-
-    @property
-    def beyond(self) -> float:
-        """Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
-        calibrated slope. 0 where nothing had to be found."""
-        return self._beyond
-
-    @property
-    def background(self) -> float | None:
-        """Mean slope [degrees] that the drift of the light since the reference looks like, in the last picture with
-        enough untouched gel; None where no height is found, or before such a picture."""
-        return self._background
-
-    @property
-    def drift(self) -> float | None:
-        """Relative change of the untouched gel's colour since the reference [-], in the same picture; also without
-        height."""
-        return self._drift
+        self.reference: Reference | None = None  # the present one; None before the first
+        # Height and gradient, or flow, are found in pictures of sources that don't know their surface
+        self.finds_height, self.finds_flow = find is not None, markers is not None
+        # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
+        # calibrated slope. 0 where nothing had to be found
+        self.beyond_range = 0.0
+        # Relative change of the untouched gel's colour since the reference [-], in the last picture with enough of it;
+        # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
+        self.drift: float | None = None
+        self.drift_slope: float | None = None
 
     @property
     def stale(self) -> bool:
         """True when the reference is outdated: take a fresh one as soon as nothing touches."""
-        return (self._drift or 0.0) > STALE_COLOUR or (self._background or 0.0) > STALE_SLOPE
-
-    @property
-    def finds_flow(self) -> bool:
-        """True when flow is found in pictures of sources that don't know their surface."""
-        return self._markers is not None
+        return (self.drift or 0.0) > STALE_COLOUR or (self.drift_slope or 0.0) > STALE_SLOPE
 
     @property
     def markers_seen(self) -> NDArray[np.bool_] | None:
@@ -142,24 +115,22 @@ class FrameNormaliser:
             self._markers.take_reference(frame.image, frame.index)
         elif self._find is not None:
             require_no_markers(frame.image)
-        self._reference = reference
-        self._background = self._drift = None
+        self.reference = reference
+        self.drift_slope = self.drift = None
 
     def diagnostics(self) -> dict[str, float]:
-        """Quality of the last observation, where it was found in a picture: the properties `beyond`, `drift`,
-        `background`, `kept`, and `stale` (0 or 1)."""
+        """Quality of the last observation, where it was found in a picture, as far as it is known: `beyond`
+        (`beyond_range`), `drift`, `background` (`drift_slope`), `kept`, and `stale` (0 or 1)."""
         if not self._sought:
             return {}
-        found = {"stale": float(self.stale)}
-        if self._find is not None:
-            found["beyond"] = self._beyond
-        if self._drift is not None:
-            found["drift"] = self._drift
-        if self._background is not None:
-            found["background"] = self._background
-        if self._markers is not None:
-            found["kept"] = self.kept
-        return found
+        known = {
+            "stale": float(self.stale),
+            "beyond": self.beyond_range if self.finds_height else None,
+            "drift": self.drift,
+            "background": self.drift_slope,
+            "kept": self.kept if self.finds_flow else None,
+        }
+        return {name: value for name, value in known.items() if value is not None}
 
     def __call__(self, frame: TactileFrame, now: float) -> TactileObservation:
         """The observation of `frame` at time `now` [s].
@@ -170,9 +141,9 @@ class FrameNormaliser:
         Raises NoReference; StaleReference when the light is another; MarkersLost when too few markers are seen;
         ValueError for a frame of another shape.
         """
-        if self._reference is None:
+        if self.reference is None:
             raise NoReference("no reference yet: call take_reference with a frame without contact (Rig.reset does)")
-        seen = self._reference.difference(self._rectify(frame.image))
+        seen = self.reference.difference(self._rectify(frame.image))
         change: NDArray[np.float32] = canonical_part(seen, self._grid)
         height, gradient, flow, drift = self._surface(frame, seen)
         if drift is not None:
@@ -199,7 +170,7 @@ class FrameNormaliser:
     def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
         """Height, gradient and flow, from the source or from the picture; and the drift that is to be taken off the
         canonical image."""
-        self._beyond, self._sought = 0.0, False
+        self.beyond_range, self._sought = 0.0, False
         if frame.surface is not None:
             self._check(frame.surface)
             return frame.surface.height, frame.surface.gradient, frame.surface.flow, None
@@ -208,14 +179,14 @@ class FrameNormaliser:
         if self._find_drift is not None:
             drift = self._find_drift(np.ascontiguousarray(np.moveaxis(change, -1, 0)), ~self._on_image)
             if drift.measured:
-                self._drift = size_of(self._find_drift.at(drift))
+                self.drift = size_of(self._find_drift.at(drift))
                 removed = self._find_drift.part(drift, (0, 0), self._on_image.shape)
         if self._find is not None:
-            assert self._reference is not None
-            found = self._find(change, self._reference.relative)
-            self._beyond = found.beyond_range
+            assert self.reference is not None
+            found = self._find(change, self.reference.relative)
+            self.beyond_range = found.beyond_range
             if found.drift is not None:
-                self._drift, self._background = found.drift, found.drift_slope
+                self.drift, self.drift_slope = found.drift, found.drift_slope
             height, gradient, removed = found.height, found.gradient, found.removed_drift
         self._require_light()
         if self._markers is not None:
@@ -226,8 +197,8 @@ class FrameNormaliser:
     def _require_light(self) -> None:
         """Raises StaleReference."""
         for measured, limit, words in (
-            (self._background, LOST_SLOPE, "slopes of {:.0f} degrees"),
-            (self._drift, LOST_COLOUR, "{:.0%} of its colour"),
+            (self.drift_slope, LOST_SLOPE, "slopes of {:.0f} degrees"),
+            (self.drift, LOST_COLOUR, "{:.0%} of its colour"),
         ):
             if measured is not None and measured > limit:
                 raise StaleReference(

@@ -72,15 +72,15 @@ def test_a_stale_reference_is_seen_in_contact_and_without(
     for image in (sensor.empty(), press.image):
         normalise.take_reference(frame(bundle[1]))
         normalise(frame(image), 0.0)
-        assert not normalise.stale and normalise.background < 0.6
+        assert not normalise.stale and normalise.drift_slope < 0.6
         assert normalise.diagnostics()["stale"] == 0.0
         normalise(frame(change(image.astype(float))), 0.0)
-        assert normalise.stale and normalise.background > STALE_SLOPE
+        assert normalise.stale and normalise.drift_slope > STALE_SLOPE
         told = normalise.diagnostics()
-        assert told["stale"] == 1.0 and told["background"] == normalise.background
+        assert told["stale"] == 1.0 and told["background"] == normalise.drift_slope
         normalise.take_reference(frame(change(sensor.empty().astype(float))))  # a fresh one
         normalise(frame(change(image.astype(float))), 0.0)
-        assert not normalise.stale and normalise.background < 0.6
+        assert not normalise.stale and normalise.drift_slope < 0.6
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
@@ -100,7 +100,7 @@ def test_a_reference_becomes_stale_by_and_by(normalise: FrameNormaliser, sensor:
     told: list[tuple[float, float, bool]] = []
     for gain in (1.0, 0.98, 0.95, 0.9, 0.8, 0.7):
         normalise(frame(gain * press.image.astype(float)), 0.0)
-        told.append((normalise.background, normalise.drift, normalise.stale))
+        told.append((normalise.drift_slope, normalise.drift, normalise.stale))
     assert np.all(np.diff([background for background, _, _ in told]) > 0)
     assert [drift for _, drift, _ in told] == pytest.approx([0.0, 0.02, 0.05, 0.1, 0.2, 0.3], abs=0.01)
     assert not told[1][2] and told[3][2]  # before it costs a degree, and after
@@ -113,7 +113,7 @@ def test_nothing_is_told_by_another_light(change, normalise: FrameNormaliser, se
     normalise.take_reference(frame(bundle[1]))
     with pytest.raises(StaleReference, match=r"Is a lamp out.*take a fresh reference"):
         normalise(frame(change(sensor.press(0.5e-3, 130, 100).image.astype(float))), 0.0)
-    assert normalise.background > LOST_SLOPE or normalise.drift > LOST_COLOUR
+    assert normalise.drift_slope > LOST_SLOPE or normalise.drift > LOST_COLOUR
 
 
 def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
@@ -124,19 +124,19 @@ def test_a_lamp_that_tilts_nothing_is_told_by_the_colour() -> None:
     normalise.take_reference(frame(render(flat())))
     deep = normalise(frame(render(dent())), 0.0).height.max()
     assert normalise(frame(0.8 * render(dent()).astype(float)), 0.0).height.max() < 0.9 * deep
-    assert normalise.background < STALE_SLOPE and normalise.stale
+    assert normalise.drift_slope < STALE_SLOPE and normalise.stale
 
 
 def test_where_too_little_is_untouched_the_last_word_stays(
     normalise: FrameNormaliser, sensor: HiddenSensor, bundle
 ) -> None:
     normalise.take_reference(frame(bundle[1]))
-    assert normalise.background is None and not normalise.stale and normalise.diagnostics() == {}
+    assert normalise.drift_slope is None and not normalise.stale and normalise.diagnostics() == {}
     normalise(frame(0.8 * bundle[1].astype(float)), 0.0)
-    before = normalise.background
+    before = normalise.drift_slope
     checks = 40.0 * (-1) ** np.add.outer(np.arange(ROWS) // 20, np.arange(COLUMNS) // 20)[..., None]
     normalise(frame(bundle[1] + checks), 0.0)  # pressed all over
-    assert normalise.background == before and normalise.stale
+    assert normalise.drift_slope == before and normalise.stale
 
 
 def test_a_large_contact_is_no_drift_and_a_simulation_has_none() -> None:
@@ -145,7 +145,7 @@ def test_a_large_contact_is_no_drift_and_a_simulation_has_none() -> None:
     render = Renderer(model, (20e-3, 20e-3))
     normalise.take_reference(frame(render(flat())))
     normalise(frame(render(dent(depth=1e-3))), 0.0)
-    assert normalise.background < 0.5 and not normalise.stale
+    assert normalise.drift_slope < 0.5 and not normalise.stale
     known = normaliser_for_simulation(model, (20e-3, 20e-3), GRID)
     known.take_reference(frame(render(flat())))
     known(frame(0.7 * render(flat()).astype(float), surface_map(flat(), GRID, None)), 0.0)

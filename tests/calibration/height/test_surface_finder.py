@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.height.colour_table import from_model
-from calibration.height.surface_finder import SurfaceFinder, view
+from calibration.height.surface_finder import SurfaceFinder, extended_view
 from calibration.normaliser import (
     FrameNormaliser,
     normaliser_for_camera,
@@ -71,7 +71,7 @@ def both(surface: GelSurface, model: SensorModel = MODEL, sent=lambda image: ima
     ):
         normalise.take_reference(frame(sent(render(flat()))))
         seen.append(normalise(frame(sent(render(surface)), shown, model), now=0.0))
-        assert normalise.beyond == 0.0
+        assert normalise.beyond_range == 0.0
     return seen
 
 
@@ -164,11 +164,11 @@ def test_colours_that_no_slope_has_are_counted() -> None:
     image = Renderer(MODEL, GEL)(flat())
     normalise.take_reference(frame(image))
     normalise(frame(image), now=0.0)
-    assert normalise.beyond == 0.0
+    assert normalise.beyond_range == 0.0
     spoiled = image.copy()
     spoiled[100:140, 100:160] = 255
     seen = normalise(frame(spoiled), now=0.0)
-    assert normalise.beyond == pytest.approx(40 * 60 / (240 * 320), rel=0.1)
+    assert normalise.beyond_range == pytest.approx(40 * 60 / (240 * 320), rel=0.1)
     assert np.isfinite(seen.height).all()
 
 
@@ -191,8 +191,8 @@ def test_a_lamp_that_drifts_is_no_dent() -> None:
 
 
 def test_the_view_is_the_canonical_image_made_wider() -> None:
-    wide = view(GRID, GEL)
+    wide = extended_view(GRID, GEL)
     assert wide.shape == (160, 160)
-    assert view(GRID, (10e-3, 6e-3)).shape == (128, 128)
+    assert extended_view(GRID, (10e-3, 6e-3)).shape == (128, 128)
     with pytest.raises(ValueError, match="canonical image has"):
         FrameNormaliser(normaliser_for_pictures(MODEL, GEL, GRID)._rectify, GRID)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Literal
 
 import typer
@@ -69,8 +68,9 @@ def bench(
 
     Example: tacsim bench press --json press.json
     """
+    require_checkout("tacsim bench")
     with busy("loading"):
-        bench = _programme()
+        from benchmarks import command as bench
     if from_:
         if json_ is not None and len(from_) > 1:
             raise typer.BadParameter("one file holds one report: give --from once", param_hint="--json")
@@ -88,14 +88,6 @@ def bench(
     bench.write(reports, json_, docs)
     if any(report.failures for report in reports):
         raise typer.Exit(1)
-
-
-def _programme() -> ModuleType:
-    """benchmarks.command of the checkout that this file lies in."""
-    require_checkout("tacsim bench")
-    from benchmarks import command
-
-    return command
 
 
 def require_checkout(what: str) -> None:

@@ -100,7 +100,10 @@ def _run(
                 return recorder
 
             episode, failure = _drive(rig, acting, task, steps, setup, record, interrupt)
-    lost = "" if recorder is None else _lost_steps(recorder, len(episode.steps))
+    lost = ""
+    if recorder is not None and (recorder.error or recorder.dropped):
+        why = recorder.error or "the disk was too slow"
+        lost = f"{recorder.path} holds {recorder.written} of {len(episode.steps)} steps: {why}"
     for problem in filter(None, (failure, lost)):
         complain(problem)
     if recorder is None or not episode.steps:
@@ -134,14 +137,6 @@ def _drive(
         except EpisodeFailed as failed:
             return failed.episode, str(failed)
     return episode, ""
-
-
-def _lost_steps(recorder: Recorder, steps: int) -> str:
-    """What the recording lacks of `steps`, and why; "" when it lacks nothing."""
-    if not (recorder.error or recorder.dropped):
-        return ""
-    why = str(recorder.error) if recorder.error else "the disk was too slow"
-    return f"{recorder.path} holds {recorder.written} of {steps} steps: {why}"
 
 
 def replay(

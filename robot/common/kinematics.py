@@ -171,11 +171,7 @@ class Kinematics:
         if near is not None:
             return near
         flange = target if tool is None else target @ inverse_frame(tool)
-        best: FloatArray | None = None
-        for solution in self.solutions(flange, seed):
-            if best is None or np.abs(solution - seed).max() < np.abs(best - seed).max():
-                best = solution
-        return best
+        return min(self.solutions(flange, seed), key=lambda q: float(np.abs(q - seed).max()), default=None)
 
     def singularity(self, q: Sequence[float] | FloatArray) -> float:
         """How far the arm is from a singular pose: least singular value of the Jacobian at the flange, with lengths

@@ -38,7 +38,7 @@ LAST_LINES = 5  # of a dead child's standard error, in errors
 
 
 class Child(Closing):
-    """A process `python -m module`. A context manager; several threads may use it.
+    """A process `python -m module`; base of the handles of mocks. A context manager; several threads may use it.
 
     Args:
         name: what it is, in errors.
@@ -177,29 +177,6 @@ class Child(Closing):
             lines = self._errors.read().decode(errors="replace").strip().splitlines()[-LAST_LINES:]
             text += "".join(f"\n  {line}" for line in lines)
         return self._error(text)
-
-
-class ChildHandle(Closing):
-    """What the handles of child processes share. A context manager."""
-
-    _child: Child
-
-    @property
-    def pid(self) -> int:
-        return self._child.pid
-
-    @property
-    def running(self) -> bool:
-        """False once the process has ended."""
-        return self._child.running
-
-    def check(self) -> None:
-        """Raises a DeviceError, with its reason, if the process has ended."""
-        self._child.check()
-
-    def close(self) -> None:
-        """Ends the process; a second call does nothing."""
-        self._child.close()
 
 
 class Parent:

@@ -21,12 +21,10 @@ class PolicyNotFound(ValueError):
 class FunctionPolicy:
     """A plain function from Observation to Action as a policy that needs nothing and remembers nothing."""
 
+    needs = Needs()
+
     def __init__(self, act: Callable[[Observation], Action]) -> None:
         self._act = act
-
-    @property
-    def needs(self) -> Needs:
-        return Needs()
 
     def reset(self) -> None:
         """A function has no state."""

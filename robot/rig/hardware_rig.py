@@ -68,7 +68,11 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
         cell = stack.enter_context(MockCell(config))
         sensors: dict[str, TactileSource] = {}
         for name, sensor in config.sensors.items():
-            sensors[name] = _sensor(name, sensor, cell)
+            if isinstance(sensor, CameraSensorConfig):
+                sensors[name] = Camera(sensor, name)
+            else:
+                assert isinstance(sensor, SimSensorConfig)
+                sensors[name] = CellSensor(cell, name, sensor)
             stack.callback(sensors[name].close)
         arms: dict[str, CommandedArm] = {}
         for name, arm in config.arms.items():
@@ -121,13 +125,6 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
         )
         stack.pop_all()
         return rig
-
-
-def _sensor(name: str, config: object, cell: MockCell) -> TactileSource:
-    if isinstance(config, CameraSensorConfig):
-        return Camera(config, name)
-    assert isinstance(config, SimSensorConfig)
-    return CellSensor(cell, name, config)
 
 
 def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:

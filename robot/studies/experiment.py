@@ -7,7 +7,7 @@ import os
 import queue
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,7 +77,13 @@ def run_trials(
                 on_step(*steps.get(timeout=0.1))
             except queue.Empty:
                 continue
-        return {trial: _result(trial, future) for trial, future in running.items()}
+    found: dict[tuple[str, str], Trial] = {}
+    for trial, future in running.items():
+        result = future.result()
+        if isinstance(result, str):
+            raise TrialFailed(f"{trial[0]} by physics '{trial[1]}' failed: {result}")
+        found[trial] = result
+    return found
 
 
 _steps: multiprocessing.Queue[tuple[str, str]] | None = None  # in a worker: to the process that started it
@@ -95,13 +101,6 @@ def _work(task: str, physics: str) -> Trial | str:
         return run_trial(task, physics, lambda: _steps.put((task, physics)) if _steps is not None else None)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-
-
-def _result(trial: tuple[str, str], future: Future[Trial | str]) -> Trial:
-    result = future.result()
-    if isinstance(result, str):
-        raise TrialFailed(f"{trial[0]} by physics '{trial[1]}' failed: {result}")
-    return result
 
 
 def run_trial(task: str, physics: str, on_step: Callable[[], None] = lambda: None) -> Trial:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.common.loopback import require_loopback
-from robot.common.process import Child, ChildHandle
+from robot.common.process import Child
 
 STREAM = "/?action=stream"  # where mjpg-streamer has its stream
 ANSWER_TIMEOUT = 10.0  # a process that does not answer for so long is killed [s]
@@ -45,7 +45,7 @@ class MockCameraState(Faults):
     clients: int  # connected now
 
 
-class MockCamera(ChildHandle):
+class MockCamera(Child):
     """Handle of a mock camera: starts the process, gives it pictures, breaks it, ends it. Threads may share one."""
 
     def __init__(
@@ -63,14 +63,18 @@ class MockCamera(ChildHandle):
         """`width`, `height` of the picture of the gel [px]; with `stamped` each frame has the strip of
         `robot.common.stamp` below it. Port 0: any free one. Raises ValueError for a host that is not loopback unless
         `allow_network`, DeviceError when the process does not start (the port is taken, say)."""
-        check_options(host, port, width, height, fps, quality, allow_network=allow_network)
+        require_loopback(host, "mock camera", allow_network=allow_network)
+        _within(port, 0, 65535, "port")
+        _within(width, 16, MAX_SIDE, "width [px]")
+        _within(height, 16, MAX_SIDE, "height [px]")
+        _within(fps, 0.1, 1000.0, "fps")
+        _within(quality, 50, 100, "quality of JPEG")
         self.host, self.width, self.height = host, width, height
-        options = {"host": host, "port": port, "width": width, "height": height, "fps": fps, "quality": quality}
-        arguments = [f"--{name}={value}" for name, value in options.items()]
-        arguments += ["--stamped"] * stamped + ["--allow-network"] * allow_network
+        source = {"width": width, "height": height, "fps": fps, "quality": quality, "stamped": stamped}
+        request = {"host": host, "port": port, "source": source}
         name = f"mock camera at {host}"
-        self._child = Child("robot.mock.camera", arguments, name=name, ready_timeout=ANSWER_TIMEOUT)
-        self.port = int(self._child.ready["port"])
+        super().__init__("robot.mock.camera", name=name, ready_timeout=ANSWER_TIMEOUT, first_request=request)
+        self.port = int(self.ready["port"])
         self.url = f"http://{host}:{self.port}{STREAM}"
 
     def push(self, image: NDArray[np.uint8]) -> int:
@@ -124,22 +128,10 @@ class MockCamera(ChildHandle):
         return MockCameraState(**answer)
 
     def _ask(self, command: str, value: Any = None, **pictures: NDArray[np.uint8]) -> Any:
-        return self._child.ask({"do": command, "value": value}, pictures, timeout=ANSWER_TIMEOUT)[0]["result"]
+        return self.ask({"do": command, "value": value}, pictures, timeout=ANSWER_TIMEOUT)[0]["result"]
 
 
 def _within(value: float, low: float, high: float, what: str) -> float:
     if not low <= value <= high:  # also NaN
         raise ValueError(f"mock camera, {what}: must lie within {low:g} and {high:g}, got {value}")
     return value
-
-
-def check_options(
-    host: str, port: int, width: int, height: int, fps: float, quality: int, *, allow_network: bool
-) -> None:
-    """Raises ValueError."""
-    require_loopback(host, "mock camera", allow_network=allow_network)
-    _within(port, 0, 65535, "port")
-    _within(width, 16, MAX_SIDE, "width [px]")
-    _within(height, 16, MAX_SIDE, "height [px]")
-    _within(fps, 0.1, 1000.0, "fps")
-    _within(quality, 50, 100, "quality of JPEG")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.common.process import Arrays, Child, ChildHandle
+from robot.common.process import Arrays, Child
 from robot.errors import DeviceError
 from tacsim.interface import FloatArray, Pose, SurfaceMap, Truth
 
@@ -44,7 +44,7 @@ class SceneFrame:
     seconds: float  # that it took
 
 
-class SimServer(ChildHandle):
+class SimServer(Child):
     """Starts the process for a scene and talks to it.
 
     Args:
@@ -66,7 +66,7 @@ class SimServer(ChildHandle):
             "models": {name: model.model_dump(mode="json") for name, model in models.items()},
             "grid": grid.model_dump(),
         }
-        self._child = Child(
+        super().__init__(
             "robot.mock.cell",
             name="simulated cell",
             error=SimServerError,
@@ -75,7 +75,7 @@ class SimServer(ChildHandle):
             ready_timeout=PATIENCE,
             first_request={"do": "open", "contact": contact, **opened},
         )
-        poses = self._child.ready["poses"]
+        poses = self.ready["poses"]
         self.initial = {name: pose_of(numbers) for name, numbers in poses.items()}  # of the sensors
 
     def place(self, poses: Mapping[str, Pose]) -> SceneFrame:
@@ -88,7 +88,7 @@ class SimServer(ChildHandle):
 
     def _move(self, what: str, poses: Mapping[str, Pose]) -> SceneFrame:
         request = {"do": what, "poses": {name: numbers_of(pose) for name, pose in poses.items()}}
-        answer, arrays = self._child.ask(request, timeout=PATIENCE)
+        answer, arrays = self.ask(request, timeout=PATIENCE)
         self._index += 1
         return SceneFrame(
             index=self._index,

@@ -153,17 +153,6 @@ def _force_limit(controller: Controller, newtons: float) -> None:
     controller.machine.load.force_limit = _not_negative(newtons, "force limit")
 
 
-def _cut(controller: Controller, ports: list[int] | None, reset: bool) -> int:
-    return controller.cut(PORTS if ports is None else ports, reset=reset)
-
-
-def _refuse(controller: Controller, on: bool) -> None:
-    if on:
-        controller.refuse()
-    else:
-        controller.listen()
-
-
 def _drop(controller: Controller, probability: float, seed: int) -> None:
     if not 0 <= probability <= 1:
         raise ValueError(f"probability must lie within 0 and 1, got {probability}")
@@ -198,10 +187,6 @@ def _unlock_delay(controller: Controller, seconds: float) -> None:
     controller.machine.unlock_delay = _not_negative(seconds, "unlock delay")
 
 
-def _log(controller: Controller) -> list[tuple[float, str]]:
-    return list(controller.machine.log)
-
-
 def _switch(name: str) -> Callable[[Controller, bool], None]:
     def switch(controller: Controller, on: bool) -> None:
         setattr(controller.faults, name, bool(on))
@@ -212,7 +197,7 @@ def _switch(name: str) -> Callable[[Controller, bool], None]:
 ACTIONS: dict[str, Callable[..., Any]] = {
     "state": _state,
     "received": _received,
-    "log": _log,
+    "log": lambda controller: list(controller.machine.log),
     "reset": Controller.reset,
     "protective_stop": lambda controller: controller.machine.protective_stop("injected"),
     "estop": lambda controller: controller.machine.emergency_stop(),
@@ -226,8 +211,8 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "remote_control": _switch("remote_control"),
     "dashboard_mute": _switch("dashboard_mute"),
     "black_hole": Controller.black_hole,
-    "cut": _cut,
-    "refuse": _refuse,
+    "cut": lambda controller, ports, reset: controller.cut(PORTS if ports is None else ports, reset=reset),
+    "refuse": lambda controller, on: controller.refuse() if on else controller.listen(),
     "delay": _delay,
     "drop": _drop,
     "wrench": _wrench,

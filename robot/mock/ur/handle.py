@@ -9,7 +9,7 @@ import numpy as np
 
 from robot.common import MOCK_SERIAL
 from robot.common.loopback import require_loopback
-from robot.common.process import Child, ChildHandle
+from robot.common.process import PATIENCE, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
 from robot.mock.ur.machine.machine import Version
@@ -24,7 +24,7 @@ class MockError(DeviceError):
     """A mock controller did not start."""
 
 
-class MockArms(ChildHandle):
+class MockArms(Child):
     """Mock controllers in one process of their own, one for each host; a context manager.
 
     model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6). Raises MockError when they are
@@ -57,13 +57,12 @@ class MockArms(ChildHandle):
         check_hosts(self.hosts, allow_network)
         self.fault_clients = tuple(FaultClient(host, fault_port) for host in self.hosts)
         name = f"mock controller on {', '.join(hosts)}"
-        self._child = Child("robot.mock", arguments, name=name, error=MockError, ready_timeout=ready_timeout)
+        super().__init__("robot.mock", arguments, name=name, error=MockError, ready_timeout=ready_timeout)
 
-    def close(self) -> None:
-        """Ends the process; a second call does nothing."""
+    def close(self, patience: float = PATIENCE) -> None:
         for faults in self.fault_clients:
             faults.close()
-        super().close()
+        super().close(patience)
 
 
 class MockUR(MockArms):

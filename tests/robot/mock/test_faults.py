@@ -179,7 +179,7 @@ def test_black_hole(mock: MockUR, faults: FaultClient) -> None:
 def test_a_black_hole_ends_as_quietly_as_any_mock() -> None:
     with MockUR(wire_host(8), ready_timeout=60) as mock:
         mock.faults.black_hole(True)
-    assert mock._child._process.returncode == 0
+    assert mock.exit_status == 0
 
 
 def test_delay_is_at_least_what_was_asked(mock: MockUR, faults: FaultClient) -> None:

@@ -56,8 +56,8 @@ def _register(array: str, index: int) -> Callable[[Machine], Values]:
     return read
 
 
-def _joint_mode(machine: Machine) -> Values:
-    return ({Mode.RUNNING: 253, Mode.IDLE: 255}.get(machine.mode, 239),) * 6  # running, idle, power off
+JOINT_MODES = {Mode.RUNNING: 253, Mode.IDLE: 255}  # running, idle; any other: POWERED_OFF
+POWERED_OFF = 239
 
 
 def _constant(*values: float) -> Callable[[Machine], Values]:
@@ -71,14 +71,6 @@ def _powered(volts: float, count: int) -> Callable[[Machine], Values]:
         return (value,) * count if count > 1 else value
 
     return read
-
-
-def _accelerometer(machine: Machine) -> Values:
-    return [GRAVITY * value for value in machine.arm.frame[2, :3].tolist()]
-
-
-def _execution_time(machine: Machine) -> Values:
-    return machine.work_time
 
 
 OUTPUTS: dict[str, Output] = {
@@ -101,12 +93,12 @@ OUTPUTS: dict[str, Output] = {
     "target_TCP_speed": Output("VECTOR6D", lambda m: m.arm.target_twist.tolist()),
     "actual_digital_input_bits": Output("UINT64", _constant(0)),
     "joint_temperatures": Output("VECTOR6D", _constant(*[30.0] * 6)),
-    "actual_execution_time": Output("DOUBLE", _execution_time),
+    "actual_execution_time": Output("DOUBLE", lambda m: m.work_time),
     "robot_mode": Output("INT32", lambda m: int(m.mode)),
-    "joint_mode": Output("VECTOR6INT32", _joint_mode),
+    "joint_mode": Output("VECTOR6INT32", lambda m: (JOINT_MODES.get(m.mode, POWERED_OFF),) * 6),
     "safety_mode": Output("INT32", lambda m: int(m.safety)),
     "safety_status": Output("INT32", lambda m: int(m.safety), since=((3, 10), (5, 4))),
-    "actual_tool_accelerometer": Output("VECTOR3D", _accelerometer),
+    "actual_tool_accelerometer": Output("VECTOR3D", lambda m: (GRAVITY * m.arm.frame[2, :3]).tolist()),
     "speed_scaling": Output("DOUBLE", lambda m: m.arm.scale),
     "target_speed_fraction": Output("DOUBLE", lambda m: m.slider),
     "actual_momentum": Output("DOUBLE", _constant(0.0)),

@@ -217,9 +217,15 @@ class Camera(Closing):
                 try:
                     self._accept(capture.read())
                 except DamagedFrame as damage:
-                    self._count_damaged(str(damage))
+                    with self._changed:
+                        self._damaged += 1
+                        self._unread += 1
+                        self._error = str(damage)
         except EndOfEpisode as end:
-            return self._set_ended(str(end))
+            with self._changed:
+                self._ended, self._error = True, str(end)
+                self._changed.notify_all()
+            return False
         except Exception as failure:  # OpenCV raises errors of its own; the thread must live
             refused = isinstance(failure, WrongSource)
             self._set_failure(failure, refused)
@@ -277,12 +283,6 @@ class Camera(Closing):
         # After an interruption the numbers may have restarted: a restarted camera counts from 1.
         return max(numbered, self._unread, round((exposure - self._frame.time) * self._config.fps) - 1)
 
-    def _count_damaged(self, error: str) -> None:
-        with self._changed:
-            self._damaged += 1
-            self._unread += 1
-            self._error = error
-
     def _set_failure(self, failure: Exception, refused: bool) -> None:
         text = str(failure) or type(failure).__name__
         if not isinstance(failure, DeviceError) and self._name not in text:
@@ -291,9 +291,3 @@ class Camera(Closing):
             self._error = text
             self._refusal = text if refused else None
             self._changed.notify_all()
-
-    def _set_ended(self, text: str) -> bool:
-        with self._changed:
-            self._ended, self._error = True, text
-            self._changed.notify_all()
-        return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Protocol
@@ -102,9 +103,7 @@ def run_episode(
             action = policy(observation)
             observation, sent = rig.step(action)
             keep(observation, action, sent)
-    except EndOfEpisode:
-        pass
-    except KeyboardInterrupt:
+    except (EndOfEpisode, KeyboardInterrupt):
         pass
     except (Exception, SystemExit) as failure:  # a policy may call sys.exit
         done = max(len(episode.steps) - 1, 0)
@@ -119,10 +118,8 @@ def versions() -> dict[str, str]:
     """Versions of Python and of the packages that make the numbers, without importing them."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
     return found
 
 

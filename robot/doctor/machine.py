@@ -75,14 +75,13 @@ def packages(distribution: str = "tacsim") -> list[Check]:
 
 
 def _package(need: Requirement) -> Check:
-    name = f"package {need.name}"
+    name, advice = f"package {need.name}", f"python -m pip install '{need.name}{need.specifier}'"
     try:
         version = metadata.version(need.name)
     except metadata.PackageNotFoundError:
-        return Check(name, "fail", "not installed", f"python -m pip install '{need.name}{need.specifier}'")
+        return Check(name, "fail", "not installed", advice)
     if need.specifier.contains(version, prereleases=True):
         return Check(name, "ok", version)
-    advice = f"python -m pip install '{need.name}{need.specifier}'"
     return Check(name, "fail", f"{version}, but {need.specifier} is needed", advice)
 
 

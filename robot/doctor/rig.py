@@ -36,18 +36,14 @@ MIN_FRAME_RATE = 0.8  # share of the rate asked for; a slower camera is a warnin
 
 def examine_rig(config: RigConfig) -> list[Check]:
     """All checks of one rig. Mocks that its file asks for are started for as long as it takes."""
-    if not any(
-        isinstance(part, UrArmConfig | CameraSensorConfig) for part in (*config.arms.values(), *config.sensors.values())
-    ):
+    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    cameras = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, CameraSensorConfig)}
+    if not (arms or cameras):
         return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
     try:
         with MockCell(config):
-            checks = [
-                check for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) for check in _arm(name, arm)
-            ]
-            for name, sensor in config.sensors.items():
-                if isinstance(sensor, CameraSensorConfig):
-                    checks.append(_camera(name, sensor))
+            checks = [check for name, arm in arms.items() for check in _arm(name, arm)]
+            checks += [_camera(name, camera) for name, camera in cameras.items()]
     except (DeviceError, ValueError, RuntimeError) as failure:
         return [Check("rig", "fail", str(failure), "mend the rig file")]
     return checks

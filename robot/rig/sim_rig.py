@@ -102,12 +102,8 @@ def _driven_frames(config: RigConfig, scene: Scene) -> dict[str, str]:
 def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfig, rig: RigConfig) -> SimSensor:
     assert rig.scene is not None
     model = config.model
-    spec = SensorSpec(
-        image_shape=(model.geometry.height, model.geometry.width),
-        height=True,
-        flow=model.markers is not None,
-        arm=config.arm,
-    )
+    shape = (model.geometry.height, model.geometry.width)
+    spec = SensorSpec(shape, height=True, flow=model.markers is not None, arm=config.arm)
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
     render = Renderer(model, rig.scene.gel.size[:2])
     return SimSensor(world, clock, name, spec, render, sample, noise_source(model, name))

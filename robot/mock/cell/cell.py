@@ -241,12 +241,5 @@ def _camera(name: str, config: CameraSensorConfig) -> MockCamera:
             f"sensors.{name}.source: a mock camera needs an address on loopback such as "
             f"http://127.0.0.2:8081/?action=stream, got {config.source}"
         )
-    return MockCamera(
-        url.hostname,
-        url.port,
-        config.width,
-        config.height,
-        config.mock.fps,
-        config.mock.quality,
-        stamped=config.stamped,
-    )
+    rate, quality = config.mock.fps, config.mock.quality
+    return MockCamera(url.hostname, url.port, config.width, config.height, rate, quality, stamped=config.stamped)

@@ -53,11 +53,7 @@ class HertzCell:
         self._noise = {name: noise_source(model, name) for name, model in models.items()}
         self._pictures = count()
         self._drawn = lru_cache(KEPT)(self._draw)
-
-    @property
-    def stats(self) -> Mapping[str, float]:
-        """Nothing is iterated here."""
-        return {}
+        self.stats: Mapping[str, float] = {}  # nothing is iterated here
 
     def truth(self) -> None:
         """There is no body."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 READY, DONE = 1, 2  # answers in output_int_register_0
 STOP_SCRIPT = 255  # the command that ends the script
+_ENDED = object()
 
 
 class Program:
@@ -163,11 +164,7 @@ class Program:
 
 def _go_on(work: MotionSteps) -> bool:
     """One control period of `work`; False when it has ended."""
-    try:
-        next(work)
-    except StopIteration:
-        return False
-    return True
+    return next(work, _ENDED) is not _ENDED
 
 
 def _of_version(text: str, version: tuple[int, ...]) -> str:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot.common import MOCK_SERIAL
+from robot.mock.ur.fault_client import Input
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.machine import Machine, Version
 from robot.mock.ur.wire import dashboard
@@ -58,15 +59,6 @@ class Faults:
     claimed: set[str] = field(default_factory=set)  # input names that a field bus holds
 
 
-@dataclass(frozen=True)
-class Received:
-    """An input package as it arrived."""
-
-    number: int
-    tick: int
-    values: dict[str, Value | tuple[Value, ...]]
-
-
 class Controller:
     """Serves one host. The process calls `tick` once a control period; sockets call back in between."""
 
@@ -76,7 +68,7 @@ class Controller:
         self.machine = Machine(config.model, config.joints, config.version)
         self.ticks = self.overruns = 0
         self.sent = self.dropped = 0  # data packages
-        self.received: deque[Received] = deque(maxlen=KEPT)
+        self.received: deque[Input] = deque(maxlen=KEPT)
         self.arrived = 0  # input packages so far
         self.clients: dict[Connection, Session | None] = {}
         self._listeners: list[socket.socket] = []
@@ -295,7 +287,7 @@ class Controller:
 
     def _write(self, values: dict[str, Value | tuple[Value, ...]]) -> None:
         self.arrived += 1
-        self.received.append(Received(self.arrived, self.ticks, values))
+        self.received.append(Input(self.arrived, self.ticks, values))
         apply(self.machine, values)
 
 

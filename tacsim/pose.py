@@ -22,9 +22,8 @@ def rotation(pose: Pose) -> Rotation:
 
 def from_rotation_vector(position: ArrayLike, vector: ArrayLike) -> Pose:
     """The pose at `position` (3,) [m], turned by |vector| [rad] about `vector` (3,)."""
-    return Pose(
-        np.array(position, dtype=np.float64), Rotation.from_rotvec(np.array(vector, dtype=np.float64)).as_quat()
-    )
+    turn = Rotation.from_rotvec(np.array(vector, dtype=np.float64))
+    return Pose(np.array(position, dtype=np.float64), turn.as_quat())
 
 
 def from_matrix(matrix: ArrayLike) -> Pose:

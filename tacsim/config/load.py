@@ -62,9 +62,8 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     config = _validate(RigConfig, root, state)
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
-    text = "# A rig, resolved: every reference and default written out, SI units.\n" + dump(
-        config.model_dump(mode="json")
-    )
+    text = dump(config.model_dump(mode="json"))
+    text = f"# A rig, resolved: every reference and default written out, SI units.\n{text}"
     return LoadedRig(config, text, tuple(dict.fromkeys(state.sources)))
 
 

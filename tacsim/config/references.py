@@ -75,16 +75,14 @@ def read_file(
     except (OSError, ValueError, RuntimeError) as error:  # a name with a null byte, a loop of symbolic links
         refuse(f"cannot read '{shown(path)}': {error}")
         return broken
+    text = None
     if resolved in chain:
         circle = " -> ".join(shown(step) for step in (*chain[chain.index(resolved) :], resolved))
         refuse(f"the references form a circle: {circle}; break it in one of them")
-        return broken
-    if len(chain) >= _MAX_CHAIN:
+    elif len(chain) >= _MAX_CHAIN:
         refuse(f"more than {_MAX_CHAIN} files refer to each other in a row; shorten the chain")
-        return broken
-    if state.nodes > MAX_NODES:  # reported already; every further file would report it again
-        return broken
-    text = read_text(path, refuse, state)
+    elif state.nodes <= MAX_NODES:  # else reported already; every further file would report it again
+        text = read_text(path, refuse, state)
     if text is None:
         return broken
     root = parse_text(text, shown(path), path.parent, state)

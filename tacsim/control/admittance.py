@@ -54,9 +54,8 @@ class Admittance:
     def __call__(self, action: Action, arms: Mapping[str, ArmState]) -> Action:
         """`action` with each loaded arm's displacement along z replaced. Raises LimitExceeded when a load is out of
         reach, or a force is not finite."""
-        return Action(
-            {**action.tool, **{name: self._target(name, action.tool.get(name), arms[name]) for name in self.loads}}
-        )
+        held = {name: self._target(name, action.tool.get(name), arms[name]) for name in self.loads}
+        return Action({**action.tool, **held})
 
     def sent(self, poses: Mapping[str, Pose | None]) -> None:
         """What the arms were really sent, after their limits; None: nothing was executed."""

@@ -224,10 +224,8 @@ def away_from_surface(surface: Surface, points: FloatArray) -> FloatArray:
     at = points / surface.unit
     value, triangle = _nearest(surface, at)
     closest = _to_triangles(surface, at, triangle)[1]
-    on = np.abs(value) < 1e-6
-    gradient = np.where(
-        on[:, None], _pseudonormals(surface, closest, triangle), (at - closest) * np.sign(value)[:, None]
-    )
+    on, normals = np.abs(value) < 1e-6, _pseudonormals(surface, closest, triangle)
+    gradient = np.where(on[:, None], normals, (at - closest) * np.sign(value)[:, None])
     return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
 
@@ -269,10 +267,8 @@ def _signs(surface: Surface, points: FloatArray, far: NDArray[np.bool_]) -> Floa
     regions, count = label(far)
     found, first = np.unique(regions, return_index=True)
     signs = np.zeros(count + 1)
-    inside = _nearest(surface, points[first[found > 0]])[0] < 0
-    signs[1:] = np.where(inside, -1.0, 1.0)
-    result: FloatArray = signs[regions.ravel()]
-    return result
+    signs[1:] = np.where(_nearest(surface, points[first[found > 0]])[0] < 0, -1.0, 1.0)
+    return np.asarray(signs[regions.ravel()])
 
 
 def _chunks(count: int, size: int) -> Iterator[slice]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -117,9 +118,8 @@ class UrArmConfig(Config):
     action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2  # without an action, the arm holds [s]
     # The arm holds, whatever is asked, when the newest observation is older [s].
     observation_timeout: Annotated[Time, Field(ge=0.02, le=600.0)] = 1.0
-    watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = (
-        10.0  # the controller stops the arm after 1 / watchdog without a command [Hz]
-    )
+    # The controller stops the arm after 1 / watchdog without a command [Hz].
+    watchdog: Annotated[float, Field(ge=0.2, le=125.0)] = 10.0
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
     latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]
@@ -199,25 +199,18 @@ class ResetConfig(Config):
 def weakened_limits(before: UrArmConfig, after: UrArmConfig) -> list[str]:
     """The limits that `after` weakens, compared with `before`, as "key: from -> to"."""
     found = []
-    for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed", "force", "torque"):
-        old, new = getattr(before.limits, key), getattr(after.limits, key)
-        if new > old:
-            found.append(f"limits.{key}: {old:g} -> {new:g}")
-    for key in ("depth", "shear"):
-        old, new = getattr(before.limits, key), getattr(after.limits, key)
+    keys = [f"limits.{key}" for key in ("speed", "turn_rate", "acceleration", "turn_acceleration", "joint_speed")]
+    keys += ["limits.force", "limits.torque", "limits.depth", "limits.shear"]
+    keys += ["link_timeout", "action_timeout", "observation_timeout"]
+    for key in keys:
+        old, new = (attrgetter(key)(config) for config in (before, after))
         if old is not None and (new is None or new > old):
-            found.append(f"limits.{key}: {old:g} -> {'not watched' if new is None else f'{new:g}'}")
-    boxes = before.limits.workspace, after.limits.workspace
-    if any(new < old for old, new in zip(boxes[0].lower, boxes[1].lower, strict=True)) or any(
-        new > old for old, new in zip(boxes[0].upper, boxes[1].upper, strict=True)
-    ):
+            found.append(f"{key}: {old:g} -> {'not watched' if new is None else f'{new:g}'}")
+    was, now = before.limits.workspace, after.limits.workspace
+    if (np.array(now.lower) < was.lower).any() or (np.array(now.upper) > was.upper).any():
         found.append("limits.workspace: reaches farther")
     if not set(before.limits.planes) <= set(after.limits.planes):
         found.append("limits.planes: one is gone")
-    for key in ("link_timeout", "action_timeout", "observation_timeout"):
-        old, new = getattr(before, key), getattr(after, key)
-        if new > old:
-            found.append(f"{key}: {old:g} -> {new:g}")
     if after.watchdog < before.watchdog:
         found.append(f"watchdog: {before.watchdog:g} -> {after.watchdog:g}")
     return found

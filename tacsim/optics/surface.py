@@ -89,9 +89,7 @@ class SurfaceTable:
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
-        block = max(
-            1, int(self._pitch / (grid.pitch * (2 if fine else 1)))
-        )  # fine points for a coarse one, along a side
+        block = max(1, int(self._pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
         points = self._material_points(grid if block == 1 else _coarse(grid, block))
         inside = self._on_gel(points)
         if block > 1:

@@ -93,8 +93,7 @@ def only_or_named(names: list[str], name: str, path: Path, kind: str) -> str:
         return name
     if len(names) == 1:
         return names[0]
-    there = ", ".join(names) or "(none)"
-    raise EpisodeError(f"{path}: no {kind} '{name}'; the recording has: {there}")
+    raise EpisodeError(f"{path}: no {kind} '{name}'; the recording has: {', '.join(names) or '(none)'}")
 
 
 def list_pictures(folder: Path) -> list[Path]:
@@ -223,19 +222,15 @@ def finger_states(rows: list[tuple[float, ...]], period: float, lower: bool) -> 
     """
     side = -1.0 if lower else 1.0
     quaternion = np.array([0.0, 0.0, 0.0, 1.0] if lower else [1.0, 0.0, 0.0, 0.0])  # half a turn about x
-    states: list[ArmState] = []
-    before = None
-    for number, (force, *opening) in enumerate(rows):
-        z = side * opening[0] / 2.0 if opening else 0.0
-        speed = 0.0 if before is None else (z - before) / period
-        before = z
-        states.append(
-            ArmState(
-                pose=Pose(np.array([0.0, 0.0, z]), quaternion),
-                twist=np.array([0.0, 0.0, speed, 0.0, 0.0, 0.0]),
-                wrench=np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0]),
-                joints=None,
-                time=number * period,
-            )
+    place = [side * opening[0] / 2.0 if opening else 0.0 for _, *opening in rows]
+    speed = np.diff(place, prepend=place[0]) / period
+    return [
+        ArmState(
+            pose=Pose(np.array([0.0, 0.0, place[k]]), quaternion),
+            twist=np.array([0.0, 0.0, speed[k], 0.0, 0.0, 0.0]),
+            wrench=np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0]),
+            joints=None,
+            time=k * period,
         )
-    return states
+        for k, (force, *_) in enumerate(rows)
+    ]

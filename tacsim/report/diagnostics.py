@@ -68,9 +68,8 @@ def trust(episode: Episode) -> dict[str, dict[str, Any]] | None:
 
     None for an episode whose sensors know their surface by themselves.
     """
-    sensors = [
-        key.removeprefix(STALE) for key in (episode.steps[0].info if episode.steps else {}) if key.startswith(STALE)
-    ]
+    first = episode.steps[0].info if episode.steps else {}
+    sensors = [key.removeprefix(STALE) for key in first if key.startswith(STALE)]
     if not sensors:
         return None
 

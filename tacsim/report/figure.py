@@ -158,10 +158,8 @@ def _draw_reward(axes: Axes, episode: Episode) -> None:
 
 
 def _draw_distance(axes: Axes, episode: Episode) -> None:
-    name = {"squeeze": "|height − goal|", "reposition": "|position − goal|"}.get(
-        episode.meta.task or "", "from the goal"
-    )
-    plain(axes, f"distance: {name}", "step", "mm")
+    known = {"squeeze": "|height − goal|", "reposition": "|position − goal|"}
+    plain(axes, f"distance: {known.get(episode.meta.task or '', 'from the goal')}", "step", "mm")
     _series(axes, episode.steps, [None if s.distance is None else s.distance * 1e3 for s in episode.steps], INK)
     best, at = min((step.distance * 1e3, step.index) for step in episode.steps if step.distance is not None)
     axes.axhline(0.0, color=GOAL, linestyle="--", linewidth=1)

@@ -69,10 +69,8 @@ def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
     paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    page = figure.overview(
-        episode, _title(stats), " · ".join(f"{key}: {value}" for key, value in _headline(stats, episode))
-    )
-    figure.save(page, paths["report.png"])
+    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats, episode))
+    figure.save(figure.overview(episode, _title(stats), subtitle), paths["report.png"])
     paths["report.html"].write_text(_html(episode, stats), encoding="utf-8")
     return paths
 

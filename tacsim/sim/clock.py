@@ -30,9 +30,8 @@ class SimClock:
         self._time = 0.0
         self.version = 0
         self.stats: MoveStats | None = None  # of the last motion
-        self.velocities: Mapping[
-            str, FloatArray
-        ] = {}  # (6,) by frame: mean of the last period, world axes [m/s, rad/s]
+        # (6,) by frame: mean of the last period, world axes [m/s, rad/s]
+        self.velocities: Mapping[str, FloatArray] = {}
 
     def now(self) -> float:
         return self._time
@@ -76,6 +75,5 @@ class SimClock:
         stats = self.stats
         if stats is None:
             return {}
-        return {name: float(value) for name, value in asdict(stats).items()} | {
-            "shortened": float(sum(self._limited.values()))
-        }
+        found = {**asdict(stats), "shortened": sum(self._limited.values())}
+        return {name: float(value) for name, value in found.items()}

@@ -1,0 +1,31 @@
+"""Fixtures of the tests of the camera driver."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.robot.camera.servers import Server
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    server = Server()
+    yield server
+    server.close()
+
+
+def sockets() -> set[str]:
+    targets = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    return {target for target in targets if target.startswith("socket:")}
+
+
+@pytest.fixture
+def nothing_is_left() -> Iterator[None]:
+    threads, open_sockets = set(threading.enumerate()), sockets()
+    yield
+    assert [t.name for t in set(threading.enumerate()) - threads if t.name.startswith("camera")] == []
+    assert sockets() - open_sockets == set()

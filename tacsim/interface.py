@@ -104,7 +104,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Action:
-    """Desired sensor pose in world at the end of the control period, by arm name; None (or absent) holds."""
+    """Desired world_from_sensor (not the TCP) at the end of the control period, by arm name; None or absent: hold."""
 
     tool: Mapping[str, Pose | None] = field(default_factory=dict)
 

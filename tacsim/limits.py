@@ -37,7 +37,7 @@ def check_action(action: object, movable: Collection[str], rig: str) -> Action:
         raise ActionError(f"rig '{rig}' takes a tacsim.Action, got {type(action).__name__}")
     if not isinstance(action.tool, Mapping):
         raise ActionError(
-            "Action.tool must be a mapping from arm names to poses, such as {'upper': pose}, "
+            "Action.tool must map arm names to poses of the sensor (not the TCP), such as {'upper': pose}, "
             f"got {type(action.tool).__name__}"
         )
     for name, target in action.tool.items():

@@ -26,7 +26,7 @@ from tacsim.interface import (
 from tacsim.limits import check_action
 
 if TYPE_CHECKING:
-    from tacsim.control.admittance import Admittance
+    from tacsim.control.load_controller import LoadController
 
 
 READ_TIMEOUT = 1.0  # longest wait for a frame [s]
@@ -54,13 +54,13 @@ class Rig:
         reset: brings the rig to the start of an episode.
         truth: the body as only a simulation knows it; None on rigs without.
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
-        gather: how the sensors are read: one by one, or in parallel where that is faster (tacsim.compute.threads).
+        read_all: how the sensors are read: one by one, or in parallel where that is faster (tacsim.compute.threads).
         on_tactile: called with every tactile observation before anybody acts on it; raises what ends the episode.
         on_close: closes what the rig needs besides sensors and arms, after them.
-        admittance: holds normal forces, whatever the actions ask along the z axis of the sensors.
+        load_control: holds normal forces, whatever the actions ask along the z axis of the sensors.
     """
 
-    # By name; for what needs more than an observation a period: calibration, inspection.
+    # By name; for calibration and inspection only.
     sensors: Mapping[str, TactileSource]
     arms: Mapping[str, Arm]
     normalisers: Mapping[str, Normaliser]  # by sensor
@@ -79,17 +79,18 @@ class Rig:
         reset: Reset,
         truth: Callable[[], Truth | None] | None = None,
         diagnostics: Callable[[], Mapping[str, float]] = dict,
-        gather: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = map_serial,
+        read_all: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = map_serial,
         on_tactile: Callable[[Mapping[str, TactileObservation]], None] | None = None,
         on_close: Callable[[], None] | None = None,
-        admittance: Admittance | None = None,
+        load_control: LoadController | None = None,
     ) -> None:
         if set(normalisers) != set(sensors):
             raise ValueError(f"rig '{name}': sensors {sorted(sensors)} but normalisers {sorted(normalisers)}")
         self.name = name
         self.sensors, self.arms, self.normalisers = dict(sensors), dict(arms), dict(normalisers)
         self._clock, self._reset, self._truth, self._diagnostics = clock, reset, truth, diagnostics
-        self._gather, self._admittance, self._on_tactile, self._on_close = gather, admittance, on_tactile, on_close
+        self._read_all, self._load_control = read_all, load_control
+        self._on_tactile, self._on_close = on_tactile, on_close
         self._arm_states: Mapping[str, ArmState] = {}
         self.frames = self.references = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
@@ -110,8 +111,8 @@ class Rig:
         for name, normaliser in self.normalisers.items():
             normaliser.take_reference(self.references[name])
         self._reset.touch()
-        if self._admittance is not None:
-            self._admittance.reset()
+        if self._load_control is not None:
+            self._load_control.reset()
         return self.observe()
 
     def observe(self) -> Observation:
@@ -120,7 +121,7 @@ class Rig:
         Raises TimeoutError without a frame, EndOfEpisode after a recording.
         """
         reads = [partial(sensor.read, READ_TIMEOUT) for sensor in self.sensors.values()]
-        frames = dict(zip(self.sensors, self._gather(reads), strict=True))
+        frames = dict(zip(self.sensors, self._read_all(reads), strict=True))
         exposed = {self.sensors[name].spec.arm: frame.time for name, frame in frames.items()}
         arms: dict[str, ArmState] = {name: arm.state(exposed.get(name)) for name, arm in self.arms.items()}
         now = self._clock.now()
@@ -137,11 +138,11 @@ class Rig:
         Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged.
         """
         check_action(action, self._addressable, self.name)
-        if self._admittance is not None:
-            action = self._admittance(action, self._arm_states)
+        if self._load_control is not None:
+            action = self._load_control(action, self._arm_states)
         sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
-        if self._admittance is not None:
-            self._admittance.sent(sent)
+        if self._load_control is not None:
+            self._load_control.sent(sent)
         self._clock.tick()
         return self.observe(), sent
 
@@ -159,13 +160,13 @@ class Rig:
 
     def stop(self) -> None:
         """Stops all arms, each even when another fails to stop."""
-        _each([arm.stop for arm in self.arms.values()])
+        _run_all([arm.stop for arm in self.arms.values()])
 
     def close(self) -> None:
         """Stops the arms and closes everything, each even when another fails."""
         arms = [step for arm in self.arms.values() for step in (arm.stop, arm.close)]
         others = [] if self._on_close is None else [self._on_close]
-        _each([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
+        _run_all([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
 
     def __enter__(self) -> Self:
         return self
@@ -174,7 +175,7 @@ class Rig:
         self.close()
 
 
-def _each(calls: list[Callable[[], None]]) -> None:
+def _run_all(calls: list[Callable[[], None]]) -> None:
     """Runs all calls, then raises what failed."""
     failures: list[Exception] = []
     for call in calls:

@@ -185,7 +185,7 @@ class URArm(Closing):
         with self._lock:
             if not self._closed:
                 known = GelReading(math.nan) if reading is None else reading
-                self._channel.tactile.write(tactile_record(known.seen, known.depth, known.shear))
+                self._channel.tactile.write(tactile_record(known.exposed, known.depth, known.shear))
 
     def zero_wrench(self) -> None:
         """Zeroes the force sensor. The arm must be at rest and touch nothing.

@@ -16,9 +16,9 @@ from robot.mock.cell.cell import MockCell
 from robot.rig.clock import LockStep, WallClock
 from robot.rig.commanded_arm import CommandedArm
 from robot.rig.reset import HardwareReset
-from tacsim.control.admittance import held_loads
 from tacsim.control.contact_signal import contact_signal
 from tacsim.control.gel_monitor import GelMonitor
+from tacsim.control.load_controller import load_controller
 from tacsim.interface import Normaliser, Pose, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
@@ -121,7 +121,7 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
             diagnostics=diagnostics,
             on_close=cell.close,
             on_tactile=_gel_monitor(config, sensors, arms),
-            admittance=held_loads(config.task),
+            load_control=load_controller(config.task),
         )
         stack.pop_all()
         return rig

@@ -8,8 +8,8 @@ from functools import partial
 from calibration.normaliser import normaliser_for_simulation
 from robot.rig import CannotOpen
 from tacsim.compute.threads import map_parallel
-from tacsim.control.admittance import held_loads
 from tacsim.control.gel_monitor import GelMonitor
+from tacsim.control.load_controller import load_controller
 from tacsim.interface import Arm, SensorSpec
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.models.scene import Scene
@@ -34,7 +34,7 @@ def open_sim(config: RigConfig) -> Rig:
             f"rig '{config.name}': physics 'seed' settles every motion, so it can't go by motion '{config.motion}'; "
             "use physics 'hybrid', or motion 'settled'"
         )
-    frames = _driven_frames(config, scene)
+    frames = _frame_of_arm(config, scene)
     models = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, SimSensorConfig)}
     world = make_world(scene)
     clock = SimClock(world, config.period, config.motion)
@@ -60,9 +60,9 @@ def open_sim(config: RigConfig) -> Rig:
         reset=SimReset(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
-        gather=map_parallel,
+        read_all=map_parallel,
         on_tactile=_gel_monitor(config, sensors),
-        admittance=held_loads(config.task),
+        load_control=load_controller(config.task),
     )
 
 
@@ -78,7 +78,7 @@ def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMoni
         raise CannotOpen(f"rig '{config.name}': {failure}") from None
 
 
-def _driven_frames(config: RigConfig, scene: Scene) -> dict[str, str]:
+def _frame_of_arm(config: RigConfig, scene: Scene) -> dict[str, str]:
     """Which frame of the world each arm moves: the sensor it carries, or the indenter."""
     there = ", ".join(scene.sensors)
     for name in config.sensors:

@@ -14,12 +14,12 @@ def approach(
 ) -> float:
     """Moves ahead in equal steps until something is touched. Returns the distance travelled [m].
 
-    The law of all sensors that cannot take a motion back; a simulated world can (tacsim.sim.reset.approach_force).
+    For rigs that cannot undo a motion; a simulated world can (tacsim.sim.reset.approach_force).
 
     Args:
         touches: whether the gels touch by now; asked before every step.
-        advance: goes this far [m] from where the approach began, and returns once the gels were seen there.
-        step: between two questions [m].
+        advance: goes this far [m] from where the approach began, and returns once the gels were observed there.
+        step: between two contact checks [m].
         longest: the approach ends here [m].
         advice: what a person may do about it when nothing was touched.
 

@@ -17,18 +17,18 @@ from tacsim.models.hardware import ArmLimits
 class GelReading:
     """The state of the gels, as reported to an arm."""
 
-    seen: float  # when the oldest picture of the rig was exposed, on its clock [s]
+    exposed: float  # when the oldest picture of the rig was exposed, on its clock [s]
     depth: float = math.nan  # of the arm's own gels, the deepest; NaN: not measured [m]
     shear: float = math.nan  # of their surfaces, the largest; NaN: not measured [m]
 
 
-def depth_and_shear(touch: TactileObservation) -> tuple[float, float]:
+def depth_and_shear(tactile: TactileObservation) -> tuple[float, float]:
     """Depth and shear [m] that one sensor shows; NaN where it does not measure them."""
     depth = shear = math.nan
-    if touch.height is not None:
-        depth = float(touch.height.max(where=touch.valid, initial=0.0))
-    if touch.flow is not None:
-        dragged = np.linalg.norm(touch.flow, axis=-1)
+    if tactile.height is not None:
+        depth = float(tactile.height.max(where=tactile.valid, initial=0.0))
+    if tactile.flow is not None:
+        dragged = np.linalg.norm(tactile.flow, axis=-1)
         shear = float(np.nanmax(dragged)) if np.isfinite(dragged).any() else math.nan
     return depth, shear
 
@@ -52,15 +52,15 @@ class GelMonitor:
         report: Mapping[str, Callable[[GelReading], None]],
         error: type[LimitExceeded] = LimitExceeded,
     ) -> None:
-        self._carried = {name: spec.arm for name, spec in sensors.items() if spec.arm is not None}
+        self._arm_of = {name: spec.arm for name, spec in sensors.items() if spec.arm is not None}
         self._limits, self._report, self._error = dict(limits), dict(report), error
-        for name, arm in self._carried.items():
+        for name, arm in self._arm_of.items():
             own = limits.get(arm)
             if own is None:
                 continue
             spec = sensors[name]
-            for what, limit, there in (("depth", own.depth, spec.height), ("shear", own.shear, spec.flow)):
-                if limit is not None and not there:
+            for what, limit, measured in (("depth", own.depth, spec.height), ("shear", own.shear, spec.flow)):
+                if limit is not None and not measured:
                     raise ValueError(
                         f"arms.{arm}.limits.{what}: sensor '{name}' does not measure it (no calibration, no markers): "
                         "leave it out, or calibrate the sensor"
@@ -68,20 +68,20 @@ class GelMonitor:
 
     def __call__(self, tactile: Mapping[str, TactileObservation]) -> None:
         """`tactile`: by sensor name. Every arm gets its report before anything is raised."""
-        seen = min((touch.time for touch in tactile.values()), default=math.nan)
-        shown = {name: depth_and_shear(tactile[name]) for name in self._carried if name in tactile}
+        exposed = min((observation.time for observation in tactile.values()), default=math.nan)
+        shown = {name: depth_and_shear(tactile[name]) for name in self._arm_of if name in tactile}
         for arm, report in self._report.items():
-            own = [found for name, found in shown.items() if self._carried[name] == arm] or [(math.nan, math.nan)]
-            report(GelReading(seen, *np.max(own, axis=0).tolist()))  # NaN if any is: what is not measured is not safe
+            own = [found for name, found in shown.items() if self._arm_of[name] == arm] or [(math.nan, math.nan)]
+            report(GelReading(exposed, *np.max(own, axis=0).tolist()))  # NaN if any is: not measured is not safe
         for name, found in shown.items():
-            arm = self._carried[name]
+            arm = self._arm_of[name]
             limits = self._limits.get(arm)
             if limits is None:
                 continue
             for what, value, limit in zip(("depth", "shear"), found, (limits.depth, limits.shear), strict=True):
                 if exceeds(value, limit):
                     assert limit is not None
-                    shown_as = "cannot be seen" if math.isnan(value) else f"{1e3 * value:.3g} mm"
+                    shown_as = "is not measured (markers lost?)" if math.isnan(value) else f"{1e3 * value:.3g} mm"
                     raise self._error(
                         f"gel of sensor '{name}': {what} {shown_as}, limits.{what} of arm '{arm}' is "
                         f"{1e3 * limit:.3g} mm; the arms are stopped. Move them apart, then begin a new episode"

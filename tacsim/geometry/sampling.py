@@ -12,7 +12,7 @@ from tacsim.models.scene import Body, Shape
 ITERATIONS = 20  # of mutual repulsion
 REACH = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
 STEP = 0.25  # share of the missing distance by which each of two moves
-SKIN = 0.05  # no particle nearer to the surface than this [spacings]
+MIN_DEPTH = 0.05  # no particle nearer to the surface than this [spacings]
 
 
 def body_points(body: Body, spacing: float) -> FloatArray:
@@ -44,7 +44,7 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
         points = points + _repulsion(points, REACH * spacing)
         points -= (STEP * np.maximum(REACH * spacing - 2 * depth, 0.0))[:, None] * normals
         depth, normals = surface(points)
-        points -= np.maximum(depth + SKIN * spacing, 0.0)[:, None] * normals
+        points -= np.maximum(depth + MIN_DEPTH * spacing, 0.0)[:, None] * normals
     inside: NDArray[np.bool_] = distance(geometry, points) < 0  # at sharp edges of a mesh its grid is not exact
     if not inside.any():
         raise no_particle(geometry, spacing)

@@ -78,8 +78,8 @@ class RepositionConfig(Config):
     scene: Scene = Scene()
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
     max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
-    # Normal forces that arms hold along the z of their sensors (tacsim.control.admittance), by arm; an arm without one
-    # holds its height. [N]
+    # Normal forces along the z of their sensors (tacsim.control.load_controller), by arm; an arm without one holds its
+    # height. [N]
     loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
     touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
     placement: Annotated[Length, Field(ge=0)] = 0.0

@@ -87,7 +87,7 @@ def test_a_good_action_passes() -> None:
         ),  # type: ignore[dict-item]
         ({"upper": START}, r"rig 'bench' takes a tacsim.Action, got dict"),
         (None, "got NoneType"),
-        (Action([START]), "Action.tool must be a mapping from arm names to poses.*got list"),  # type: ignore[arg-type]
+        (Action([START]), "Action.tool must map arm names to poses of the sensor.*got list"),  # type: ignore[arg-type]
         (Action({"upper": Pose(np.array([0.0, 1e308, 0.0]))}), "target of arm 'upper' is at .* more than 1000 m"),
     ],
 )

@@ -127,7 +127,7 @@ def test_sensors_are_read_the_way_they_are_gathered() -> None:
         return lower.frame(3)
 
     lower.read = dark  # type: ignore[method-assign]
-    rig = make_rig(upper, gather=last_first)
+    rig = make_rig(upper, read_all=last_first)
     rig.sensors["thumb"], rig.normalisers["thumb"] = lower, lower
     rig.observe()
     assert seen == [2]

@@ -146,13 +146,13 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
 
     x, v: position, and velocity relative to the moving sensor. history: elastic slip, and the multiplier as the overlap
     whose penalty it equals [mm]. row: the gel's first in `surface`; forces: where those on its nodes begin. Returns
-    whether it touches, whether the housing, the force, and the new history.
+    whether it touches, whether it touches the housing, the force, and the new history.
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
     mu, housing = env.param(layout.FRICTION + g), env.param(layout.HOUSING)
     deepest = env.param(layout.BODY_CELL)  # two particle spacings: the largest overlap answered in full
     nx, ny, layers = gels.nx, gels.ny, gels.layers
-    touching, housed = False, False
+    in_contact, housed = False, False
     force = vec3(0.0)
     slip = vec3(history[0], history[1], history[2])
     multiplier = history[3]
@@ -188,7 +188,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                 multiplier = ti.max(multiplier + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vr - vn * n, fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
-                touching = True
+                in_contact = True
                 overlap = gap
                 back = vec4(force[0], force[1], force[2], 0.0)
                 for p, q in ti.static(ti.ndrange(3, 3)):
@@ -205,10 +205,10 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                 multiplier = ti.max(multiplier + MULTIPLIER_RATE * gap, 0.0)
                 ft, slip = friction(slip, n, vec3(v[0], v[1], 0.0), fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
                 force = fn * n + ft
-                touching, housed = True, True
+                in_contact, housed = True, True
                 overlap = gap
     remembered = ContactHistory([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
-    if touching:
+    if in_contact:
         remembered = ContactHistory([slip[0], slip[1], slip[2], multiplier, moved[0], moved[1]])
         record_most(env, slot_of(part), layout.OVERLAP, overlap)
-    return touching, housed, force, remembered
+    return in_contact, housed, force, remembered

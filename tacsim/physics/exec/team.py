@@ -17,11 +17,11 @@ from tacsim.compute.threads import threads
 from tacsim.physics.exec.lanes import PARTS
 
 CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
-PATIENCE = 20_000  # looks at a stage that is not done, after which a member leaves: some 0.5 ms
+PATIENCE = 20_000  # polls of a stage that is not done, after which a member leaves: some 0.5 ms
 
 # Columns of `sync`, a row (one cache line) for each environment that has substeps to do
 ENVIRONMENT = 0  # its index
-TAKEN, DONE = 1, 2  # pieces of work so far
+CLAIMED, DONE = 1, 2  # pieces of work so far
 
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
@@ -34,17 +34,17 @@ def next_piece(sync: ti.template(), turn, pieces):
     turn: row of `sync`; pieces: in all stages, PARTS in each. A member that leaves has nothing in hand, so somebody
     else has what it waited for, and does the rest.
     """
-    piece, looks = -1, 0
+    piece, polls = -1, 0
     while piece < 0:
-        following = ti.atomic_add(sync[turn, TAKEN], 0)
+        following = ti.atomic_add(sync[turn, CLAIMED], 0)
         if following >= pieces:
             piece = pieces
         elif ti.atomic_add(sync[turn, DONE], 0) >= following // PARTS * PARTS:
-            if ti.atomic_max(sync[turn, TAKEN], following + 1) == following:  # nobody was faster
+            if ti.atomic_max(sync[turn, CLAIMED], following + 1) == following:  # nobody was faster
                 piece = following
         else:
-            looks += 1
-            if looks > PATIENCE:
+            polls += 1
+            if polls > PATIENCE:
                 piece = pieces
     return piece
 

@@ -20,19 +20,19 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
-LAUNCH = 20  # substeps of one launch while frames are driven
-COMPARED = 2  # earlier readings that one is compared with: a single one may have the same phase of an oscillation
-FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
+SUBSTEPS_PER_LAUNCH = 20  # while frames are driven
+EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
+FORCE_FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
 def force_floor(modulus: float, thickness: float) -> float:
     """The smallest force [N] that residuals are relative to, of a gel with Young's modulus [MPa] and thickness [mm]."""
-    return FLOOR * modulus * thickness**2
+    return FORCE_FLOOR * modulus * thickness**2
 
 
 @dataclass(frozen=True)
-class StepNumbers:
-    """The numbers that a launch was integrated with."""
+class Integration:
+    """How a launch was integrated."""
 
     step: float = 0.0  # time step [mm, wave speed 1]
     damping: float = 0.0  # of the gel: its rate times the wave's time through it [-]
@@ -43,9 +43,9 @@ class StepNumbers:
 class ForceReading:
     """Forces at one instant [N]: contact on each gel and reaction at its backing, world axes; and what guards saw.
 
-    moment: about each sensor's origin, in its own axes, over half the gel's width: the force it means at the rim [N].
+    moment: about each sensor's origin, in its own axes, divided by half the gel's width [N].
     load: external force on the body besides contact, world axes.
-    torque: of all contact on a free body about its centre, world axes, over half the gel's width [N].
+    torque: of all contact on a free body about its centre, world axes, divided likewise [N].
     """
 
     contact: NDArray[np.float64]  # (gels, 3)
@@ -56,30 +56,30 @@ class ForceReading:
     moment: NDArray[np.float64] | None = None  # (gels, 3)
     load: NDArray[np.float64] | None = None  # (3,) of the body from elsewhere: its weight
     torque: NDArray[np.float64] | None = None  # (3,)
-    scheme: StepNumbers = StepNumbers()
+    integration: Integration = Integration()
     gel_overlap: float = 0.0  # of the gels with one another [mm]
 
 
-def residual(now: ForceReading, before: ForceReading, balanced: bool) -> float:
+def residual(reading: ForceReading, before: ForceReading, balanced: bool) -> float:
     """Largest imbalance of forces or moments, or their change since `before`, relative to the largest force [-].
 
     `balanced`: the contact forces on all gels must add up to the load of a free body, its weight, and have no torque.
     """
-    scale = max(float(np.abs(now.contact).max()), now.floor)
-    parts = [np.abs(now.contact - now.backing).max(), np.abs(now.contact - before.contact).max()]
-    if now.moment is not None and before.moment is not None:  # a twist settles later than the forces
-        parts.append(np.abs(now.moment - before.moment).max())
+    scale = max(float(np.abs(reading.contact).max()), reading.floor)
+    parts = [np.abs(reading.contact - reading.backing).max(), np.abs(reading.contact - before.contact).max()]
+    if reading.moment is not None and before.moment is not None:  # a twist settles later than the forces
+        parts.append(np.abs(reading.moment - before.moment).max())
     if balanced:
-        load = 0.0 if now.load is None else now.load
-        parts.append(np.abs(now.contact.sum(axis=0) - load).max())
-        if now.torque is not None:
-            parts.append(np.abs(now.torque).max())
+        load = 0.0 if reading.load is None else reading.load
+        parts.append(np.abs(reading.contact.sum(axis=0) - load).max())
+        if reading.torque is not None:
+            parts.append(np.abs(reading.torque).max())
     return float(max(parts)) / scale
 
 
 @dataclass(frozen=True)
 class Launch:
-    """What a motion wants next: substeps first..last of a path, then a Reading."""
+    """What a motion wants next: substeps first..last of a path, then a ForceReading."""
 
     path: Path
     first: int
@@ -87,7 +87,7 @@ class Launch:
 
     @property
     def held(self) -> bool:
-        """Nothing is driven in it."""
+        """Sensors stand still."""
         return self.path.substeps == 0
 
     @property
@@ -102,8 +102,8 @@ class PreparedLaunch:
 
     launch: Launch
     drive: NDArray[np.float32]  # (n, frames, 6, 3) of the kernel
-    where: LaunchSpan
-    good: State  # copies of the environment's arrays before it
+    span: LaunchSpan
+    before: State  # copies of the environment's arrays
 
 
 # The logic of one world's motion, which touches no kernel: it yields a Launch and is sent the ForceReading at its end,
@@ -132,15 +132,15 @@ def run(motion: Motion, advance: Callable[[Path, int, int], ForceReading]) -> Mo
 
 def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Follows `path`, then holds at its end until the residual is within tolerance or the hold budget is spent."""
-    readings = yield from _driven(path)
+    readings = yield from _follow(path)
     rest = replace(path, start=path.end, substeps=0, rates=None)
     held, worst = 0, math.inf
     while held < settling.max_substeps:
         count = min(path.interval, settling.max_substeps - held)
         readings.append((yield Launch(rest, 0, count)))
         held += count
-        if len(readings) > COMPARED:
-            worst = max(residual(readings[-1], earlier, balanced) for earlier in readings[-1 - COMPARED : -1])
+        if len(readings) > EARLIER_READINGS:
+            worst = max(residual(readings[-1], earlier, balanced) for earlier in readings[-1 - EARLIER_READINGS : -1])
             if worst <= settling.tolerance:
                 break
     return _stats(readings, path.substeps, held, worst, settling)
@@ -148,7 +148,7 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
 
 def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Follows `path` without a hold; the residual says how far from rest the scene is at the end."""
-    readings = yield from _driven(path)
+    readings = yield from _follow(path)
     worst = residual(readings[-1], readings[-2], balanced) if len(readings) > 1 else math.inf
     return _stats(readings, path.substeps, 0, worst, settling)
 
@@ -157,32 +157,32 @@ def move_flowing(path: Path, settling: Settling, *, balanced: bool) -> Motion:
     """Follows `path`, which does not end at rest; the residual is the imbalance of forces there."""
     if not path.substeps:
         return (yield from move_and_settle(path, settling, balanced=balanced))
-    readings = yield from _driven(path)
+    readings = yield from _follow(path)
     stats = _stats(readings, path.substeps, 0, residual(readings[-1], readings[-1], balanced), settling)
     return replace(stats, settled=False)
 
 
 def come_to_rest(path: Path, motion: Motion) -> Motion:
     """Follows `path`, which ends at rest, then does `motion`."""
-    yield from _driven(path)
+    yield from _follow(path)
     stats = yield from motion
     return replace(stats, substeps=path.substeps + stats.substeps)
 
 
-def _driven(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
+def _follow(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
     readings: list[ForceReading] = []
-    for first in range(0, path.substeps, LAUNCH):
-        readings.append((yield Launch(path, first, min(first + LAUNCH, path.substeps))))
+    for first in range(0, path.substeps, SUBSTEPS_PER_LAUNCH):
+        readings.append((yield Launch(path, first, min(first + SUBSTEPS_PER_LAUNCH, path.substeps))))
     return readings
 
 
 def _stats(readings: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
     overlap = readings[-1].overlap / MM if readings else 0.0
     hits = sum(reading.guard_hits for reading in readings)
-    last = readings[-1].scheme if readings else StepNumbers()
+    last = readings[-1].integration if readings else Integration()
     return MoveStats(
         substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
         time_step=last.step / MM, damping=last.damping,
-        courant=max((reading.scheme.courant for reading in readings), default=0.0),
+        courant=max((reading.integration.courant for reading in readings), default=0.0),
         gel_overlap=readings[-1].gel_overlap / MM if readings else 0.0,
     )  # fmt: skip

@@ -22,7 +22,7 @@ from tacsim.models.scene import FASTEST_MACH, BodyMaterial, Gel, GelMaterial, Ge
 from tacsim.physics.body.material import ELASTIC
 from tacsim.physics.exec.layout import NUMBERS
 from tacsim.physics.failure.health import Health, LaunchSpan, SimulationDiverged, check_launch, require_room
-from tacsim.physics.motion.controller import ForceReading, Motion, StepNumbers, move_and_settle
+from tacsim.physics.motion.controller import ForceReading, Integration, Motion, move_and_settle
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, plan, resolve_targets
 from tacsim.physics.move import MoveCommand
@@ -233,9 +233,9 @@ class SeedWorld(BaseWorld):
         if not len(self._body_points()):
             cause = "every particle of the body left the grid"
             raise SimulationDiverged(cause, where, quantity="particle speed", good=good, failed=self.arrays())
-        scheme = StepNumbers(path.step, GEL_DAMPING, health.courant)
+        integration = Integration(path.step, GEL_DAMPING, health.courant)
         overlap = self._overlap(path, last)
-        return ForceReading(backing + self._gain, backing, self._floor, overlap, left, scheme=scheme)
+        return ForceReading(backing + self._gain, backing, self._floor, overlap, left, integration=integration)
 
     @launching()
     def _launch(self, drive: Float32, dt: float, x0: float, y0: float, health: Float32) -> None:

@@ -47,7 +47,7 @@ from tacsim.physics.exec.layout import (
 from tacsim.physics.exec.team import run_team
 from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
 from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
-from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
+from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.snapshot import copies
 from tacsim.physics.units import MM, MPA
@@ -225,27 +225,27 @@ class HybridWorld(FemWorld):
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Fits the grid and sets this environment's parameters. Raises SimulationDiverged for a grid too large."""
         state, index, path = self._state, self._index, launch.path
-        span = (launch.last - launch.first) * path.dt
+        duration = (launch.last - launch.first) * path.dt
         weight = float(np.linalg.norm(state.params[index, GRAVITY : GRAVITY + 3]))
-        fall = float(state.params[index, RIGID_MASS_SCALE]) * weight * span
+        fall = float(state.params[index, RIGID_MASS_SCALE]) * weight * duration
         drive = path.drive(launch.first, launch.last)
         driven = max(self._mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
-        margin = 2 * self._body.cell + 2 * span * max(self._speed + fall, driven)
-        where = path.span(self._poses, launch.first, launch.last)
+        margin = 2 * self._body.cell + 2 * duration * max(self._speed + fall, driven)
+        span = path.span(self._poses, launch.first, launch.last)
         x = state.particles.x(index)
         low, high = bounds(x)
         reach = margin + BORDER / 2 * self._body.cell
-        require_room(low - reach, high + reach, self._body.cell, where, state.particles.most)
+        require_room(low - reach, high + reach, self._body.cell, span, state.particles.most)
         try:
             state.particles.fit(index, self._body.cell, margin, state.params, state.counts)
         except MemoryError as error:
-            raise SimulationDiverged(f"no memory for the grid round the particles ({error})", where, NO_ROOM) from None
-        good = copies(self.arrays())
+            raise SimulationDiverged(f"no memory for the grid round the particles ({error})", span, NO_ROOM) from None
+        before = copies(self.arrays())
         state.params[index, STEP] = path.step
         self._write_body_inertia(x)
         self._write_inertia(launch)
         Health.clear(state.partial[index])
-        return PreparedLaunch(launch, drive, where, good)
+        return PreparedLaunch(launch, drive, span, before)
 
     def _write_body_inertia(self, x: np.ndarray) -> None:
         """Centre and inverse moment of inertia of the particles (n, 3) [mm], where the kernels find them."""
@@ -266,7 +266,7 @@ class HybridWorld(FemWorld):
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
-        health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
+        health = check_launch(self.arrays(), prepared.before, Health.read(partial, self._courant()), prepared.span)
         self._speed = health.fastest
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
@@ -282,7 +282,7 @@ class HybridWorld(FemWorld):
         return ForceReading(
             contact, backing, self._floor, health.overlap, health.capped + (gel_overlap > 0.0),
             moment / lever, self._weight, torque / lever,
-            StepNumbers(prepared.launch.path.step, self._damping(), health.courant), gel_overlap,
+            Integration(prepared.launch.path.step, self._damping(), health.courant), gel_overlap,
         )  # fmt: skip
 
     def _gel_overlap(self, prepared: PreparedLaunch) -> float:
@@ -293,7 +293,7 @@ class HybridWorld(FemWorld):
         if found > most:
             raise SimulationDiverged(
                 f"the gels lie {found:.3g} mm inside one another, which they do not feel (limit {most:.3g} mm)",
-                prepared.where, "keep the sensors further apart, or use physics 'seed'", retry=False,
-                good=prepared.good, failed=self.arrays(),
+                prepared.span, "keep the sensors further apart, or use physics 'seed'", retry=False,
+                good=prepared.before, failed=self.arrays(),
             )  # fmt: skip
         return found

@@ -75,10 +75,10 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     A boost is added to every velocity: selective mass scaling of the slowest modes, the rigid motions of a body that
     hangs between two soft gels. Inertia is artificial here anyway; the resting state does not depend on it.
 
-    With `layout.WIDENING` the reference also widens as fast as a body must whose volume stays (docs/decisions/0002).
+    With `layout.WIDENING` that motion also widens as fast as a body must whose volume stays (docs/decisions/0002).
 
     Only a sensor that touches the body imposes anything; a body without contact is damped towards rest. Across the
-    sensors' axis the reference is the body's own mean velocity while anything is driven: a body that rides on one
+    sensors' axis it is the body's own mean velocity while anything is driven: a body that rides on one
     sensor must not be dragged back by the other.
     """
     dt, cell, damping = env.param(layout.STEP), env.param(layout.BODY_CELL), env.param(layout.BODY_DAMPING)
@@ -89,7 +89,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     push = mass * particles * weight  # total force on the body: weight and contact
     push -= rotation(drive, env, it, 0) @ force0
     push -= rotation(drive, env, it, 1) @ force1
-    touch0, touch1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
+    touches0, touches1 = force0.norm_sqr() > 0.0, force1.norm_sqr() > 0.0
     mean = part_sum(env, layout.VELOCITY_SUM) / particles
     boost = ((env.param(layout.RIGID_MASS_SCALE) - 1.0) * dt / (mass * particles)) * push
     p0, p1 = row(drive, env, it, 0, 3), row(drive, env, it, 1, 3)
@@ -101,9 +101,9 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     w0, w1 = row(drive, env, it, 0, 5), row(drive, env, it, 1, 5)
     axis = p1 - p0
     length2 = axis.norm_sqr() + 1e-12
-    share = ti.select(touch0 and touch1, 1.0, 0.0)  # of the distance from one sensor to the other that counts
-    alone = ti.select(touch1 and not touch0, 1.0, 0.0)
-    held = ti.select(touch0 or touch1, 1.0, 0.0)
+    share = ti.select(touches0 and touches1, 1.0, 0.0)  # of the distance from one sensor to the other that counts
+    only_upper = ti.select(touches1 and not touches0, 1.0, 0.0)
+    held = ti.select(touches0 or touches1, 1.0, 0.0)
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
     widening = -0.5 * env.param(layout.WIDENING) * share * (v1 - v0).dot(axis) / length2
@@ -127,12 +127,12 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                         x = origin + cell * vec3(i, j, k * NODES + n)
                         velocity = vec3(q[4 * n], q[4 * n + 1], q[4 * n + 2]) / q[4 * n + 3] + dt * weight
                         velocity += boost + turn.cross(x - centre)
-                        t = alone + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
-                        reference = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
+                        t = only_upper + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
+                        imposed = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
                         if driven:
                             across = (x - centre) - axis * ((x - centre).dot(axis) / length2)
-                            reference = axis * (reference.dot(axis) / length2) + mean_across + widening * across
-                        velocity -= damping * dt * (velocity - reference)
+                            imposed = axis * (imposed.dot(axis) / length2) + mean_across + widening * across
+                        velocity -= damping * dt * (velocity - imposed)
                         for d in ti.static(range(3)):
                             moved[4 * n + d] = velocity[d]
                 body.velocities[base + at] = moved
@@ -169,11 +169,11 @@ def gel_contact(
             local = back @ arm
             moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
             relative = back @ (moving - velocity - spin.cross(arm))
-            touching, housed, force, history = particle_contact(
+            in_contact, housed, force, history = particle_contact(
                 env, part, g, local, relative, histories[env.index, g, p], radius, gels, rows, forces
             )
             histories[env.index, g, p] = history
-            if touching:
+            if in_contact:
                 moving += rate * (rotate @ force)
                 for d in ti.static(range(3)):
                     body.particles[at + (layout.VELOCITY + d) * stride] = moving[d]

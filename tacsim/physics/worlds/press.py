@@ -61,7 +61,7 @@ from tacsim.physics.gel.kernels import (
     gel_forces,
     gels_of,
 )
-from tacsim.physics.motion.controller import ForceReading, Launch, PreparedLaunch, StepNumbers, force_floor
+from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.snapshot import copies
 from tacsim.physics.units import MM, MPA
@@ -248,20 +248,20 @@ class PressWorld(FemWorld):
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Sets this environment's parameters. Raises SimulationDiverged where too much of a mesh could be touched."""
         path = launch.path
-        where = path.span(self._poses, launch.first, launch.last)
+        span = path.span(self._poses, launch.first, launch.last)
         both = path.drive(launch.first, launch.last)
         drive = relative_drive(both[:, 0], both[:, 1])
         try:
             self._cover(drive)
         except ValueError as error:
-            raise SimulationDiverged(str(error), where, TOO_MUCH, retry=False) from None
+            raise SimulationDiverged(str(error), span, TOO_MUCH, retry=False) from None
         except MemoryError as error:
             cause = f"no memory for the distances from the indenter's mesh ({error})"
-            raise SimulationDiverged(cause, where, TOO_MUCH, retry=False) from None
-        good = copies(self.arrays())
+            raise SimulationDiverged(cause, span, TOO_MUCH, retry=False) from None
+        before = copies(self.arrays())
         self._state.params[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
-        return PreparedLaunch(launch, drive, where, good)
+        return PreparedLaunch(launch, drive, span, before)
 
     def _cover(self, drive: np.ndarray) -> None:
         """Fills in a mesh's distances wherever the gel's surface may touch it in this launch."""
@@ -285,7 +285,7 @@ class PressWorld(FemWorld):
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
-        health = check_launch(self.arrays(), prepared.good, Health.read(partial, self._courant()), prepared.where)
+        health = check_launch(self.arrays(), prepared.before, Health.read(partial, self._courant()), prepared.span)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
@@ -293,7 +293,7 @@ class PressWorld(FemWorld):
             self._require_touch(prepared)
         return ForceReading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
-            scheme=StepNumbers(prepared.launch.path.step, self._damping(), health.courant),
+            integration=Integration(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
 
     def _require_touch(self, prepared: PreparedLaunch) -> None:
@@ -320,8 +320,8 @@ class PressWorld(FemWorld):
                 f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
                 f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
             )
-            good = prepared.good
-            raise SimulationDiverged(cause, prepared.where, advice, retry=False, good=good, failed=self.arrays())
+            before = prepared.before
+            raise SimulationDiverged(cause, prepared.span, advice, retry=False, good=before, failed=self.arrays())
 
 
 def _require_resolved(geometry: Shape, gel: GelParams) -> None:

@@ -35,7 +35,7 @@ def loaded() -> Iterator[Opened]:
 @pytest.fixture
 def simulated(loaded: Opened, monkeypatch: pytest.MonkeyPatch) -> Opened:
     """The same rig without the load."""
-    monkeypatch.setattr(loaded.rig, "_admittance", None)
+    monkeypatch.setattr(loaded.rig, "_load_control", None)
     return loaded
 
 

@@ -51,7 +51,7 @@ def test_a_gel_pressed_or_dragged_too_far_ends_the_episode() -> None:
 
 def test_what_is_watched_and_cannot_be_seen_is_too_much() -> None:
     watch = GelMonitor(sensors(), {"upper": limits(depth=1e-3)}, {})
-    with pytest.raises(LimitExceeded, match=r"depth cannot be seen"):
+    with pytest.raises(LimitExceeded, match=r"depth is not measured"):
         watch({"lower": touch(0.0, 0.0), "upper": blind()})
 
 
@@ -63,7 +63,7 @@ def test_arms_are_told_before_anything_is_raised() -> None:
         watch({"lower": touch(2e-3, 1e-4, time=5.0), "upper": touch(3e-4, 2e-4, time=4.0)})
     assert told["lower"].depth == pytest.approx(2e-3)
     assert told["upper"].shear == pytest.approx(2e-4)
-    assert told["lower"].seen == told["upper"].seen == 4.0  # the oldest picture of the rig
+    assert told["lower"].exposed == told["upper"].exposed == 4.0  # the oldest picture of the rig
     watch({"lower": touch(1e-4, 0.0), "upper": blind()})
     assert math.isnan(told["upper"].depth)
 

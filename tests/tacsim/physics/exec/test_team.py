@@ -60,11 +60,11 @@ def test_one_of_three_moves_with_any_team(moving: int, size: int, monkeypatch: p
 )
 def test_the_next_piece(taken: int, done: int, expected: int) -> None:
     sync, found = np.zeros((1, 16), np.int32), np.zeros(1, np.int32)
-    sync[0, [team.TAKEN, team.DONE]] = taken, done
+    sync[0, [team.CLAIMED, team.DONE]] = taken, done
     start()
     ask(sync, found)
     assert found[0] == expected
-    assert sync[0, team.TAKEN] == taken + (expected < 2 * PARTS)
+    assert sync[0, team.CLAIMED] == taken + (expected < 2 * PARTS)
 
 
 @ti.kernel

@@ -19,15 +19,15 @@ from tacsim.models.rig import RepositionConfig, TaskConfig
 
 TOLERANCE = 0.01  # of the load: an error within it is left alone, so an arm at its load rests
 PROBE = 0.1  # of the longest correction: the length of one while no stiffness is known
-# The stiffness changes at most by these factors a period: forces are noisy; less towards soft, whose steps are longer
+# Largest change of stiffness a period, as forces are noisy; smaller towards soft, where corrections are longer
 HARDER, SOFTER = 2.0, 1.25
 SMALLEST = 1e-6  # a shorter displacement gives no stiffness [m]
 REACH = 5e-3  # farthest from where the arm began along z; beyond, the load counts as out of reach [m]
 
 
 @dataclass
-class _NormalAxis:
-    """What is known of one arm's z: where it began, what it felt last, and where it was last sent."""
+class _AxisState:
+    """One arm's z: where it began, its last force, and where it was last sent."""
 
     began: FloatArray  # (3,) [m]
     before: tuple[FloatArray, float]  # (3,) position [m] and force [N] of the period before
@@ -35,8 +35,8 @@ class _NormalAxis:
     stiffness: float | None = None  # [N/m]
 
 
-class Admittance:
-    """Turns the actions of a policy so that arms hold `loads` along the z of their sensors.
+class LoadController:
+    """Secant force control: changes the actions of a policy so that arms hold `loads` along the z of their sensors.
 
     Call it once a control period with the action and the latest arm states, then `sent` with the poses that were really
     sent. It replaces only the displacement along z; an arm without a target of its own still follows its load.
@@ -45,7 +45,7 @@ class Admittance:
     def __init__(self, loads: Mapping[str, float], longest: float) -> None:
         """loads: normal force by arm name, > 0 when pressed [N]; longest: correction of one period, > 0 [m]."""
         self.loads, self._longest = dict(loads), longest
-        self._axes: dict[str, _NormalAxis] = {}
+        self._axes: dict[str, _AxisState] = {}
 
     def reset(self) -> None:
         """For a new episode: forgets stiffness and travel."""
@@ -67,7 +67,7 @@ class Admittance:
         if not math.isfinite(force):
             raise LimitExceeded(f"arm '{name}' holds a load of {self.loads[name]:g} N, but feels {force} N")
         here = arm.pose.position
-        axis = self._axes.setdefault(name, _NormalAxis(here, (here, force), arm.pose))
+        axis = self._axes.setdefault(name, _AxisState(here, (here, force), arm.pose))
         normal = se3.rotation(arm.pose).as_matrix()[:, 2]
         self._learn(axis, float(normal @ (here - axis.before[0])), force)
         axis.before = here, force
@@ -82,7 +82,7 @@ class Admittance:
         along = normal @ (axis.sent.position - asked.position) + step
         return Pose(asked.position + along * normal, asked.quaternion)
 
-    def _learn(self, axis: _NormalAxis, displacement: float, force: float) -> None:
+    def _learn(self, axis: _AxisState, displacement: float, force: float) -> None:
         """The stiffness from the last displacement along z [m] and the force after it [N]; a force that fell as the
         sensor pressed came from elsewhere (the body slid, tipped or yielded) and teaches nothing."""
         change = force - axis.before[1]
@@ -92,7 +92,7 @@ class Admittance:
         known = axis.stiffness
         axis.stiffness = found if known is None else min(max(found, known / SOFTER), known * HARDER)
 
-    def _step(self, axis: _NormalAxis, load: float, force: float) -> float:
+    def _step(self, axis: _AxisState, load: float, force: float) -> float:
         """The next correction, positive towards the object [m]."""
         error = load - force
         if abs(error) <= TOLERANCE * load:
@@ -102,6 +102,6 @@ class Admittance:
         return max(-self._longest, min(self._longest, error / axis.stiffness))
 
 
-def held_loads(task: TaskConfig | None) -> Admittance | None:
-    """What holds the loads of a rig's task; None if it asks for none."""
-    return Admittance(task.loads, task.max_step) if isinstance(task, RepositionConfig) and task.loads else None
+def load_controller(task: TaskConfig | None) -> LoadController | None:
+    """The controller of the loads of a rig's task; None if it asks for none."""
+    return LoadController(task.loads, task.max_step) if isinstance(task, RepositionConfig) and task.loads else None

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from robot.open import open_rig
 from tacsim import pose as se3
 from tacsim.config import ConfigError, load_rig
-from tacsim.control.admittance import REACH, TOLERANCE, Admittance, held_loads
+from tacsim.control.load_controller import REACH, TOLERANCE, LoadController, load_controller
 from tacsim.interface import Action, ArmState, Pose
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
@@ -40,7 +40,7 @@ class Wall:
         felt = np.array([0.0, 0.0, -self.force + self.noise * self.rng.standard_normal(), 0.0, 0.0, 0.0])
         return ArmState(self.pose, np.zeros(6), felt, None, 0.0)
 
-    def period(self, held: Admittance, asked: Pose | None, share: float = 1.0) -> None:
+    def period(self, held: LoadController, asked: Pose | None, share: float = 1.0) -> None:
         """share: of the way that its limits leave."""
         target = held(Action({"hand": asked}), {"hand": self.state()}).tool["hand"]
         assert target is not None
@@ -48,8 +48,8 @@ class Wall:
         held.sent({"hand": self.pose})
 
 
-def holding(load: float = LOAD) -> Admittance:
-    return Admittance({"hand": load}, LONGEST)
+def holding(load: float = LOAD) -> LoadController:
+    return LoadController({"hand": load}, LONGEST)
 
 
 @pytest.mark.parametrize("stiffness", [300.0, 3e3, 3e4])
@@ -117,7 +117,7 @@ def test_an_arm_with_nothing_to_press_stops_and_says_so() -> None:
     wall.period(held, None)  # a new episode begins anew
 
 
-def _twice(wall: Wall, held: Admittance) -> None:
+def _twice(wall: Wall, held: LoadController) -> None:
     wall.period(held, None)
     wall.period(held, None)
 
@@ -130,10 +130,10 @@ def test_a_force_that_is_no_number_moves_nothing(felt: float) -> None:
 
 
 def test_only_tasks_that_name_loads_hold_them() -> None:
-    assert held_loads(None) is None
-    assert held_loads(SqueezeConfig(kind="squeeze")) is None
-    assert held_loads(RepositionConfig(kind="reposition")) is None
-    held = held_loads(RepositionConfig(kind="reposition", loads={"upper": 2.0}))
+    assert load_controller(None) is None
+    assert load_controller(SqueezeConfig(kind="squeeze")) is None
+    assert load_controller(RepositionConfig(kind="reposition")) is None
+    held = load_controller(RepositionConfig(kind="reposition", loads={"upper": 2.0}))
     assert held is not None and held.loads == {"upper": 2.0}
 
 

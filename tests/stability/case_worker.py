@@ -10,8 +10,8 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Self
 
-import hard_cases
-from hard_cases import Outcome
+import case_run
+from case_run import Outcome
 
 
 class CaseDied(Exception):
@@ -22,7 +22,7 @@ def serve(requests: Any, answers: Any) -> None:
     """In the worker: runs what is asked for until None comes."""
     while (request := requests.get()) is not None:
         try:
-            answers.put(hard_cases.run(*request))
+            answers.put(case_run.run(*request))
         except Exception:
             answers.put(traceback.format_exc())
 

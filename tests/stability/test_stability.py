@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
-# The worker process is handed sys.path and finds the two modules by name.
+# The worker process is handed sys.path and finds these modules by name.
 sys.path.insert(0, str(Path(__file__).parent))
+from case_run import Outcome
 from case_worker import CaseDied, Worker
-from hard_cases import CASES, Outcome
+from hard_cases import CASES
 
 Config = dict[str, float]
 LONG = {"loaded rest, long": 600, "unstressed rest, long": 400, "unstressed rest, long, press": 100}  # [s]

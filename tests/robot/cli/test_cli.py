@@ -1,14 +1,10 @@
-"""The `tacsim` command: exit codes, messages, files, signals."""
+"""The `tacsim` command: exit codes, messages, presses."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,42 +12,18 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner, Result
 
-from robot.cli import app
 from robot.cli.errors import explain
 from robot.cli.output import writing
-from robot.studies.experiment import (
-    EXPERIMENTS,
-    TrialFailed,
-    as_json,
-    image_difference,
-    key_steps,
-    run_trials,
-    shortcomings,
-)
 from robot.studies.press import PressMotion, _targets
 from tacsim.config import ConfigError
-from tacsim.interface import IncompatibleRig, Pose, TactileFrame
+from tacsim.interface import IncompatibleRig, Pose
 from tacsim.models.scene import Sphere
 from tacsim.record.episode import EpisodeError
-from tacsim.record.reader import read_episode
-from tacsim.report.figure4 import Trial
+from tests.robot.cli.invoked import START, environment, tacsim
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
 COMMANDS = ("run", "press", "reproduce", "replay", "schema", "doctor", "debug", "bench", "mock", "compare")
-TINY = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")  # a world of seconds
-START = (sys.executable, "-c", "from robot.cli import main; main()")
-
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setenv("TERM", "dumb")
-
-
-def tacsim(*words: str) -> Result:
-    return CliRunner().invoke(app, list(words), env={"COLUMNS": "200"})
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -203,7 +175,7 @@ def test_a_broken_mesh_file_ends_with_2(name: str, content: bytes, said: str, tm
 )
 def test_a_machine_that_is_not_there_ends_with_2(variable: str, value: str, said: str, tmp_path: Path) -> None:
     words = (*START, "press", "sphere", "--preset", "draft")
-    result = subprocess.run(words, env={**_environment(), variable: value}, capture_output=True, text=True)
+    result = subprocess.run(words, env={**environment(), variable: value}, capture_output=True, text=True)
     assert result.returncode == 2 and said in result.stderr and "unexpected" not in result.stderr
     assert list(tmp_path.iterdir()) == []
 
@@ -232,203 +204,7 @@ def test_a_press_that_diverges_leaves_what_debug_reads(tmp_path: Path) -> None:
     assert (tmp_path / "p" / "diverged" / "00" / "state.npz").is_file()
 
 
-def test_run_makes_exactly_its_steps_and_replay_shows_them_again(tmp_path: Path) -> None:
-    result = tacsim("run", "--steps", "3", "--seed", "5", "--out", "r", *TINY)
-    assert result.exit_code == 0, result.output
-    names = ("report.html", "report.png", "episode.mcap", "summary.json")
-    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == sorted(names)
-    assert all(str(Path("r") / name) in result.stdout for name in names)
-    config = json.loads((tmp_path / "r" / "summary.json").read_text())
-    assert (config["steps"], len(config["reward"]), config["seed"], config["complete"]) == (3, 3, 5, True)
-    assert config["distance"][2] < config["distance"][0]  # the scripted policy squeezes
-    episode = read_episode(tmp_path / "r" / "episode.mcap")
-    assert [step.index for step in episode.steps] == [0, 1, 2, 3]
-    assert b"scene:" in episode.meta.attachments["rig.yaml"]
-
-    result = tacsim("replay", "r/episode.mcap", "--out", "again")
-    assert result.exit_code == 0, result.output
-    again = json.loads((tmp_path / "again" / "summary.json").read_text())
-    assert again["reward"] == pytest.approx(config["reward"])
-    assert again["force"] == config["force"]
-
-
-def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
-    result = tacsim("run", "--steps", "0", "--task", "reposition", *TINY)
-    assert result.exit_code == 0, result.output
-    (folder,) = (tmp_path / "runs").iterdir()
-    assert folder.name.endswith("-reposition")
-    assert f"runs/{folder.name}/report.html" in result.stdout
-
-
-def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
-    monkeypatch.setattr(sys, "path", list(sys.path))  # the command adds the current folder
-    result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
-    assert result.exit_code == 1
-    assert "no idea" in result.stderr
-    assert json.loads((tmp_path / "r" / "summary.json").read_text())["steps"] == 0
-    assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 1
-
-
-def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) -> None:
-    text = "class Act:\n    needs = Needs()\n    def reset(self): raise OSError('no gripper')\n"
-    text += "    def __call__(self, observation): return None\n"
-    (tmp_path / "unready.py").write_text("from tacsim.interface import Needs\n" + text)
-    result = tacsim("run", "--policy", "unready:Act", "--out", "r", *TINY)
-    assert result.exit_code == 1
-    assert "no gripper" in result.stderr
-    assert "report" not in result.stderr
-    again = tacsim("replay", "r/episode.mcap", "--out", "again")
-    assert again.exit_code == 1
-    assert "no step can be read" in again.stderr
-    assert not (tmp_path / "again").exists()
-
-
 def test_a_full_disk_is_named(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space") as caught, writing(tmp_path):
         raise OSError(28, "No space left on device")
     assert explain(caught.value) == (f"{tmp_path}: No space left on device", 1)
-
-
-@pytest.mark.deep
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
-    words = ("run", "--steps", "100000", "--task", "reposition", "--out", "r", *TINY)
-    process = subprocess.Popen(
-        [*START, *words], env=_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        _wait_for_steps(tmp_path / "r" / "episode.mcap", process)
-        process.send_signal(number)
-        output, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == code, errors
-    episode = read_episode(tmp_path / "r" / "episode.mcap")
-    assert episode.complete
-    config = json.loads((tmp_path / "r" / "summary.json").read_text())
-    assert config["steps"] == len(episode.steps) - 1 > 0
-    assert (tmp_path / "r" / "report.html").exists()
-    assert "report.html" in output
-    assert "Traceback" not in errors
-
-
-def test_a_signal_in_this_process_ends_the_episode_and_saves_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = "import os, signal\nfrom tacsim.interface import Action\n"
-    text += "def act(observation):\n    os.kill(os.getpid(), signal.SIGTERM)\n    return Action({})\n"
-    (tmp_path / "ending.py").write_text(text)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    result = tacsim("run", "--policy", "ending:act", "--steps", "9", "--out", "r", *TINY)
-    assert result.exit_code == 143, result.output
-    assert "stopped by a signal before the last step; what was done is saved" in result.stderr
-    assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 2
-
-
-def _environment() -> dict[str, str]:
-    """So that a process started elsewhere finds the packages."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[3]), *sys.path])}
-
-
-def _wait_for_steps(path: Path, process: subprocess.Popen[str]) -> None:
-    """Until the recording has grown by a few steps."""
-    end = time.monotonic() + 90
-    while time.monotonic() < end and process.poll() is None:
-        if path.exists() and path.stat().st_size > 1_500_000:
-            return
-        time.sleep(0.05)
-    pytest.fail(f"no recording grew at {path}: {process.stderr.read() if process.poll() is not None else 'too slow'}")  # type: ignore[union-attr]
-
-
-def made_up(distance: list[float]) -> Trial:
-    """A trial with these distances [mm] from the goal."""
-    metres = [value * 1e-3 for value in distance]
-    seen = [0.5 * k for k in range(len(distance))]
-    return Trial(
-        list(range(len(distance))), [-d for d in distance], metres, seen, 7e-3, [], 1e-4, (0.02, 0.02, 0.004), 1e-3
-    )
-
-
-def test_a_curve_is_the_seeds_only_if_it_rises_to_the_goal_and_falls() -> None:
-    good = made_up([3.0, 1.5, 0.04, 1.0, 2.0])
-    assert shortcomings("squeeze", good) == []
-    assert "closest" in shortcomings("squeeze", made_up([3.0, 1.5, 0.06, 1.0, 2.0]))[0]
-    assert shortcomings("reposition", made_up([3.0, 1.5, 0.06, 1.0, 2.0])) == []  # 0.1 mm will do there
-    assert "at the end" in shortcomings("squeeze", made_up([3.0, 1.5, 0.04, 0.1, 0.28]))[0]
-    assert "at the start" in shortcomings("squeeze", made_up([0.2, 0.1, 0.04, 1.0, 2.0]))[0]
-    assert "at the end" in shortcomings("squeeze", made_up([3.0, 2.0, 1.0, 0.5, 0.0]))[0]  # never falls
-    blind = replace(good, image_difference=[0.0] * 5)
-    assert "images" in shortcomings("squeeze", blind)[0]
-    assert shortcomings("squeeze", made_up([float("nan")] * 5))  # nothing is no success
-
-
-def test_what_the_reproduction_tells() -> None:
-    assert key_steps(26, 15) == [0, 7, 15, 20, 25]
-    assert key_steps(3, 2) == [0, 1, 2]
-    config = as_json({"squeeze": {"seed": made_up([1.0, 0.0, 1.0])}})
-    assert set(config["squeeze"]["seed"]) >= {"step", "reward", "goal", "image_difference"}
-    json.dumps(config, allow_nan=False)
-    dark, bright = (TactileFrame(np.full((2, 2, 3), value, np.uint8), 0.0, 0) for value in (250, 10))
-    assert image_difference({"a": bright, "b": dark}, {"a": dark, "b": dark}) == 120.0  # no wrap-around of uint8
-
-
-@pytest.mark.deep
-def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
-    with pytest.raises(TrialFailed, match=r"squeeze by physics 'magic' failed: KeyError"):
-        run_trials([("squeeze", "magic")])
-
-
-@pytest.mark.deep
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for the processes in /proc")
-def test_a_signal_ends_the_reproduction_and_its_processes(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*START, "reproduce", "--out", "f"], env=_environment(), stderr=subprocess.PIPE, text=True
-    )
-    try:
-        children = _wait_for_children(process)
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 143, errors
-    assert "Traceback" not in errors
-    assert not (tmp_path / "f").exists()
-    end = time.monotonic() + 10
-    while any(map(_lives, children)) and time.monotonic() < end:
-        time.sleep(0.1)
-    assert not list(filter(_lives, children))
-
-
-def _lives(number: int) -> bool:
-    """True while the process runs; an ended one may wait for its parent (state Z)."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def _wait_for_children(process: subprocess.Popen[str]) -> list[int]:
-    """Process ids of the workers, once there are some."""
-    end = time.monotonic() + 60
-    while time.monotonic() < end and process.poll() is None:
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        if len(children) >= 2:
-            return [int(word) for word in children]
-        time.sleep(0.1)
-    pytest.fail("no processes were started")
-
-
-@pytest.mark.deep
-@pytest.mark.timeout(600)
-def test_the_seeds_experiment_comes_out(tmp_path: Path) -> None:
-    result = tacsim("reproduce", "--out", "f")
-    assert result.exit_code == 0, result.output
-    config = json.loads((tmp_path / "f" / "fig4.json").read_text())
-    for task, planned in EXPERIMENTS.items():
-        assert set(config[task]) == {"seed", "hybrid"}
-        for curve in config[task].values():
-            assert curve["step"] == list(range(len(curve["reward"])))
-            assert len(curve["step"]) <= planned.steps + 1
-            assert 0.4 < np.argmax(curve["reward"]) / curve["step"][-1] < 0.8
-    assert imread(tmp_path / "f" / "fig4.png").shape[1] > 1500

@@ -1,0 +1,23 @@
+"""The `tacsim` command, called in this process or started in another."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from typer.testing import CliRunner, Result
+
+from robot.cli import app
+
+TINY = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 mm")  # a world of seconds
+START = (sys.executable, "-c", "from robot.cli import main; main()")
+
+
+def tacsim(*words: str) -> Result:
+    return CliRunner().invoke(app, list(words), env={"COLUMNS": "200"})
+
+
+def environment() -> dict[str, str]:
+    """So that a process started elsewhere finds the packages."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[3]), *sys.path])}

@@ -1,0 +1,123 @@
+"""`tacsim reproduce`: what counts as the paper's curves, trials in processes, signals."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from robot.studies.experiment import (
+    EXPERIMENTS,
+    TrialFailed,
+    as_json,
+    image_difference,
+    key_steps,
+    run_trials,
+    shortcomings,
+)
+from tacsim.interface import TactileFrame
+from tacsim.report.figure4 import Trial
+from tests.robot.cli.invoked import START, environment, tacsim
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def made_up(distance: list[float]) -> Trial:
+    """A trial with these distances [mm] from the goal."""
+    metres = [value * 1e-3 for value in distance]
+    seen = [0.5 * k for k in range(len(distance))]
+    return Trial(
+        list(range(len(distance))), [-d for d in distance], metres, seen, 7e-3, [], 1e-4, (0.02, 0.02, 0.004), 1e-3
+    )
+
+
+def test_a_curve_is_the_seeds_only_if_it_rises_to_the_goal_and_falls() -> None:
+    good = made_up([3.0, 1.5, 0.04, 1.0, 2.0])
+    assert shortcomings("squeeze", good) == []
+    assert "closest" in shortcomings("squeeze", made_up([3.0, 1.5, 0.06, 1.0, 2.0]))[0]
+    assert shortcomings("reposition", made_up([3.0, 1.5, 0.06, 1.0, 2.0])) == []  # 0.1 mm will do there
+    assert "at the end" in shortcomings("squeeze", made_up([3.0, 1.5, 0.04, 0.1, 0.28]))[0]
+    assert "at the start" in shortcomings("squeeze", made_up([0.2, 0.1, 0.04, 1.0, 2.0]))[0]
+    assert "at the end" in shortcomings("squeeze", made_up([3.0, 2.0, 1.0, 0.5, 0.0]))[0]  # never falls
+    blind = replace(good, image_difference=[0.0] * 5)
+    assert "images" in shortcomings("squeeze", blind)[0]
+    assert shortcomings("squeeze", made_up([float("nan")] * 5))  # nothing is no success
+
+
+def test_what_the_reproduction_tells() -> None:
+    assert key_steps(26, 15) == [0, 7, 15, 20, 25]
+    assert key_steps(3, 2) == [0, 1, 2]
+    config = as_json({"squeeze": {"seed": made_up([1.0, 0.0, 1.0])}})
+    assert set(config["squeeze"]["seed"]) >= {"step", "reward", "goal", "image_difference"}
+    json.dumps(config, allow_nan=False)
+    dark, bright = (TactileFrame(np.full((2, 2, 3), value, np.uint8), 0.0, 0) for value in (250, 10))
+    assert image_difference({"a": bright, "b": dark}, {"a": dark, "b": dark}) == 120.0  # no wrap-around of uint8
+
+
+@pytest.mark.deep
+def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
+    with pytest.raises(TrialFailed, match=r"squeeze by physics 'magic' failed: KeyError"):
+        run_trials([("squeeze", "magic")])
+
+
+@pytest.mark.deep
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for the processes in /proc")
+def test_a_signal_ends_the_reproduction_and_its_processes(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*START, "reproduce", "--out", "f"], env=environment(), stderr=subprocess.PIPE, text=True
+    )
+    try:
+        children = _wait_for_children(process)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 143, errors
+    assert "Traceback" not in errors
+    assert not (tmp_path / "f").exists()
+    end = time.monotonic() + 10
+    while any(map(_lives, children)) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not list(filter(_lives, children))
+
+
+def _lives(number: int) -> bool:
+    """True while the process runs; an ended one may wait for its parent (state Z)."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def _wait_for_children(process: subprocess.Popen[str]) -> list[int]:
+    """Process ids of the workers, once there are some."""
+    end = time.monotonic() + 60
+    while time.monotonic() < end and process.poll() is None:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        if len(children) >= 2:
+            return [int(word) for word in children]
+        time.sleep(0.1)
+    pytest.fail("no processes were started")
+
+
+@pytest.mark.deep
+@pytest.mark.timeout(600)
+def test_the_seeds_experiment_comes_out(tmp_path: Path) -> None:
+    result = tacsim("reproduce", "--out", "f")
+    assert result.exit_code == 0, result.output
+    config = json.loads((tmp_path / "f" / "fig4.json").read_text())
+    for task, planned in EXPERIMENTS.items():
+        assert set(config[task]) == {"seed", "hybrid"}
+        for curve in config[task].values():
+            assert curve["step"] == list(range(len(curve["reward"])))
+            assert len(curve["step"]) <= planned.steps + 1
+            assert 0.4 < np.argmax(curve["reward"]) / curve["step"][-1] < 0.8
+    assert imread(tmp_path / "f" / "fig4.png").shape[1] > 1500

@@ -1,0 +1,115 @@
+"""`tacsim run` and `tacsim replay`: episodes, their files, errors of policies, signals."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tacsim.record.reader import read_episode
+from tests.robot.cli.invoked import START, TINY, environment, tacsim
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def test_run_makes_exactly_its_steps_and_replay_shows_them_again(tmp_path: Path) -> None:
+    result = tacsim("run", "--steps", "3", "--seed", "5", "--out", "r", *TINY)
+    assert result.exit_code == 0, result.output
+    names = ("report.html", "report.png", "episode.mcap", "summary.json")
+    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == sorted(names)
+    assert all(str(Path("r") / name) in result.stdout for name in names)
+    config = json.loads((tmp_path / "r" / "summary.json").read_text())
+    assert (config["steps"], len(config["reward"]), config["seed"], config["complete"]) == (3, 3, 5, True)
+    assert config["distance"][2] < config["distance"][0]  # the scripted policy squeezes
+    episode = read_episode(tmp_path / "r" / "episode.mcap")
+    assert [step.index for step in episode.steps] == [0, 1, 2, 3]
+    assert b"scene:" in episode.meta.attachments["rig.yaml"]
+
+    result = tacsim("replay", "r/episode.mcap", "--out", "again")
+    assert result.exit_code == 0, result.output
+    again = json.loads((tmp_path / "again" / "summary.json").read_text())
+    assert again["reward"] == pytest.approx(config["reward"])
+    assert again["force"] == config["force"]
+
+
+def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
+    result = tacsim("run", "--steps", "0", "--task", "reposition", *TINY)
+    assert result.exit_code == 0, result.output
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.endswith("-reposition")
+    assert f"runs/{folder.name}/report.html" in result.stdout
+
+
+def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the command adds the current folder
+    result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
+    assert result.exit_code == 1
+    assert "no idea" in result.stderr
+    assert json.loads((tmp_path / "r" / "summary.json").read_text())["steps"] == 0
+    assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 1
+
+
+def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) -> None:
+    text = "class Act:\n    needs = Needs()\n    def reset(self): raise OSError('no gripper')\n"
+    text += "    def __call__(self, observation): return None\n"
+    (tmp_path / "unready.py").write_text("from tacsim.interface import Needs\n" + text)
+    result = tacsim("run", "--policy", "unready:Act", "--out", "r", *TINY)
+    assert result.exit_code == 1
+    assert "no gripper" in result.stderr
+    assert "report" not in result.stderr
+    again = tacsim("replay", "r/episode.mcap", "--out", "again")
+    assert again.exit_code == 1
+    assert "no step can be read" in again.stderr
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    words = ("run", "--steps", "100000", "--task", "reposition", "--out", "r", *TINY)
+    process = subprocess.Popen(
+        [*START, *words], env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        _wait_for_steps(tmp_path / "r" / "episode.mcap", process)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == code, errors
+    episode = read_episode(tmp_path / "r" / "episode.mcap")
+    assert episode.complete
+    config = json.loads((tmp_path / "r" / "summary.json").read_text())
+    assert config["steps"] == len(episode.steps) - 1 > 0
+    assert (tmp_path / "r" / "report.html").exists()
+    assert "report.html" in output
+    assert "Traceback" not in errors
+
+
+def test_a_signal_in_this_process_ends_the_episode_and_saves_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "import os, signal\nfrom tacsim.interface import Action\n"
+    text += "def act(observation):\n    os.kill(os.getpid(), signal.SIGTERM)\n    return Action({})\n"
+    (tmp_path / "ending.py").write_text(text)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    result = tacsim("run", "--policy", "ending:act", "--steps", "9", "--out", "r", *TINY)
+    assert result.exit_code == 143, result.output
+    assert "stopped by a signal before the last step; what was done is saved" in result.stderr
+    assert len(read_episode(tmp_path / "r" / "episode.mcap").steps) == 2
+
+
+def _wait_for_steps(path: Path, process: subprocess.Popen[str]) -> None:
+    """Until the recording has grown by a few steps."""
+    end = time.monotonic() + 90
+    while time.monotonic() < end and process.poll() is None:
+        if path.exists() and path.stat().st_size > 1_500_000:
+            return
+        time.sleep(0.05)
+    pytest.fail(f"no recording grew at {path}: {process.stderr.read() if process.poll() is not None else 'too slow'}")  # type: ignore[union-attr]

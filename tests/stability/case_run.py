@@ -1,6 +1,6 @@
 """Runs one hard case from a new world on.
 
-A case ends `finite` (a sound state, whose numbers are in `facts`), `diverged` (SimulationDiverged, and the world is bit
+A case ends `finite` (a sound state, whose numbers are in `figures`), `diverged` (SimulationDiverged, and the world is bit
 for bit as before the motion and still of use) or `refused` (ValueError). Anything else is a failure of the case.
 """
 

@@ -1,7 +1,7 @@
 """Runs one hard case from a new world on.
 
-A case ends `finite` (a sound state, whose numbers are in `figures`), `diverged` (SimulationDiverged, and the world is bit
-for bit as before the motion and still of use) or `refused` (ValueError). Anything else is a failure of the case.
+A case ends `finite` (a sound state, whose numbers are in `figures`), `diverged` (SimulationDiverged, and the world is
+bit for bit as before the motion and still of use) or `refused` (ValueError). Anything else is a failure of the case.
 """
 
 from __future__ import annotations

@@ -5,20 +5,14 @@ its own folder), ``scene: {extends: squeeze, preset: standard}`` (that file with
 Every problem is a line ``file:line: key: what is wrong; what is allowed; did you mean``, all in one ConfigError.
 """
 
-from tacsim.config.errors import ConfigError
-from tacsim.config.kinds import KINDS, config_root, json_schema, names
-from tacsim.config.load import LoadedRig, load, load_rig, load_scene, load_sensor, load_task
-
-__all__ = [
-    "KINDS",
-    "ConfigError",
-    "LoadedRig",
-    "config_root",
-    "json_schema",
-    "load",
-    "load_rig",
-    "load_scene",
-    "load_sensor",
-    "load_task",
-    "names",
-]
+from tacsim.config.errors import ConfigError as ConfigError
+from tacsim.config.kinds import KINDS as KINDS
+from tacsim.config.kinds import config_root as config_root
+from tacsim.config.kinds import json_schema as json_schema
+from tacsim.config.kinds import names as names
+from tacsim.config.load import LoadedRig as LoadedRig
+from tacsim.config.load import load as load
+from tacsim.config.load import load_rig as load_rig
+from tacsim.config.load import load_scene as load_scene
+from tacsim.config.load import load_sensor as load_sensor
+from tacsim.config.load import load_task as load_task

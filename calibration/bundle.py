@@ -91,21 +91,13 @@ class Calibration(Config):
         return (self.geometry.height, self.geometry.width) if self.view is None else self.view.image_shape
 
     @model_validator(mode="after")
-    def _picture_shows_the_gel(self) -> Self:
+    def _parts_agree(self) -> Self:
         pitch = self.geometry.pixel_pitch
         shown = (self.geometry.width * pitch, self.geometry.height * pitch)
         if any(abs(one - other) > pitch for one, other in zip(shown, self.gel_size, strict=True)):
             raise ValueError(f"gel_size is {self.gel_size} m, the picture of its geometry shows {shown} m")
-        return self
-
-    @model_validator(mode="after")
-    def _view_gives_the_geometry(self) -> Self:
         if self.view is not None and self.view.geometry != self.geometry:
             raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
-        return self
-
-    @model_validator(mode="after")
-    def _format_has_all_that_is_given(self) -> Self:
         for name in sorted(NOT_YET[self.format]):
             if getattr(self, name) is not None:
                 raise ValueError(f"format {self.format} has no {name}")

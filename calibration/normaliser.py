@@ -105,7 +105,11 @@ class FrameNormaliser:
         """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
         UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
         rectified = self._rectify(frame.image)
-        reference = make_reference(rectified, self._rectify.valid, self._measured())
+        # The mean is that of the canonical image's pixels, so that what a policy sees does not depend on whether height
+        # is found.
+        measured = np.zeros_like(self._rectify.valid)
+        canonical_part(measured, self._grid)[...] = self._on_image
+        reference = make_reference(rectified, self._rectify.valid, measured)
         if self._untouched is not None and exchanged(rectified, self._untouched, self._rectify.valid):
             raise UnusableReference(
                 "red and blue are exchanged: the gel looks as in its calibration only with the channels in the other "
@@ -159,13 +163,6 @@ class FrameNormaliser:
             time=frame.time,
             age=now - frame.time,
         )
-
-    def _measured(self) -> NDArray[np.bool_]:
-        """Pixels of the view whose mean is mean(I0): those of the canonical image, so that what a policy sees does not
-        depend on whether height is found."""
-        inside = np.zeros_like(self._rectify.valid)
-        canonical_part(inside, self._grid)[...] = self._on_image
-        return inside
 
     def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:
         """Height, gradient and flow, from the source or from the picture; and the drift that is to be taken off the

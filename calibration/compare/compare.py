@@ -151,7 +151,8 @@ def compare_frames(
     how many there are. Raises BadFrames.
     """
     couples, left = paired(a, b, options.pairing)
-    alignment, notes = _alignment(a, b, couples, calibration_a, calibration_b, shift=options.shift)
+    alignment = _alignment(a, b, couples, calibration_a, calibration_b, shift=options.shift)
+    notes: list[str] = []
     grid = options.grid
     found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a, grid)
     found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b, grid)
@@ -310,7 +311,7 @@ def _alignment(
     calibration_b: Calibration | None,
     *,
     shift: bool,
-) -> tuple[Alignment, list[str]]:
+) -> Alignment:
     if calibration_a is not None and calibration_b is not None:
         alignment = by_geometry(calibration_a.geometry, calibration_b.geometry)
         for side, shape, said in ((a, alignment.source, "A"), (b, alignment.shape, "B")):
@@ -324,13 +325,13 @@ def _alignment(
     if not alignment.covered.any():
         raise BadFrames("A shows no part of the gel that B shows; are these the right calibrations?")
     if not shift:
-        return alignment, []
+        return alignment
     chosen = couples if len(couples) <= MAX_SHIFT_PAIRS else [
         couples[int(k)] for k in np.linspace(0, len(couples) - 1, MAX_SHIFT_PAIRS)
     ]  # fmt: skip
     base_a, base_b = alignment(a.reference), b.reference.astype(np.float32)
     changes = ((alignment(one.image) - base_a, other.image - base_b) for one, other in chosen)
-    return find_shift(changes, alignment), []
+    return find_shift(changes, alignment)
 
 
 def _floor(

@@ -149,11 +149,9 @@ def invariance(
     return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
 
-def ratio(of_a: Float64, of_b: Float64, order: NDArray[np.intp]) -> tuple[float, float]:
-    """Median distance of rows (n, d) of A and B that are partners, and of rows of B that are neighbours in `order`."""
-    apart = np.linalg.norm(of_a - of_b, axis=1)
-    steps = np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
-    return float(np.median(apart)), float(np.median(steps))
+def distances(of_a: Float64, of_b: Float64, order: NDArray[np.intp]) -> tuple[Float64, Float64]:
+    """(n,) of rows (n, d) of A and B that are partners, and (n - 1,) of rows of B that are neighbours in `order`."""
+    return np.linalg.norm(of_a - of_b, axis=1), np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
 
 
 def classifier_scores(of_a: Float64, of_b: Float64) -> tuple[Float64, Float64]:
@@ -189,13 +187,12 @@ def area_under_curve(low: Float64, high: Float64, weight: Float64 | None = None)
 def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray[np.intp]) -> Invariance:
     rng = np.random.default_rng(0)
     count = len(of_a)
-    apart, step = ratio(of_a, of_b, order)
     score_a, score_b = classifier_scores(of_a, of_b)
-    distances = np.linalg.norm(of_a - of_b, axis=1)
-    steps = np.linalg.norm(np.diff(of_b[order], axis=0), axis=1)
+    to_partner, steps = distances(of_a, of_b, order)
+    apart, step = float(np.median(to_partner)), float(np.median(steps))
     drawn = rng.integers(0, count, (BOOTSTRAP_DRAWS, count))
     below = np.median(steps[rng.integers(0, count - 1, (BOOTSTRAP_DRAWS, count - 1))], axis=1)
-    rho_low, rho_high = np.percentile(np.median(distances[drawn], axis=1) / np.maximum(below, 1e-30), (2.5, 97.5))
+    rho_low, rho_high = np.percentile(np.median(to_partner[drawn], axis=1) / np.maximum(below, 1e-30), (2.5, 97.5))
     times = np.stack([(drawn == press).sum(axis=1) for press in range(count)], axis=1).astype(np.float64)
     auc_low, auc_high = np.percentile(area_under_curve(score_a, score_b, times), (2.5, 97.5))
     return Invariance(

@@ -87,7 +87,7 @@ def correlation(one: Picture, other: Picture, where: Mask | None = None) -> floa
     """Pearson's correlation of two changes of colour (normalised cross-correlation without shift), over pixels and
     channels; 0 if either does not vary."""
     _require_alike(one, other)
-    a, b = (_chosen(np.asarray(picture, dtype=np.float64), where).ravel() for picture in (one, other))
+    a, b = (np.asarray(picture, dtype=np.float64)[... if where is None else where].ravel() for picture in (one, other))
     if a.size == 0:
         return math.nan
     a, b = a - a.mean(), b - b.mean()
@@ -183,11 +183,7 @@ def _difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Float64
     return np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
 
 
-def _chosen(values: Float64, where: Mask | None) -> Float64:
-    return values if where is None else values[where]
-
-
 def _mean(values: Float64, where: Mask | None) -> float:
-    chosen = _chosen(values, where)
+    chosen = values if where is None else values[where]
     known = chosen[np.isfinite(chosen)]
     return float(known.mean()) if known.size else math.nan

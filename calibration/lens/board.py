@@ -76,7 +76,6 @@ def parse_board(text: str) -> Board:
     board = Board(parts[0], columns, rows, metres[0])
     if board.kind == "charuco":
         board = replace(board, marker=metres[1], dictionary=parts[4] if len(parts) == 5 else board.dictionary)
-    if board.kind == "charuco":
         _charuco(board)  # refuses an unknown dictionary now
     return board
 

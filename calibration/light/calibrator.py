@@ -154,7 +154,8 @@ def calibrate_light(
         except (NoCircle, BadFrames) as error:
             left_out.append((name, str(error)))
     presses, refined = _refined(found, left_out, ball)
-    labels = [_gradient(press, refined.skirt, ball) for press in presses]
+    v, u = np.mgrid[: reference.shape[0], : reference.shape[1]].astype(np.float64)
+    labels = [dent_gradient(u, v, press.circle, refined.skirt, ball, RIM_BLUR) for press in presses]
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     size = choose_size(forward_sets)
@@ -275,12 +276,6 @@ def _window(press: BallPress) -> Window:
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
     u, v = u[keep], v[keep]
     return Window(u.astype(np.float64), v.astype(np.float64), smooth(press.change, BLUR)[v, u])
-
-
-def _gradient(press: BallPress, skirt: Skirt, ball: float) -> Float64:
-    """(H, W, 2) the press's labels."""
-    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-    return dent_gradient(u, v, press.circle, skirt, ball, RIM_BLUR)
 
 
 def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:

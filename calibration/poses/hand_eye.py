@@ -78,15 +78,9 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
             f"{np.degrees(MIN_SPREAD):.0f} are needed. Turn it about all axes, 30 degrees and more"
         )
     arm = inverse(flange) if fixed else flange  # arm_i camera board_i = mount, always the same
-    camera, mount, fit = np.eye(4), np.eye(4), None
-    starts = _starts(arm, board)
+    camera, mount = _start(arm, board)
     for _ in range(1 + REWEIGHTINGS):
-        if fit is not None:
-            starts = [(camera, mount)]
-        camera, mount, fit = min(
-            (_solved(arm, board, start, noise, fixed=fixed) for start in starts), key=lambda each: each[2].scatter
-        )
-    assert fit is not None
+        camera, mount, fit = _solved(arm, board, camera, mount, noise, fixed=fixed)
     predicted = inverse(camera) @ inverse(arm) @ mount
     turn = Rotation.from_matrix(predicted[:, :3, :3] @ np.swapaxes(board[:, :3, :3], 1, 2)).magnitude()
     missed = np.linalg.norm(predicted[:, :3, 3] - board[:, :3, 3], axis=1)
@@ -102,9 +96,8 @@ def fit_hand_eye(poses: Sequence[BoardPose], *, fixed: bool = False, noise: Hand
 
 
 def _solved(
-    arm: FloatArray, board: FloatArray, start: tuple[FloatArray, FloatArray], noise: HandEyeNoise, *, fixed: bool
+    arm: FloatArray, board: FloatArray, camera: FloatArray, mount: FloatArray, noise: HandEyeNoise, *, fixed: bool
 ) -> tuple[FloatArray, FloatArray, RobustFit]:
-    camera, mount = start
     back = inverse(arm)
     seen_turn = np.swapaxes(board[:, :3, :3], 1, 2)
     whiten = _whitening(camera, mount, arm, noise, fixed=fixed)
@@ -149,7 +142,7 @@ def _cross(vectors: FloatArray) -> FloatArray:
     return matrix - np.swapaxes(matrix, 1, 2)
 
 
-def _starts(arm: FloatArray, board: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def _start(arm: FloatArray, board: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The closed form's camera and mount from all poses or a subset, whichever the poses agree with most."""
     random = np.random.default_rng(0)
     count = len(arm)
@@ -166,7 +159,7 @@ def _starts(arm: FloatArray, board: FloatArray) -> list[tuple[FloatArray, FloatA
         typical = np.median(between, axis=1)
         candidates.append((float(typical.min()), camera, mounts[int(typical.argmin())]))
     _, camera, mount = min(candidates, key=lambda each: each[0])
-    return [(camera, mount)]
+    return camera, mount
 
 
 def closed_form(arm: FloatArray, board: FloatArray) -> FloatArray:

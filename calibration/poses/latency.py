@@ -89,7 +89,13 @@ def _fit(
     for _ in range(ITERATIONS):
         response = _response(np.interp(times - shift, arm_times, arm), seen)
         expected = np.interp(arm, *response)  # the touch that a camera without latency would show
-        shift, likeness = _refine(shift, arm_times, expected, times, seen)
+        found = minimize_scalar(
+            lambda tried, touch=expected: -_correlation(np.interp(times - tried, arm_times, touch), seen),
+            bounds=(shift - PEAK_HALF_WIDTH, shift + PEAK_HALF_WIDTH),
+            method="bounded",
+            options={"xatol": 1e-6},
+        )
+        shift, likeness = float(found.x), -float(found.fun)
     return shift, likeness
 
 
@@ -100,19 +106,6 @@ def _response(depth: FloatArray, touch: FloatArray) -> tuple[FloatArray, FloatAr
     abscissae, first = np.unique(depth[order], return_index=True)
     counts = np.diff([*first, len(depth)])
     return abscissae, np.add.reduceat(fitted, first) / counts
-
-
-def _refine(
-    shift: float, arm_times: FloatArray, expected: FloatArray, times: FloatArray, seen: FloatArray
-) -> tuple[float, float]:
-    """The shift near `shift` at which `expected` fits `seen` best [s], and the correlation there."""
-    found = minimize_scalar(
-        lambda tried: -_correlation(np.interp(times - tried, arm_times, expected), seen),
-        bounds=(shift - PEAK_HALF_WIDTH, shift + PEAK_HALF_WIDTH),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
-    return float(found.x), -float(found.fun)
 
 
 def _signal(times: ArrayLike, values: ArrayLike, what: str) -> tuple[FloatArray, FloatArray]:

@@ -39,8 +39,8 @@ check: $(DEV)
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
 
-# Two processes: one mostly waits for mock hardware, the other computes (tests/conftest.py says which tests go together).
-PARALLEL := -n 2 --dist loadgroup
+# Two processes; the tests of a file stay in one of them, for what a module opens is opened once.
+PARALLEL := -n 2 --dist loadfile
 
 test: check
 	@$(BIN)/python -m pytest -q $(PARALLEL) $(ARGS)

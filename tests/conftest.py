@@ -10,17 +10,13 @@ import io
 import ipaddress
 import os
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from numbers import Integral
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytest_plugins = ["tests.promises"]  # figures of what is promised of arms and cameras
-HERE = Path(__file__).parent
-# Tests here wait for mock hardware more than they compute: one process runs them all, another the rest.
-WIRE = ("robot/arm", "robot/camera", "robot/mock", "robot/procedures", "robot/rig", "robot/doctor")
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("TACSIM_THREADS", "1")  # every process has a core
 
@@ -86,15 +82,6 @@ def _refuse_camera(arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
     source = arguments[0] if arguments else options.get("index", options.get("filename"))
     if isinstance(source, Integral) or str(source).startswith(DEVICES):
         raise RealHardware(f"test opened camera {source!r}: use recorded or simulated frames")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: Sequence[pytest.Item]) -> None:
-    """A file's tests stay in one process (fixtures are made once), and so do all that use mock hardware."""
-    for item in items:
-        folder = item.path.parent.relative_to(HERE).as_posix()
-        group = "wire" if folder.startswith(WIRE) else item.path.relative_to(HERE).as_posix()
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(autouse=True)

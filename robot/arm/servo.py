@@ -10,7 +10,8 @@ as computed by the controller against the flange of our own forward kinematics a
 
 There are two ways to stop. When nothing is wrong (no fresh action, `stop`) the servo target brakes within the limits of
 the arm. After a fault the target is reset to the *measured* pose and velocity of the arm, and brakes at least with
-HARD: the target leads the arm by the servo's lag, and an arm at a limit must not travel that distance too.
+FAULT_DECELERATION: the target leads the arm by the servo's lag, and an arm at a limit must not travel that distance
+too.
 """
 
 from __future__ import annotations
@@ -37,16 +38,16 @@ from tacsim.limits import (
     segment_distance,
 )
 
-HARD = 5.0  # minimum deceleration after a fault [m/s^2]
-HARD_TURN = 50.0  # the same for rotations [rad/s^2]
-BARRIER = 0.5e-3  # how far outside its region the arm itself may come to rest; the target never leaves it [m]
+FAULT_DECELERATION = 5.0  # minimum deceleration after a fault [m/s^2]
+FAULT_TURN_DECELERATION = 50.0  # the same for rotations [rad/s^2]
+ALLOWED_OVERSHOOT = 0.5e-3  # how far outside its region the arm itself may come to rest; the target never leaves it [m]
 LEAST_SINGULAR_VALUE = 0.02  # of the Jacobian, lengths in reaches; below it the arm may only move away
 # Bound on the change of the least singular value for each radian that a joint turns: each of the six columns has a
 # length of at most sqrt(2) in these units, and turns with the joints before it.
-STEEPEST = math.sqrt(12.0)
+MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
 RESTING, RESTING_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
-MOVED, MOVED_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
-SKEW = 2 * PERIOD  # between the loops of two arms [s]
+PUSHED_AWAY, PUSHED_AWAY_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
+LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 
 
 class Servo:
@@ -64,8 +65,12 @@ class Servo:
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position (3,), rotation (3, 3)
         self._goal_time = -math.inf
         self._tactile_read, self._exposed = tactile_read, math.nan  # reports read; exposure of the oldest picture [s]
-        self._clear: tuple[FloatArray, float] | None = None  # joints, and their margin to a singularity
-        self._hard = max(HARD, config.acceleration), max(HARD_TURN, config.turn_acceleration)
+        # joints, and their margin to a singularity
+        self._last_singularity_check: tuple[FloatArray, float] | None = None
+        self._hard = (
+            max(FAULT_DECELERATION, config.acceleration),
+            max(FAULT_TURN_DECELERATION, config.turn_acceleration),
+        )
 
     @property
     def resting(self) -> bool:
@@ -76,36 +81,41 @@ class Servo:
         """(3,) where the servo target comes to rest if it brakes now [m]; None while nothing is sent."""
         return None if self.motion is None else stopping_point(self.motion, self.config.acceleration)
 
-    def trip(self, status: ArmStatus, now: Measured | None) -> None:
+    def trip(self, status: ArmStatus, measured: Measured | None) -> None:
         """Enters a fault: brakes hard and moves no more. A worse fault replaces a lesser one."""
-        if not self.status.is_fault and self.motion is not None and now is not None:
-            self.motion = MotionState(now.sensor[:3, 3], now.sensor[:3, :3], now.twist[:3], now.twist[3:])
-            self._sent = now.joints
+        if not self.status.is_fault and self.motion is not None and measured is not None:
+            self.motion = MotionState(
+                measured.sensor[:3, 3], measured.sensor[:3, :3], measured.twist[:3], measured.twist[3:]
+            )
+            self._sent = measured.joints
         self.status = max(self.status, status)
         self._goal = None
 
-    def check_faults(self, now: Measured, partners: Sequence[Record | None]) -> None:
+    def check_faults(self, measured: Measured, partners: Sequence[Record | None]) -> None:
         """Trips on the measured state: force, region, keep-out, faults of the other arms."""
         config = self.config
-        if exceeds_wrench(now.wrench, config.force, config.torque):
-            self.trip(ArmStatus.FORCE_LIMIT, now)
-        here = now.sensor[:3, 3]
-        if self.region.excess(braking_end(here, now.twist[:3], self._hard[0])) > BARRIER:
-            self.trip(ArmStatus.WORKSPACE_LIMIT, now)
+        if exceeds_wrench(measured.wrench, config.force, config.torque):
+            self.trip(ArmStatus.FORCE_LIMIT, measured)
+        here = measured.sensor[:3, 3]
+        if self.region.excess(braking_end(here, measured.twist[:3], self._hard[0])) > ALLOWED_OVERSHOOT:
+            self.trip(ArmStatus.WORKSPACE_LIMIT, measured)
         if not all(map(is_healthy, partners)):
             if self.resting and not self.status.is_fault:
                 self.status, self._goal = ArmStatus.WAITING, None
             else:
-                self.trip(ArmStatus.PARTNER_STOPPED, now)
+                self.trip(ArmStatus.PARTNER_STOPPED, measured)
         elif self.status in (ArmStatus.CONNECTING, ArmStatus.WAITING):
             self.status = ArmStatus.HOLD
         for partner, other in zip(config.partners, partners, strict=True):
-            if other is not None and float(np.linalg.norm(here - other["position"])) < partner.distance - BARRIER:
-                approach = float(now.twist[:3] @ (other["position"] - here))
+            if (
+                other is not None
+                and float(np.linalg.norm(here - other["position"])) < partner.distance - ALLOWED_OVERSHOOT
+            ):
+                approach = float(measured.twist[:3] @ (other["position"] - here))
                 if approach > 0.0 and not self.resting:
-                    self.trip(ArmStatus.KEEP_OUT, now)
+                    self.trip(ArmStatus.KEEP_OUT, measured)
 
-    def on_tactile(self, number: int, report: Record | None, now: Measured) -> None:
+    def on_tactile(self, number: int, report: Record | None, measured: Measured) -> None:
         """Reads the newest tactile report, once: a gel pressed or sheared beyond its limit trips."""
         if report is None or number == self._tactile_read:
             return
@@ -114,7 +124,7 @@ class Servo:
         if not math.isnan(self._exposed) and (
             exceeds(float(report["depth"]), config.depth) or exceeds(float(report["shear"]), config.shear)
         ):
-            self.trip(ArmStatus.GEL_LIMIT, now)
+            self.trip(ArmStatus.GEL_LIMIT, measured)
 
     def on_command(self, number: int, command: Record | None) -> None:
         """Reads the newest command, once. A target that is not a pose is rejected, and the arm holds."""
@@ -135,7 +145,7 @@ class Servo:
             self.close_requested |= kind == CommandKind.CLOSE
             self.zero_requested |= kind == CommandKind.ZERO_WRENCH
 
-    def step(self, time: float, now: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
+    def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
         config = self.config
         goal = self._goal if time - self._goal_time <= config.action_timeout else None
@@ -143,18 +153,18 @@ class Servo:
         if self.status.is_fault or goal is None or stale:
             if not self.status.is_fault and self.status != ArmStatus.WAITING:
                 self.status = ArmStatus.HOLD if goal is None else ArmStatus.OBSERVATION_STALE
-            return self._slow_down(now)
+            return self._slow_down(measured)
         if self.motion is None or (
-            self.status in (ArmStatus.HOLD, ArmStatus.OBSERVATION_STALE) and self._was_moved(self.motion, now)
+            self.status in (ArmStatus.HOLD, ArmStatus.OBSERVATION_STALE) and self._was_moved(self.motion, measured)
         ):
-            self.motion, self._sent = resting(now.sensor[:3, 3], now.sensor[:3, :3]), now.joints
+            self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
             goal = self._clip_goal(self.motion) or goal
         elif self._sent is not None and self.motion.at_rest and _is_at(self.motion, goal):
             self.status = ArmStatus.OK
             return self._sent
         gaps = self._gaps(self.motion, partners)
 
-        def admissible(motion: MotionState) -> bool:
+        def allowed(motion: MotionState) -> bool:
             """The arm could still stop inside its region and clear of the other arms, or it moves away from them."""
             assert self.motion is not None
             reach = self.region.excess(stopping_point(motion, self.config.acceleration))
@@ -162,32 +172,36 @@ class Servo:
                 return False
             return all(new >= 0.0 or new >= old for new, old in zip(self._gaps(motion, partners), gaps, strict=True))
 
-        wanted = towards(self.motion, *goal, self.config, admissible)
-        joints = self._joints(wanted, now)
+        wanted = towards(self.motion, *goal, self.config, allowed)
+        joints = self._joints(wanted, measured)
         if joints is not None:
             self.status = ArmStatus.OK
             return self._send(wanted, joints)
         self.status = ArmStatus.OUT_OF_REACH
-        return self._slow_down(now)
+        return self._slow_down(measured)
 
-    def _was_moved(self, held: MotionState, now: Measured) -> bool:
+    def _was_moved(self, held: MotionState, measured: Measured) -> bool:
         """True if the arm rests away from its held pose (somebody moved it): the next target starts at the measured
         pose. Servo lag and the deflection by a contact are smaller than that, and cause no jump."""
-        if not held.at_rest or np.abs(now.twist[:3]).max() > RESTING or np.abs(now.twist[3:]).max() > RESTING_TURN:
+        if (
+            not held.at_rest
+            or np.abs(measured.twist[:3]).max() > RESTING
+            or np.abs(measured.twist[3:]).max() > RESTING_TURN
+        ):
             return False
-        away = np.abs(now.sensor[:3, 3] - held.position).max()
-        turned = np.abs(rotation_vector(now.sensor[:3, :3] @ held.rotation.T)).max()
-        return bool(away > MOVED or turned > MOVED_TURN)
+        away = np.abs(measured.sensor[:3, 3] - held.position).max()
+        turned = np.abs(rotation_vector(measured.sensor[:3, :3] @ held.rotation.T)).max()
+        return bool(away > PUSHED_AWAY or turned > PUSHED_AWAY_TURN)
 
-    def _slow_down(self, now: Measured) -> FloatArray | None:
-        """One period of braking; repeats the last joints where the braking pose has no admissible ones."""
+    def _slow_down(self, measured: Measured) -> FloatArray | None:
+        """One period of braking; repeats the last joints where the braking pose has no allowed ones."""
         if self.motion is None or self._sent is None:
             return None
         if self.motion.at_rest:
             return self._sent
         limits = self._hard if self.status.is_fault else (self.config.acceleration, self.config.turn_acceleration)
         slower = braking(self.motion, *limits)
-        joints = self._joints(slower, now)
+        joints = self._joints(slower, measured)
         if joints is None:
             self.motion = resting(self.motion.position, self.motion.rotation)
             return self._sent
@@ -197,14 +211,14 @@ class Servo:
         self.motion, self._sent = motion, joints
         return joints
 
-    def _joints(self, motion: MotionState, now: Measured) -> FloatArray | None:
+    def _joints(self, motion: MotionState, measured: Measured) -> FloatArray | None:
         """Joints (6,) of a pose, if within reach, joint speed, and clear of singularities; else None."""
         assert self._sent is not None
         sensor = np.eye(4)
         sensor[:3, :3], sensor[:3, 3] = motion.rotation, motion.position
         wanted = self.frames.flange(sensor)
-        nominal = inverse_frame(now.flange) @ self.kinematics.forward(now.joints)  # the controller's flange to ours
-        joints = self.kinematics.inverse(wanted @ nominal, self._sent)
+        controller_from_model = inverse_frame(measured.flange) @ self.kinematics.forward(measured.joints)
+        joints = self.kinematics.inverse(wanted @ controller_from_model, self._sent)
         if joints is None or joint_step_excess(self._sent, joints, self.config.joint_speed, PERIOD) > 1.0:
             return None
         return None if self._nears_singularity(joints) else joints
@@ -212,24 +226,24 @@ class Servo:
     def _nears_singularity(self, joints: FloatArray) -> bool:
         """True if `joints` are too near to a singularity, and nearer than the joints sent last."""
         assert self._sent is not None
-        if self._clear is not None:
-            there, room = self._clear
-            if STEEPEST * float(np.abs(joints - there).sum()) < room:
+        if self._last_singularity_check is not None:
+            joints_then, margin_then = self._last_singularity_check
+            if MAX_SINGULAR_VALUE_RATE * float(np.abs(joints - joints_then).sum()) < margin_then:
                 return False
         distance = self.kinematics.singularity(joints)
-        self._clear = joints, distance - LEAST_SINGULAR_VALUE
+        self._last_singularity_check = joints, distance - LEAST_SINGULAR_VALUE
         return distance < LEAST_SINGULAR_VALUE and distance < self.kinematics.singularity(self._sent)
 
     def _gaps(self, motion: MotionState, partners: Sequence[Record | None]) -> list[float]:
         """Distance [m] between the braking path of `motion` and that of each other arm, less the keep-out distance and
-        less what the other arm may cover within SKEW (the end of a braking path moves at most twice as fast as the
-        arm)."""
+        less what the other arm may cover within LOOP_OFFSET (the end of a braking path moves at most twice as fast as
+        the arm)."""
         end = stopping_point(motion, self.config.acceleration)
         gaps = []
         for partner, other in zip(self.config.partners, partners, strict=True):
             assert other is not None  # else the arm waits
             gap = segment_distance(motion.position, end, other["position"], other["stopping_point"])
-            gaps.append(gap - partner.distance - 2.0 * float(other["top_speed"]) * SKEW)
+            gaps.append(gap - partner.distance - 2.0 * float(other["top_speed"]) * LOOP_OFFSET)
         return gaps
 
     def _clip_goal(self, start: MotionState) -> tuple[FloatArray, FloatArray] | None:

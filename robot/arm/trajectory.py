@@ -79,25 +79,25 @@ def towards(
     position: FloatArray,
     rotation: FloatArray,
     rates: Rates,
-    admissible: Callable[[MotionState], bool] | None = None,
+    allowed: Callable[[MotionState], bool] | None = None,
     period: float = PERIOD,
 ) -> MotionState:
     """One period nearer to the target `position` (3,) [m] and `rotation` (3, 3).
 
-    `admissible` says whether a motion state is allowed, judged by where it could still be stopped. Where it is not, the
-    origin brakes straight on instead: its stopping point stays the one that was admissible before.
+    `allowed` says whether a motion state is allowed, judged by where it could still be stopped. Where it is not, the
+    origin brakes straight on instead: its stopping point stays the one that was allowed before.
     """
     velocity, moved, arrived = _approach(position - now.position, now.velocity, rates.speed, rates.acceleration, period)
-    spin, turned, facing = _approach(
+    spin, turned, rotation_arrived = _approach(
         rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration, period
     )
     step = MotionState(
         position.copy() if arrived else now.position + moved,
-        rotation.copy() if facing else turn(turned) @ now.rotation,
+        rotation.copy() if rotation_arrived else turn(turned) @ now.rotation,
         velocity,
         spin,
     )
-    if admissible is None or admissible(step):
+    if allowed is None or allowed(step):
         return step
     held = braking(now, rates.acceleration, rates.turn_acceleration, period)
     return replace(held, rotation=step.rotation, spin=step.spin)  # limits hold for the origin; it may still turn

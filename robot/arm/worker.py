@@ -144,13 +144,14 @@ class Worker:
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
                 if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
                     return
-                found = f"{1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would have it"
-            else:
-                found = "not told"
-            if time.monotonic() > deadline:
-                raise DeviceNotConnectedError(
-                    f"arm '{self.config.name}': its tool is {found}; check model and flange_from_tool"
+                found = (
+                    f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would "
+                    "have it; check model and flange_from_tool"
                 )
+            else:
+                found = "no RTDE package with a pose arrived within 1 s"
+            if time.monotonic() > deadline:
+                raise DeviceNotConnectedError(f"arm '{self.config.name}': {found}")
             time.sleep(PERIOD)
 
     # -- the loop ------------------------------------------------------------------------------------------------

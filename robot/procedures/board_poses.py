@@ -107,7 +107,7 @@ def record_board_poses(arm: URArm, camera: FrameSource, plan: BoardPosePlan, ses
     spread = angular_spread(np.stack([rotation.as_matrix() for rotation in schedule(plan)]))
     if spread < MIN_SPREAD:
         raise CannotCalibrate(
-            f"with a tilt of {np.degrees(plan.tilt):.0f} degrees and {plan.poses} poses one direction would swing by "
+            f"with a tilt of {np.degrees(plan.tilt):.0f} degrees and {plan.poses} poses one direction would span "
             f"only {np.degrees(spread):.1f} degrees; {np.degrees(MIN_SPREAD):.0f} are needed: give a larger --tilt"
         )
     config = arm.config

@@ -80,18 +80,18 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
             arms[name] = CommandedArm(URArm(arm, name, keep_out=config.kept_out(name)), dry_run=dry_run)
             stack.callback(arms[name].close)
         cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
-        fed = {name: camera for name, camera in cameras.items() if name in cell.cameras}
+        mock_cameras = {name: camera for name, camera in cameras.items() if name in cell.cameras}
         clock: LockStep | WallClock
         if config.lock_step and not real and cell.simulated:
-            clock = LockStep(config.period, arms, fed, cell)
+            clock = LockStep(config.period, arms, mock_cameras, cell)
         elif cell.simulated:
             cell.run_free()
             clock = WallClock(config.period, cell.catch_up)
         else:
             clock = WallClock(config.period)
         for name, camera in cameras.items():  # what the normaliser finds in the picture is delivered too
-            found = normalisers[name]
-            camera.spec = replace(camera.spec, height=found.finds_height, flow=found.finds_flow)
+            normaliser = normalisers[name]
+            camera.spec = replace(camera.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
         task = config.task
         reset = HardwareReset(
             arms={} if dry_run else arms,
@@ -99,16 +99,16 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
             start=_start_poses(config, cell),
             clock=clock,
             config=config.start,
-            contact=None if dry_run else _contact(config, arms, sensors, normalisers),
+            contact=None if dry_run else _contact_measure(config, arms, sensors, normalisers),
             confirm=_confirmation(config, cell, confirm, real=bool(real) and not dry_run),
             placement=0.0 if task is None else task.placement,
         )
 
         def diagnostics() -> Mapping[str, float]:
-            found = {**cell.diagnostics(), **clock.diagnostics()}
+            values = {**cell.diagnostics(), **clock.diagnostics()}
             for name, arm in arms.items():
-                found |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
-            return found
+                values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
+            return values
 
         rig = Rig(
             name=config.name,
@@ -134,11 +134,14 @@ def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
         if arm.start is not None:
             starts[name] = arm.start.pose
         elif name not in starts:
-            raise DeviceError(f"arms.{name}.start is missing: world_from_sensor where an episode begins, clear of all")
+            raise DeviceError(
+                f"arms.{name}.start is missing: give the sensor's world pose at the start of an episode, "
+                "some cm clear of everything"
+            )
     return starts
 
 
-def _contact(
+def _contact_measure(
     config: RigConfig,
     arms: Mapping[str, CommandedArm],
     sensors: Mapping[str, TactileSource],
@@ -149,20 +152,20 @@ def _contact(
     signal = config.start.touch_signal
     if signal is not None:
 
-        def seen() -> float:
-            found = [contact_signal(normalisers[name](sensor.read(1.0), 0.0)) for name, sensor in sensors.items()]
-            return min(found) / signal
+        def contact_by_picture() -> float:
+            signals = [contact_signal(normalisers[name](sensor.read(1.0), 0.0)) for name, sensor in sensors.items()]
+            return min(signals) / signal
 
-        return seen
+        return contact_by_picture
     force = None if config.task is None else config.task.touch_force
-    carrying = [sensor.arm for sensor in config.sensors.values() if sensor.arm is not None]
-    if force is None or not carrying:
+    arms_with_sensor = [sensor.arm for sensor in config.sensors.values() if sensor.arm is not None]
+    if force is None or not arms_with_sensor:
         return None
 
-    def felt() -> float:
-        return min(-float(arms[name].state().wrench[2]) for name in carrying) / force
+    def contact_by_force() -> float:
+        return min(-float(arms[name].state().wrench[2]) for name in arms_with_sensor) / force
 
-    return felt
+    return contact_by_force
 
 
 def _gel_monitor(
@@ -171,9 +174,9 @@ def _gel_monitor(
     """Reports to the arms what their gels show, and guards the gels. Raises DeviceError for a limit that cannot be
     guarded because its sensor delivers no height or flow."""
     limits = {name: arm.limits for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
-    tell = {name: arm.driver.report_tactile for name, arm in arms.items()}
+    report = {name: arm.driver.report_tactile for name, arm in arms.items()}
     try:
-        return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, tell, SafetyViolation)
+        return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, report, SafetyViolation)
     except ValueError as failure:
         raise DeviceError(str(failure)) from None
 

@@ -236,7 +236,7 @@ def _report_hand_eye(record: BoardPoseFile, noise: Any, folder: Path) -> None:
     name, board = ("base_from_camera", "flange_from_board") if fixed else ("flange_from_camera", "base_from_board")
     results.print(
         f"{name}: ± {1e3 * place:.3f} mm, ± {math.degrees(turn):.3f} deg; scatter {fit.scatter:.2f} of what the noise "
-        f"allows; the flange's directions swing by {math.degrees(fit.spread):.0f} deg"
+        f"allows; the flange's directions span {math.degrees(fit.spread):.0f} deg"
     )
     results.print(f"  {name}: {_placement(fit.camera)}", markup=False)
     report = {

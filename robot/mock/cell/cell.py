@@ -49,10 +49,10 @@ class MockCell(Closing):
             name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
         }
         self._frames = {name: ArmFrames.of(arm) for name, arm in self._arms.items()}
-        self._carried: dict[str, str] = {}  # by arm: the sensor on it
+        self._sensor_on: dict[str, str] = {}  # by arm: the sensor on it
         for name, sensor in config.sensors.items():
             if sensor.arm in self._arms:
-                self._carried.setdefault(sensor.arm, name)
+                self._sensor_on.setdefault(sensor.arm, name)
         self.faults: dict[str, FaultClient] = {}
         self.cameras: dict[str, MockCamera] = {}
         self._sim_server: SimServer | None = None
@@ -77,7 +77,7 @@ class MockCell(Closing):
                 controllers = MockArms(
                     [arm.host for arm in self._arms.values()],
                     model=[arm.model for arm in self._arms.values()],
-                    joints=[self._joints(name, arm) for name, arm in self._arms.items()],
+                    joints=[self._initial_joints(name, arm) for name, arm in self._arms.items()],
                     realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._arms.values()),
                 )
                 self._controllers = stack.enter_context(controllers)
@@ -100,13 +100,14 @@ class MockCell(Closing):
         if arm.start is not None:
             return arm.start.pose
         initial = {} if self._sim_server is None else self._sim_server.initial
-        if self._carried.get(name) not in initial:
+        if self._sensor_on.get(name) not in initial:
             raise DeviceError(
-                f"arms.{name}.start: where does an episode begin? No scene says it; give the sensor's pose"
+                f"arms.{name}.start is missing, and no scene says it: give the sensor's world pose at the start of an "
+                "episode"
             )
-        return initial[self._carried[name]]
+        return initial[self._sensor_on[name]]
 
-    def _joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
+    def _initial_joints(self, name: str, arm: UrArmConfig) -> Sequence[float]:
         """Joints at power-on [rad]: by the rig file, else such that the sensor is at its start; of all postures the one
         farthest from a singularity."""
         if arm.mock is not None and arm.mock.joints is not None:
@@ -152,13 +153,13 @@ class MockCell(Closing):
     def poses(self) -> dict[str, Pose]:
         """world_from_sensor of the sensor that each mock arm carries, as the controllers have it."""
         found = {}
-        for arm, sensor in self._carried.items():
+        for arm, sensor in self._sensor_on.items():
             frames, tool = self._frames[arm], matrix(np.array(self.faults[arm].state().pose))
             found[sensor] = pose_of(frames.world_from_base @ tool @ frames.tool_from_sensor)
         return found
 
     def place(self) -> None:
-        """A person's part: puts a fresh body between the sensors. Raises SimServerError."""
+        """Puts a fresh body between the sensors, as a person does at a real rig. Raises SimServerError."""
         if self._sim_server is not None:
             with self._lock:
                 self._distribute(self._sim_server.place(self.poses()))
@@ -176,7 +177,7 @@ class MockCell(Closing):
 
     def _distribute(self, scene_frame: SceneFrame, pause: float = 0.0) -> Mapping[str, int]:
         self._scene_frame = scene_frame
-        for arm, sensor in self._carried.items():
+        for arm, sensor in self._sensor_on.items():
             if sensor in scene_frame.wrenches:
                 self.faults[arm].wrench(self._at_tool(arm, scene_frame.wrenches[sensor]).tolist())
         time.sleep(pause)
@@ -195,7 +196,7 @@ class MockCell(Closing):
     # ---------------------------------------------------------- running free
 
     def run_free(self) -> None:
-        """From now on steps as fast as it can, in a thread."""
+        """The simulation follows the arms in a thread from now on, as fast as it can."""
         if self._sim_server is not None and self._follower is None:
             self._follower = threading.Thread(target=self._follow, name="mock cell", daemon=True)
             self._follower.start()
@@ -214,7 +215,7 @@ class MockCell(Closing):
     def check(self) -> None:
         """Raises DeviceError if the thread that follows the arms has failed."""
         if self._failure is not None:
-            raise DeviceError(f"the mock cell follows the arms no more: {self._failure}") from self._failure
+            raise DeviceError(f"the simulation of the mock cell stopped: {self._failure}") from self._failure
 
     def _follow(self) -> None:
         try:

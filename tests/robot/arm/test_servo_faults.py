@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import STATE, ArmStatus, Partner, tactile_record
-from robot.arm.servo import HARD, Servo
+from robot.arm.servo import FAULT_DECELERATION, Servo
 from robot.arm.shared_ring import Record
 from tests.robot.arm.servo_bench import Bench, shifted, worker_config
 
@@ -26,7 +26,7 @@ def test_too_much_force_stops_from_the_measured_pose() -> None:
     bench.run(100, force=(0.0, 0.0, 31.0, 0.0, 0.0, 0.0))
     after = bench.path()[count:, 2]
     assert bench.servo.status == ArmStatus.FORCE_LIMIT
-    assert after.min() >= here - 0.12**2 / (2 * HARD) - 1e-6
+    assert after.min() >= here - 0.12**2 / (2 * FAULT_DECELERATION) - 1e-6
     assert bench.servo.resting
     bench.ask(shifted(bench.at, 0.0, 0.0, -0.1))
     bench.run(50)  # the force is gone, the fault is not
@@ -133,7 +133,7 @@ def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
         here = bench.at.position[2]
         bench.run(100)
         assert (bench.servo.status == ArmStatus.GEL_LIMIT) == stops
-        assert (bench.at.position[2] < here - 0.12**2 / (2 * HARD) - 1e-4) == (not stops)
+        assert (bench.at.position[2] < here - 0.12**2 / (2 * FAULT_DECELERATION) - 1e-4) == (not stops)
 
 
 def test_an_arm_is_not_called_well_before_it_was_looked_at() -> None:

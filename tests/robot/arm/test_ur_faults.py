@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.arm.channel import HISTORY, ArmStatus
-from robot.arm.servo import HARD
+from robot.arm.servo import FAULT_DECELERATION
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.errors import (
@@ -62,7 +62,7 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR, measuring:
         # No further approach: after the fault the target lies no deeper than the arm's own braking path.
         height, ticks = sensor_path(arm, servo_targets(sent))[:, 2, 3], servo_ticks(sent)
         late = ticks > round(float(first["stamp"]) / PERIOD) + ahead  # a period after that package was sent
-        braking = float(np.sum(first["tcp_speed"][:3] ** 2)) / (2 * HARD)
+        braking = float(np.sum(first["tcp_speed"][:3] ** 2)) / (2 * FAULT_DECELERATION)
         deeper = height[late] < float(first["position"][2]) - braking - 1e-5
         figure("approach commands later than 2 ms after the package", deeper.sum())
         figure("standstill, from 50 mm/s", 1e3 * float(rest["stamp"] - first["stamp"]), "ms", at_most=150)
@@ -71,7 +71,7 @@ def test_force_limit_stops_in_the_period_of_its_package(mock: MockUR, measuring:
         figure("force beyond the limit, wall of 2 N/mm at 50 mm/s", over, "N", at_most=2)
         of_that_package = seen[seen["stamp"] == first["stamp"]]
         assert (of_that_package["status"] == ArmStatus.FORCE_LIMIT).any()  # published before the next package
-        deepest_allowed = float(first["position"][2]) - speed**2 / (2 * HARD) - 1e-5
+        deepest_allowed = float(first["position"][2]) - speed**2 / (2 * FAULT_DECELERATION) - 1e-5
         assert height[-1] >= deepest_allowed
         jump = int(np.argmax(np.diff(height)))  # where the target is drawn back to the arm
         assert (height[jump + 1 :] >= deepest_allowed).all()

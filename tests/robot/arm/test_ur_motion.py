@@ -34,6 +34,7 @@ from tests.robot.arm.mocked import (
     outside,
     records,
     servo_targets,
+    servo_ticks,
     until,
 )
 
@@ -164,10 +165,10 @@ def test_hostile_targets_are_hostile() -> None:
     assert len(np.unique(hostile(1_000, 0.0, 100)[:, :3], axis=0)) == 10
 
 
-def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> np.ndarray:
-    """Joints (n, 6) that the controller was really sent meanwhile."""
+def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (n, 6) that the controller was really sent meanwhile, and the control periods (n,) in which they came."""
     since = mock.faults.received().last
-    joints = []
+    joints, ticks = [], []
     for k, target in enumerate(targets):
         # Past the guards of the driver: the worker must stand alone.
         arm._channel.commands.write(command_record(time.monotonic(), CommandKind.TARGET, target))
@@ -177,36 +178,38 @@ def send_hostile(arm: URArm, mock: MockUR, targets: np.ndarray) -> np.ndarray:
             assert page.lost == 0
             since = page.last
             joints.append(servo_targets(page.entries))
+            ticks.append(servo_ticks(page.entries))
     arm.stop()
     until(arm.at_rest, "rest")
-    sent = np.concatenate([*joints, servo_targets(mock.faults.received(since).entries)])
+    rest = mock.faults.received(since).entries
+    sent = np.concatenate([*joints, servo_targets(rest)])
     record = arm._channel.states.latest()
     assert record is not None and record["rejected"] > 0 and record["shortened"] > 0
     assert len(sent) > len(targets) / 100
     assert np.isfinite(sent).all()
     assert not arm.status().is_fault
     assert mock.faults.state().program
-    return sent
+    return sent, np.concatenate([*ticks, servo_ticks(rest)])
 
 
 @pytest.mark.promise(1, 2)
 def test_hostile_targets_leave_no_trace_beyond_the_limits(mock: MockUR, measuring: bool, figure: Record) -> None:
     given = config(realtime=measuring, limits={**SLOPED, "speed": 0.5, "acceleration": 5.0})
     with URArm(given, "left") as arm:
-        sent = send_hostile(arm, mock, hostile(5_000, 0.02, 500) if measuring else hostile(1_000, 0.2, 200))
+        sent, ticks = send_hostile(arm, mock, hostile(5_000, 0.02, 500) if measuring else hostile(1_000, 0.2, 200))
         share = of_limits(arm, sent)
         figure("of 5,000 hostile actions over the wire, received targets outside", outside(arm, sent))
         figure("fastest received target, of the limit", 100 * share["speed"], "%", at_most=101, promise=2)
         figure("largest acceleration received, of the limit", 100 * share["acceleration"], "%", at_most=101, promise=2)
         figure("largest joint step received, of the limit", 100 * share["joint step"], "%", at_most=100.1, promise=2)
-        check_path(arm, sent)
+        check_path(arm, sent, None if measuring else ticks)
 
 
 @pytest.mark.deep
 @pytest.mark.timeout(900)
 def test_a_hundred_thousand_hostile_targets(mock: MockUR) -> None:
     with URArm(config(limits={**SLOPED, "speed": 0.5, "acceleration": 5.0}), "left") as arm:
-        check_path(arm, send_hostile(arm, mock, hostile(100_000, 0.4, 1)))
+        check_path(arm, *send_hostile(arm, mock, hostile(100_000, 0.4, 1)))
 
 
 @pytest.mark.promise(1)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Self
 
 MOCK_SERIAL = "00000000001"  # of mock controllers; no real arm has it, so a driver can tell
 
 
-class Closing:
+class Closing(ABC):
     """A context manager that closes itself at the end of its block."""
 
-    def close(self) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def close(self) -> None: ...
 
     def __enter__(self) -> Self:
         return self

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robot.mock import FaultClient, MockCamera
+from robot.mock import MockCamera, MockState
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import SensorModel
 from tacsim.optics.render import Renderer
+from tests.robot.procedures.seen_arm import SeenArm
 
 GEL = (16e-3, 16e-3)  # [m]
 SPACING = 0.25e-3
 
 
-class BallOnPost:
+class BallOnPost(SeenArm):
     """While open, draws what the camera in the gel sees of the ball where the arm rests.
 
     No picture comes while it moves, nor before the new one is drawn: none of another pose is taken for it, however slow
@@ -36,13 +35,12 @@ class BallOnPost:
         base_from_ball: np.ndarray,
         ball_radius: float,
     ) -> None:
-        self._host, self._camera, self._radius = host, camera, ball_radius
-        self._sensor, self._ball = flange_from_sensor, base_from_ball
+        super().__init__(host, camera)
+        self._sensor, self._ball, self._radius = flange_from_sensor, base_from_ball, ball_radius
         self._render = Renderer(model, GEL)
         axis = SPACING * (np.arange(round(GEL[0] / SPACING) + 1)) - GEL[0] / 2
         self._x, self._y = np.meshgrid(axis, axis, indexing="ij")
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._draw)
+        self._shown: tuple[float, ...] | None = None  # the pose of the TCP that the picture belongs to
         self.deepest = 0.0  # that the gel was pressed [m]
         camera.push(self.picture(0.0, 0.0, -1e-3))
 
@@ -60,31 +58,14 @@ class BallOnPost:
         values[..., 2] = -dent
         return self._render(GelSurface(values, SPACING, (-GEL[0] / 2, -GEL[1] / 2)))
 
-    def _draw(self) -> None:
-        faults, shown = FaultClient(self._host), None  # the pose of the TCP that the picture belongs to
-        while not self._over.is_set():
-            try:
-                state = faults.state()
-            except RuntimeError:  # the controller comes and goes with the rig
-                self._over.wait(0.02)
-                continue
-            flange = Pose(np.array(state.pose[:3]), Rotation.from_rotvec(state.pose[3:]).as_quat())
-            x, y, z = se3.transform(se3.inverse(se3.compose(flange, self._sensor)), self._ball)
-            self.deepest = max(self.deepest, self._radius - z)
-            if not state.rests or state.pose != shown:
-                self._camera.stall(True)
-                shown = None
-                if state.rests:
-                    self._camera.push(self.picture(x, y, self._radius - z))
-                    self._camera.stall(False)
-                    shown = state.pose
-            self._over.wait(2e-3)
-        faults.close()
-
-    def __enter__(self) -> BallOnPost:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._over.set()
-        self._thread.join()
+    def draw(self, state: MockState) -> None:
+        flange = Pose(np.array(state.pose[:3]), Rotation.from_rotvec(state.pose[3:]).as_quat())
+        x, y, z = se3.transform(se3.inverse(se3.compose(flange, self._sensor)), self._ball)
+        self.deepest = max(self.deepest, self._radius - z)
+        if not state.rests or state.pose != self._shown:
+            self._camera.stall(True)
+            self._shown = None
+            if state.rests:
+                self._camera.push(self.picture(x, y, self._radius - z))
+                self._camera.stall(False)
+                self._shown = state.pose

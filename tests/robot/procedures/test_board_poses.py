@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from typer.testing import CliRunner
 
 from calibration.poses.records import board_pose_file, write_record
 from robot.cli import app
-from robot.mock import FaultClient, MockCamera
+from robot.mock import MockCamera, MockState
 from robot.mock.fixtures import mock_host
 from robot.procedures.board_poses import BoardPosePlan, record_board_poses, schedule
 from robot.procedures.session import CannotCalibrate, Session
@@ -24,6 +23,7 @@ from tacsim.interface import Pose
 from tests.calibration.boards import CHARUCO, LENS, facing, photograph
 from tests.calibration.poses.test_hand_eye import CAMERA, made_sights
 from tests.calibration.touches import posed
+from tests.robot.procedures.seen_arm import SeenArm
 
 WIDE = {"COLUMNS": "200"}
 RIG = """
@@ -91,42 +91,25 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
         assert not (tmp_path / "out").exists()
 
 
-class Eye:
+class Eye(SeenArm):
     """Draws what a camera on the flange sees of a board that stands fixed; no picture comes while the arm moves."""
 
     def __init__(self, host: str, camera: MockCamera, flange_from_camera: Pose, base_from_board: Pose) -> None:
-        self._host, self._camera, self._mount, self._board = host, camera, flange_from_camera, base_from_board
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._draw)
+        super().__init__(host, camera)
+        self._mount, self._board = flange_from_camera, base_from_board
+        self._shown: Pose | None = None
+        camera.stall(True)  # nothing is seen before the arm is there
 
-    def _draw(self) -> None:
-        faults, shown = FaultClient(self._host), None
-        self._camera.stall(True)  # nothing is seen before the arm is there
-        while not self._over.is_set():
-            try:
-                state = faults.state()
-            except RuntimeError:  # the controller comes and goes with the rig
-                self._over.wait(0.02)
-                continue
-            flange = posed(Rotation.from_rotvec(state.pose[3:]), state.pose[:3])  # the TCP: the rig file moves it not
-            if not state.rests:
-                self._camera.stall(True)
-                shown = None
-            elif shown is None:
-                seen = se3.relative(se3.compose(flange, self._mount), self._board)
-                self._camera.push(photograph(CHARUCO, seen))
-                self._camera.stall(False)
-                shown = flange
-            self._over.wait(4e-3)
-        faults.close()
-
-    def __enter__(self) -> Eye:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._over.set()
-        self._thread.join()
+    def draw(self, state: MockState) -> None:
+        flange = posed(Rotation.from_rotvec(state.pose[3:]), state.pose[:3])  # the TCP, which the rig file leaves there
+        if not state.rests:
+            self._camera.stall(True)
+            self._shown = None
+        elif self._shown is None:
+            seen = se3.relative(se3.compose(flange, self._mount), self._board)
+            self._camera.push(photograph(CHARUCO, seen))
+            self._camera.stall(False)
+            self._shown = flange
 
 
 @pytest.mark.deep

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,12 +11,13 @@ from typer.testing import CliRunner
 
 from calibration.poses.latency import Latency
 from robot.cli import app
-from robot.mock import FaultClient, MockCamera
+from robot.mock import MockCamera, MockState
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.procedures.session import CannotCalibrate
 from robot.procedures.taps import CONTACT_TIME, LIFTED_TIME, PAUSE, TapPlan, latency_entries, schedule, without_latency
 from tacsim.config import load_rig
 from tacsim.models.hardware import UrArmConfig
+from tests.robot.procedures.seen_arm import SeenArm
 
 WIDTH, HEIGHT = 64, 48
 DELAY = 0.15  # of the camera [s]
@@ -113,33 +113,12 @@ sensors:
 """
 
 
-class Hand:
+class Hand(SeenArm):
     """Draws what a camera in the gel would see: the deeper the arm, the brighter the picture."""
 
-    def __init__(self, host: str, camera: MockCamera) -> None:
-        self._door, self._camera, self._over = FaultClient(host), camera, threading.Event()
-        self._thread = threading.Thread(target=self._draw)
-
-    def _draw(self) -> None:
-        deep = None
-        while not self._over.is_set():
-            try:
-                height = self._door.state().pose[2]
-            except RuntimeError:  # the controller comes and goes with the rig
-                self._over.wait(0.02)
-                continue
-            deep = max(0.0, height - 0.3)  # the base stands 300 mm below the surface [m]
-            self._camera.push(np.full((HEIGHT, WIDTH, 3), 100 + min(100, int(1e5 * deep)), np.uint8))
-            self._over.wait(4e-3)
-        self._door.close()
-
-    def __enter__(self) -> Hand:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._over.set()
-        self._thread.join()
+    def draw(self, state: MockState) -> None:
+        deep = max(0.0, state.pose[2] - 0.3)  # the base stands 300 mm below the surface [m]
+        self._camera.push(np.full((HEIGHT, WIDTH, 3), 100 + min(100, int(1e5 * deep)), np.uint8))
 
 
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")

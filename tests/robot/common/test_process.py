@@ -134,7 +134,7 @@ def test_a_child_answers_until_it_is_closed_and_leaves_nothing(child: Callable[[
     ("act", "words"),
     [
         ("raise ValueError('so and so')", "^stand-in: ValueError: so and so$"),
-        ("print('last words'); os._exit(7)", "(?s)has ended, exit status 7; start another.*last words"),
+        ("print('last words', flush=True); os._exit(7)", "(?s)has ended, exit status 7; start another.*last words"),
         ("parent._answers.write(b'x' * 8 + b'\\n'); parent._answers.flush()", "sent what is no message"),
         ("parent._answers.close(); time.sleep(600)", "has ended, exit status None"),  # closed its end, but lives on
     ],

@@ -116,15 +116,17 @@ def test_all_fields_of_a_state_are_of_one_instant(arm: URArm) -> None:
 def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm, figure: Record) -> None:
     """As a policy looks, all the time and in motion: whatever is read is of one package."""
     start, states = arm.state().pose, arm._channel.states
-    seen, times = np.zeros(LOOKS, STATE), np.zeros(LOOKS)
-    for look in range(LOOKS):
-        if look % (LOOKS // 4) == 0:  # a new target, so that it never rests
-            arm.command(moved(start, x=0.1 * (1 - look // (LOOKS // 4) % 2)))
-        begun = time.perf_counter_ns()
-        record = states.latest()
-        times[look] = time.perf_counter_ns() - begun
-        seen[look] = record
-    packages, first, of = np.unique(seen["stamp"], return_index=True, return_inverse=True)
+    seen, times = np.zeros(0, STATE), np.zeros(0)
+    while len(seen) < LOOKS or len(np.unique(seen["stamp"])) <= 100:  # a fast machine looks more often at each package
+        arm.command(moved(start, x=0.1 * (1 - len(seen) // (LOOKS // 4) % 2)))  # a new target, so that it never rests
+        records, took = np.zeros(LOOKS // 4, STATE), np.zeros(LOOKS // 4)
+        for look in range(len(records)):
+            begun = time.perf_counter_ns()
+            record = states.latest()
+            took[look] = time.perf_counter_ns() - begun
+            records[look] = record
+        seen, times = np.concatenate((seen, records)), np.concatenate((times, took))
+    _, first, of = np.unique(seen["stamp"], return_index=True, return_inverse=True)
     flange_from_tool = se3.to_matrix(arm.config.flange_from_tool.pose)
     apart = [
         np.abs(KINEMATICS.forward(record["joints"], flange_from_tool) - matrix(record["tcp_pose"])).max()
@@ -135,7 +137,6 @@ def test_a_hundred_thousand_looks_and_none_is_torn(arm: URArm, figure: Record) -
         torn |= (seen[field] != seen[field][first][of]).any(axis=1)  # against another look at the same package
     figure("torn records in 100,000 looks", torn.sum())
     figure("one look at the state", np.median(times) / 1e3, "µs", at_most=5, promise=13)
-    assert len(packages) > 100
     assert not torn.any()
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -133,7 +135,7 @@ TACTILE = np.dtype([("exposed", np.float64), ("depth", np.float64), ("shear", np
 class Partner:
     """The other arm of a keep-out."""
 
-    segment: str
+    segment: int  # descriptor of its memory
     distance: float  # [m]
 
 
@@ -147,7 +149,7 @@ class WorkerConfig:
     refused_serial: str | None  # serial number of a mock controller; set for a real arm
     realtime: bool  # ask for real-time priority
     parent: int  # process id of the driver
-    segment: str
+    segment: int  # descriptor of its memory
     world_from_base: list[list[float]]
     flange_from_tool: list[list[float]]
     tool_from_sensor: list[list[float]]
@@ -197,6 +199,19 @@ class Channel:
         self.states = shared_ring.Ring(view[: self._STATES], STATE, HISTORY)
         self.commands = shared_ring.Ring(view[self._STATES : self._BOTH], COMMAND, COMMAND_SLOTS)
         self.tactile = shared_ring.Ring(view[self._BOTH :], TACTILE, TACTILE_SLOTS)
+
+
+_segments: WeakValueDictionary[str, shared_ring.Segment] = WeakValueDictionary()
+_segments_lock = threading.Lock()
+
+
+def segment_of(arm: str) -> shared_ring.Segment:
+    """The memory of an arm of this process: made when it or an arm that keeps its distance from it is opened, and gone
+    when none of them is open any more. Raises OSError."""
+    with _segments_lock:
+        segment = _segments.get(arm) or shared_ring.create(Channel.SIZE)
+        _segments[arm] = segment
+        return segment
 
 
 def command_record(time: float, kind: CommandKind, pose: FloatArray | None = None) -> shared_ring.Record:

@@ -7,26 +7,22 @@ and whose readers hardly ever repeat, and it keeps the last records.
 This relies on the memory order of x86-64, which keeps the order of stores, and of loads (Intel SDM 3A, 8.2.2), and in
 which an aligned 8-byte store is atomic. ur_rtde has wheels for nothing else; on other processors :func:`create` raises.
 
-A segment is a mapped file in the system's shared memory folder, owned by the process that made it, whose id is in its
-name. multiprocessing.shared_memory is not used: before Python 3.13 its resource tracker also removes segments that a
-dying process had only attached. Here the owner removes its segments when it closes, a worker those of an owner that
-died, and :func:`sweep` whatever is left.
+A segment is memory that has a descriptor and no name: it is handed to a child process by that number (`pass_fds`),
+nobody else can open or replace it, and it is gone when the last process that holds it is, however that one ended.
 """
 
 from __future__ import annotations
 
-import contextlib
+import fcntl
 import mmap
 import os
 import platform
 import tempfile
-from pathlib import Path
+import weakref
 
 import numpy as np
 from numpy.typing import NDArray
 
-PREFIX = "tacsim"
-FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
 _HEAD = 64  # bytes before the slots: the count, on a cache line of its own
 
 Record = NDArray[np.void]  # one record (shape ()) or several (n,)
@@ -84,70 +80,23 @@ class Ring:
 
 
 class Segment:
-    """A piece of shared memory. Its owner (:func:`create`) removes it in `close`; who attached does not."""
+    """The shared memory behind `descriptor`, which it closes when nobody holds it any more; a ring keeps the memory."""
 
-    def __init__(self, path: Path, memory: mmap.mmap, *, owned: bool) -> None:
-        self.name, self.memory = path.name, memory
-        self._path, self._owned = path, owned
-
-    def close(self) -> None:
-        """Releases the memory, and removes it if owned. A ring that is still held keeps the memory mapped."""
-        if self._owned:
-            self.remove()
-        with contextlib.suppress(BufferError):  # a ring still uses it
-            self.memory.close()
-
-    def remove(self) -> None:
-        """Removes the name; processes that are attached stay so."""
-        self._path.unlink(missing_ok=True)
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        weakref.finalize(self, os.close, descriptor)
+        self.memory = mmap.mmap(descriptor, 0)
 
 
-def segment_name(owner: int, arm: str) -> str:
-    """The name of the segment that process `owner` makes for `arm`."""
-    return f"{PREFIX}-{owner}-{arm}"
-
-
-def create(name: str, size: int) -> Segment:
-    """A new zeroed segment. Raises FileExistsError if the name is taken, OSError on a processor other than x86-64."""
+def create(size: int) -> Segment:
+    """A new zeroed segment. Raises OSError where there is no such memory, or a processor other than x86-64."""
     if platform.machine().lower() not in ("x86_64", "amd64"):
         raise OSError(f"records in shared memory need the store order of x86-64; this is {platform.machine()}")
-    path = FOLDER / name
-    with path.open("x+b") as file:
-        try:
-            path.chmod(0o600)
-            file.truncate(size)
-            if hasattr(os, "posix_fallocate"):  # a full folder is an error here, not a bus error later
-                os.posix_fallocate(file.fileno(), 0, size)
-            return Segment(path, mmap.mmap(file.fileno(), size), owned=True)
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise
-
-
-def attach(name: str) -> Segment:
-    """A segment that another process made. Raises FileNotFoundError."""
-    path = FOLDER / name
-    with path.open("r+b") as file:
-        return Segment(path, mmap.mmap(file.fileno(), 0), owned=False)
-
-
-def sweep() -> list[str]:
-    """Removes segments whose owner is gone; returns their names. Containers that share this folder but not the process
-    ids would remove each other's segments: give them separate folders."""
-    removed = []
-    for path in FOLDER.glob(f"{PREFIX}-*-*"):
-        owner = path.name.split("-")[1]
-        if owner.isdigit() and not _alive(int(owner)):
-            path.unlink(missing_ok=True)
-            removed.append(path.name)
-    return removed
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True
+    with (
+        os.fdopen(os.memfd_create("tacsim"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile() as file
+    ):
+        file.truncate(size)
+        if hasattr(os, "posix_fallocate"):  # memory that is missing is an error here, not a bus error later
+            os.posix_fallocate(file.fileno(), 0, size)
+        # Above 2: in a child those are its standard streams, also where this program was started without them.
+        return Segment(fcntl.fcntl(file.fileno(), fcntl.F_DUPFD_CLOEXEC, 3))

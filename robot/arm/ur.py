@@ -8,7 +8,6 @@ belong in the safety configuration on the pendant.
 from __future__ import annotations
 
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -16,9 +15,18 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from robot.arm import shared_ring
-from robot.arm.channel import HISTORY, ArmStatus, Channel, CommandKind, command_record, tactile_record
+from robot.arm.channel import (
+    HISTORY,
+    ArmStatus,
+    Channel,
+    CommandKind,
+    Partner,
+    command_record,
+    segment_of,
+    tactile_record,
+)
 from robot.arm.dashboard import Dashboard
+from robot.arm.shared_ring import Record
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
 from robot.common.kinematics import Kinematics
@@ -36,6 +44,8 @@ CLOSE_TIMEOUT = 1.2  # for the worker to brake and end its program; then it is k
 POLL = 2e-3  # between two looks at the worker's records while waiting [s]
 PARTNER_PATIENCE = 0.5  # how long a command waits for the state of the other arm of a keep-out [s]
 REST_SPEED, REST_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
+_open: set[str] = set()  # names of the arms that are open in this process
+_opening = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +89,17 @@ class URArm(Closing):
         self._lock = threading.RLock()
         self._closed = False
         self._worker: Child | None = None
-        shared_ring.sweep()
-        try:
-            self._segment = shared_ring.create(shared_ring.segment_name(os.getpid(), name), Channel.SIZE)
-        except FileExistsError as failure:
-            raise DeviceAlreadyConnectedError(f"arm '{name}' is open already; close it first") from failure
-        self._channel = Channel(self._segment)
-        self._worker_config = worker_config(config, name, self._segment.name, keep_out or {})
+        # Those of the other arms are held, too: they may be opened, closed and opened again meanwhile.
+        self._segments = [segment_of(arm) for arm in (name, *(keep_out or {}))]
+        gaps = (keep_out or {}).values()
+        partners = [Partner(each.descriptor, gap) for each, gap in zip(self._segments[1:], gaps, strict=True)]
+        self._channel, *self._others = map(Channel, self._segments)
+        self._worker_config = worker_config(config, name, self._segments[0].descriptor, partners)
         self._frames = self._worker_config.frames
-        self._others: dict[str, Channel] = {}
+        with _opening:
+            if name in _open:
+                raise DeviceAlreadyConnectedError(f"arm '{name}' is open already; close it first")
+            _open.add(name)
         try:
             self._start()
             status = self.status()
@@ -225,16 +237,18 @@ class URArm(Closing):
                 return
             self._end_worker()
             self._closed = True
-            self._others.clear()
-            del self._channel
-            self._segment.close()
+            del self._channel, self._others, self._segments
+            _open.discard(self.name)
 
     # -- the worker ----------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
         """Starts a worker and waits until it is connected."""
         self._worker = Child(
-            "robot.arm.worker", name=f"the worker of arm '{self.name}'", advice="see why, then recover()"
+            "robot.arm.worker",
+            name=f"the worker of arm '{self.name}'",
+            advice="see why, then recover()",
+            descriptors=[segment.descriptor for segment in self._segments],
         )
         deadline = time.monotonic() + self._timeout
         try:
@@ -274,7 +288,7 @@ class URArm(Closing):
 
     # -- records -------------------------------------------------------------------------------------------------
 
-    def _record(self) -> shared_ring.Record:
+    def _record(self) -> Record:
         """The newest record. Raises unless it is fresh."""
         status = self.status()
         record = None if self._closed else self._channel.states.latest()
@@ -288,17 +302,17 @@ class URArm(Closing):
             raise self._error(status)
         return record
 
-    def _packages(self, number: int) -> shared_ring.Record:
+    def _packages(self, number: int) -> Record:
         """The newest records, one a package, oldest first."""
         if self._closed:
             raise self._error(ArmStatus.CLOSED)
         records = self._channel.states.recent(HISTORY - 1)
         records = records[records["stamp"] != 0.0]
         first = np.flatnonzero(np.diff(records["time"], prepend=-np.inf) > 0.0)
-        kept: shared_ring.Record = records[first][-number:]
+        kept: Record = records[first][-number:]
         return kept
 
-    def _state(self, record: shared_ring.Record) -> ArmState:
+    def _state(self, record: Record) -> ArmState:
         now = self._frames.measure(record)
         return ArmState(
             pose=pose_of(now.sensor),
@@ -319,10 +333,8 @@ class URArm(Closing):
     def _spheres(self) -> list[tuple[np.ndarray, float]]:
         """Positions (3,) of the other arms [m], and the keep-out distance to each [m]."""
         spheres = []
-        for partner in self._worker_config.partners:
-            if partner.segment not in self._others:
-                self._others[partner.segment] = Channel(shared_ring.attach(partner.segment))
-            record = self._others[partner.segment].states.latest()
+        for partner, channel in zip(self._worker_config.partners, self._others, strict=True):
+            record = channel.states.latest()
             if record is not None:
                 spheres.append((record["position"], partner.distance))
         return spheres
@@ -346,6 +358,6 @@ class URArm(Closing):
 _DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStatus.PROGRAM_STOPPED)
 
 
-def _fresh(record: shared_ring.Record, now: float, link_timeout: float) -> bool:
+def _fresh(record: Record, now: float, link_timeout: float) -> bool:
     """True if the newest package is fresh, or the worker is in a call of the controller that may take this long."""
     return now <= max(float(record["time"]) + link_timeout + 5 * POLL, float(record["busy_until"]))

@@ -22,10 +22,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from robot.arm import shared_ring
 from robot.arm.channel import STATE, ArmStatus, Channel, WorkerConfig
 from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
+from robot.arm.shared_ring import Segment
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, displacement
 from robot.common.process import Parent
@@ -64,11 +64,10 @@ class Worker:
     def __init__(self, config: WorkerConfig) -> None:
         self.config = config
         self.frames = config.frames
-        self.segment = shared_ring.attach(config.segment)
-        self.channel = Channel(self.segment)
+        self.channel = Channel(Segment(config.segment))
         self.record = np.zeros((), STATE)
         self.record["top_speed"] = config.speed
-        self.partners: list[Channel | None] = [None] * len(config.partners)
+        self.partners = [Channel(Segment(partner.segment)) for partner in config.partners]
         self.servo = Servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(WINDOW, PERIOD)
         self._last = 0.0  # when the last period ended
@@ -100,7 +99,7 @@ class Worker:
         except ImportError as failure:
             raise DeviceNotConnectedError(
                 f"arm '{config.name}' needs ur_rtde, which has no wheel for this Python ({failure}); use Python "
-                "3.11 or 3.12 on x86-64 Linux or Windows"
+                "3.11 or 3.12 on x86-64 Linux"
             ) from failure
         try:
             self.receive: Any = rtde_receive.RTDEReceiveInterface(config.host, 500.0, VARIABLES)
@@ -171,7 +170,7 @@ class Worker:
             # A process that was suspended reads again first: packages may be waiting.
             if self._rereads > 5 and now - float(self.record["time"]) > self.config.link_timeout:
                 self._publish(ArmStatus.LINK_LOST)
-                self._leave(orphan)
+                self._leave()
             partners = self._read_partners(now)
             before = self.servo.status
             stopped = self._controller_stop()
@@ -193,12 +192,12 @@ class Worker:
                     self.servo.trip(ArmStatus.CLOSED, self.state)
             if stopped is not None or self.servo.status in _CONTROLLER_STOPS:
                 if ending is not None:
-                    self._leave(orphan)
+                    self._leave()
             else:
                 self._act(now, partners)
                 if ending is not None and (self.servo.resting or now > ending):
                     self._end_program()
-                    self._leave(orphan)
+                    self._leave()
             deadline = self._sleep(deadline)
 
     def _act(self, now: float, partners: list[Any]) -> None:
@@ -257,15 +256,10 @@ class Worker:
     def _read_partners(self, now: float) -> list[Any]:
         """The newest record of each other arm; None where it is missing, too old, or not healthy."""
         seen: list[Any] = []
-        for index, partner in enumerate(self.config.partners):
-            channel = self.partners[index]
-            if channel is None and int(self.record["cycles"]) % 25 == 0:
-                with contextlib.suppress(OSError, ValueError):  # not there yet, or not complete
-                    channel = self.partners[index] = Channel(shared_ring.attach(partner.segment))
-            record = None if channel is None else channel.states.latest()
+        for partner in self.partners:
+            record = partner.states.latest()
             if record is not None and now - float(record["written"]) > self.config.link_timeout:
                 record = None
-                self.partners[index] = None  # its driver may make it again under the same name
             seen.append(record if is_healthy(record) else None)
         return seen
 
@@ -306,10 +300,8 @@ class Worker:
             self.control.servoStop(10.0)
         self.control.stopScript()
 
-    def _leave(self, orphan: bool) -> NoReturn:
+    def _leave(self) -> NoReturn:
         """Ends the process without the library's destructors, which may wait for an answer that never comes."""
-        if orphan:
-            self.segment.remove()
         os._exit(0)
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 from robot.arm.channel import Partner, WorkerConfig
-from robot.arm.shared_ring import segment_name
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import pose
 from robot.common.loopback import is_loopback
@@ -30,7 +29,7 @@ def check_host(config: UrArmConfig, name: str) -> None:
         )
 
 
-def worker_config(config: UrArmConfig, name: str, segment: str, keep_out: Mapping[str, float]) -> WorkerConfig:
+def worker_config(config: UrArmConfig, name: str, segment: int, partners: Sequence[Partner]) -> WorkerConfig:
     limits, tool = config.limits, se3.to_matrix(config.flange_from_tool.pose)
     return WorkerConfig(
         name=name,
@@ -64,5 +63,5 @@ def worker_config(config: UrArmConfig, name: str, segment: str, keep_out: Mappin
         watchdog=config.watchdog,
         lookahead=config.lookahead,
         gain=config.gain,
-        partners=[Partner(segment_name(os.getpid(), other), gap) for other, gap in keep_out.items()],
+        partners=list(partners),
     )

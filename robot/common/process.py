@@ -48,6 +48,7 @@ class Child(Closing):
         ready_timeout: waits so long [s] for the child's first message, which is then in `ready`; None does not wait.
             Raises `error` as `receive` does, with the process ended.
         first_request: what is sent before that.
+        descriptors: of this process, that the child has too, by the same numbers.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Child(Closing):
         environment: Mapping[str, str] | None = None,
         ready_timeout: float | None = None,
         first_request: dict[str, Any] | None = None,
+        descriptors: Sequence[int] = (),
     ) -> None:
         self._name, self._error, self._advice = name, error, advice
         self._lock = threading.RLock()
@@ -75,6 +77,7 @@ class Child(Closing):
             stderr=self._errors,
             start_new_session=True,  # Ctrl-C is for the parent, which ends its children in order
             env={**os.environ, **(environment or {}), "PYTHONPATH": path},
+            pass_fds=descriptors,
         )
         self.pid = self._process.pid
         self.ready: dict[str, Any] = {}

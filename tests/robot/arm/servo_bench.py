@@ -29,7 +29,7 @@ def worker_config(**changes: object) -> WorkerConfig:
         "refused_serial": None,
         "realtime": False,
         "parent": 1,
-        "segment": "none",
+        "segment": -1,
         "world_from_base": EYE,
         "flange_from_tool": EYE,
         "tool_from_sensor": sensor.tolist(),

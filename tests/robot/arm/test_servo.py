@@ -151,7 +151,7 @@ def test_joint_steps_and_singularities_slow_it_down() -> None:
 
 
 def test_a_worker_config_travels_as_json() -> None:
-    given = worker_config(partners=[Partner("a", 0.1)], planes=[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    given = worker_config(partners=[Partner(-1, 0.1)], planes=[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     assert WorkerConfig.of(json.loads(json.dumps(dataclasses.asdict(given)))) == given
 
 

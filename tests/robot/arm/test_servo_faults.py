@@ -60,7 +60,7 @@ def other(position: list[float], stop: list[float] | None = None, status: ArmSta
 
 @pytest.mark.promise(15)
 def test_another_arm_is_not_come_near_and_parting_is_free() -> None:
-    bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
+    bench = Bench(action_timeout=60.0, partners=[Partner(-1, 0.05)])
     start = bench.at
     bench.partners = [other(list(start.position + [0.1, 0.0, 0.0]))]
     bench.ask(shifted(start, 0.15))
@@ -75,7 +75,7 @@ def test_another_arm_is_not_come_near_and_parting_is_free() -> None:
 
 @pytest.mark.promise(15)
 def test_the_braking_way_of_the_other_arm_counts() -> None:
-    bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
+    bench = Bench(action_timeout=60.0, partners=[Partner(-1, 0.05)])
     start = bench.at
     bench.partners = [other(list(start.position + [0.2, 0, 0]), list(start.position + [0.08, 0, 0]))]
     bench.ask(shifted(start, 0.1))
@@ -85,7 +85,7 @@ def test_the_braking_way_of_the_other_arm_counts() -> None:
 
 @pytest.mark.parametrize("partner", [None, ArmStatus.PROTECTIVE_STOP, ArmStatus.CONNECTING])
 def test_without_a_sound_partner_it_waits_and_a_moving_arm_stops(partner: ArmStatus | None) -> None:
-    bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
+    bench = Bench(action_timeout=60.0, partners=[Partner(-1, 0.05)])
     start = bench.at
     sound = other(list(start.position + [0.3, 0, 0]))
     lost = None if partner is None else other(list(start.position + [0.3, 0, 0]), status=partner)

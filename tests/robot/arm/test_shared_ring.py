@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,8 @@ ROOT = str(Path(shared_ring.__file__).parents[2])
 
 
 @pytest.fixture
-def segment() -> Iterator[shared_ring.Segment]:
-    made = shared_ring.create(shared_ring.segment_name(os.getpid(), "test"), shared_ring.Ring.size(RECORD, 8))
-    yield made
-    made.close()
+def segment() -> shared_ring.Segment:
+    return shared_ring.create(shared_ring.Ring.size(RECORD, 8))
 
 
 def record(value: float) -> shared_ring.Record:
@@ -32,10 +30,11 @@ def record(value: float) -> shared_ring.Record:
     return made
 
 
-def child(code: str, *arguments: str) -> subprocess.Popen[str]:
+def child(code: str, segment: shared_ring.Segment, *arguments: str) -> subprocess.Popen[str]:
     text = "import sys, time, os, numpy as np\nfrom robot.arm import shared_ring\n" + textwrap.dedent(code)
     return subprocess.Popen(
-        [sys.executable, "-c", text, *arguments],
+        [sys.executable, "-c", text, str(segment.descriptor), *arguments],
+        pass_fds=[segment.descriptor],
         env={**os.environ, "PYTHONPATH": ROOT},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -53,8 +52,6 @@ def test_records_in_order_and_the_past_that_fits(segment: shared_ring.Segment) -
         assert newest is not None and newest["b"] == value
     assert ring.recent(100)["b"].tolist() == [14, 15, 16, 17, 18, 19, 20]  # the slot in danger is left out
     assert ring.recent(3)["b"].tolist() == [18, 19, 20]
-    del ring
-    segment.close()
 
 
 @pytest.mark.promise(10)
@@ -63,7 +60,7 @@ def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> Non
     writer = child(
         """
         record = np.dtype([("a", np.float64, 40), ("b", np.uint64)])
-        ring = shared_ring.Ring(shared_ring.attach(sys.argv[1]).memory, record, 8)
+        ring = shared_ring.Ring(shared_ring.Segment(int(sys.argv[1])).memory, record, 8)
         value, made = 0, np.zeros((), record)
         print("writing", flush=True)
         while os.getppid() == int(sys.argv[2]):
@@ -71,7 +68,7 @@ def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> Non
             made["a"], made["b"] = value, value
             ring.write(made)
         """,
-        segment.name,
+        segment,
         str(os.getpid()),
     )
     try:
@@ -98,41 +95,44 @@ def test_no_torn_read_in_a_hundred_thousand(segment: shared_ring.Segment) -> Non
     finally:
         writer.kill()
         writer.communicate()
-        ring = None  # type: ignore[assignment]
-        segment.close()
 
 
-def test_who_only_attached_leaves_the_segment_alone(segment: shared_ring.Segment) -> None:
-    code = "segment = shared_ring.attach(sys.argv[1])\nprint(len(segment.memory), flush=True)\n"
-    assert child(code, segment.name).communicate(timeout=60)[0].strip() == str(len(segment.memory))
-    killed = child(code + "time.sleep(60)\n", segment.name)
-    assert killed.stdout is not None and killed.stdout.readline()
+def descriptors() -> list[str]:
+    """What this process has open."""
+    gc.collect()
+    return sorted(str(path.readlink()) for path in Path("/proc/self/fd").iterdir() if path.exists())
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="looks at open files as Linux shows them")
+def test_it_is_gone_with_the_last_who_holds_it_however_that_one_ended() -> None:
+    """There is no file: nothing to find for others, nothing to be squatted, nothing that a kill could leave."""
+    before = descriptors()
+    segment = shared_ring.create(shared_ring.Ring.size(RECORD, 8))
+    ring = shared_ring.Ring(segment.memory, RECORD, 8)
+    ring.write(record(7.0))
+    assert all(path.endswith("(deleted)") for path in set(descriptors()) - set(before))
+    code = """
+    held = shared_ring.Segment(int(sys.argv[1]))
+    ring = shared_ring.Ring(held.memory, np.dtype([("a", np.float64, 40), ("b", np.uint64)]), 8)
+    print(int(ring.latest()["b"]), flush=True)
+    time.sleep(60)
+    """
+    killed = child(code, segment)
+    assert killed.stdout is not None and killed.stdout.readline() == "7\n"
     killed.kill()
     killed.communicate()
-    shared_ring.attach(segment.name).close()  # still there
-    segment.close()
-    with pytest.raises(FileNotFoundError):
-        shared_ring.attach(segment.name)
-    segment.close()  # twice does no harm
+    assert ring.latest() is not None
+    del segment, ring
+    assert descriptors() == before
 
 
-def test_what_a_killed_process_left_is_swept_and_nothing_else(segment: shared_ring.Segment) -> None:
-    code = "segment = shared_ring.create(shared_ring.segment_name(os.getpid(), 'gone'), 100)\n"
-    code += "print(segment.name, flush=True)\n"
-    killed = child(code + "time.sleep(60)\n")
-    assert killed.stdout is not None
-    name = killed.stdout.readline().strip()
-    assert name not in shared_ring.sweep()
-    killed.kill()
-    killed.communicate()
-    assert name in shared_ring.sweep()
-    with pytest.raises(FileNotFoundError):
-        shared_ring.attach(name)
-    shared_ring.attach(segment.name).close()
-    segment.close()
-
-
-def test_a_name_is_given_once(segment: shared_ring.Segment) -> None:
-    with pytest.raises(FileExistsError):
-        shared_ring.create(segment.name, 64)
-    segment.close()
+def test_a_child_has_it_also_where_this_program_was_started_without_standard_streams() -> None:
+    """Else it would get one of their numbers, and the child a pipe by that number."""
+    code = """
+    import os
+    os.closerange(0, 3)
+    from robot.arm import shared_ring
+    os._exit(shared_ring.create(64).descriptor)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env={**os.environ, "PYTHONPATH": ROOT})
+    assert done.returncode >= 3

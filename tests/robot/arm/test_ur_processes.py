@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm import shared_ring, ur
+from robot.arm import ur
 from robot.arm.channel import ArmStatus
 from robot.arm.ur import URArm
 from robot.common.process import Child
@@ -84,7 +84,7 @@ from tests.robot.arm.mocked import at_full_speed, moved
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where whoever runs the tests ignores it
 arm = URArm(UrArmConfig.model_validate_json(sys.argv[1]), "policy")
 at_full_speed(arm, moved(arm.state().pose, x=0.14))
-print(arm._segment.name, arm._worker.pid, flush=True)
+print(arm._worker.pid, flush=True)
 time.sleep(60)
 """
 
@@ -106,7 +106,7 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
     path = str(Path(ur.__file__).parents[2])
     with subprocess.Popen(words, env={**os.environ, "PYTHONPATH": path}, stdout=subprocess.PIPE, text=True) as policy:
         assert policy.stdout is not None
-        segment, worker = policy.stdout.readline().split()
+        worker = policy.stdout.readline()
         before, killed = mock.faults.state(), time.monotonic()
         policy.send_signal(number)
         stood = until(lambda: stands(mock.faults.state()), "standstill", pause=5e-4)
@@ -120,9 +120,8 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
         assert went < 0.05  # ten times 5 mm
     until(lambda: not mock.faults.state().program, "end of the program")
     until(lambda: 30004 not in mock.faults.state().clients, "closed sockets")
-    until(lambda: not (shared_ring.FOLDER / segment).exists(), "removed memory")
     until(lambda: not running(int(worker)), "end of the worker")
-    figure("processes, sockets, shared memory left by a killed policy", 0, promise=14)  # else one of these waits failed
+    figure("processes, sockets left by a killed policy", 0, promise=14)  # else one of these waits failed
 
 
 # -- one commander ---------------------------------------------------------------------------------------------------
@@ -138,7 +137,7 @@ def test_a_second_driver_is_refused_and_the_first_goes_on(arm: URArm, mock: Mock
     figure("DeviceBusyError", time.monotonic() - asked, "s", at_most=1)
     seen = records(arm)
     figure("first drivers that were disturbed", (seen["status"][seen["written"] > asked] != ArmStatus.OK).any())
-    assert leftovers("second") == []
+    assert leftovers() == 1
     assert arm.status() == ArmStatus.OK
     go(arm, start)
     with pytest.raises(DeviceAlreadyConnectedError, match="open already"):
@@ -168,17 +167,17 @@ def test_nothing_is_left_after_close(mock: MockUR, measuring: bool, figure: Reco
     arm = URArm(config(realtime=measuring), "left")
     at_full_speed(arm, moved(arm.state().pose, x=0.12))
     worker = arm._worker
-    assert worker is not None and leftovers("left")
+    assert worker is not None and leftovers() == 1
     asked = time.monotonic()
     arm.close()
     figure("close() under way", time.monotonic() - asked, "s", at_most=1.5)
     arm.close()
     figure(
         "processes, shared memory, files left by close()",
-        sum((running(worker.pid), len(leftovers("left")), abs(open_files() - before))),
+        sum((running(worker.pid), leftovers(), abs(open_files() - before))),
     )
     assert worker.exit_status == 0  # it ended by itself
-    assert leftovers("left") == []
+    assert leftovers() == 0
     assert open_files() == before
     until(lambda: mock.faults.state().rests, "rest")
     assert not mock.faults.state().program
@@ -202,7 +201,7 @@ def test_nothing_is_left_of_a_worker_that_died(mock: MockUR) -> None:
     until(lambda: arm.status() == ArmStatus.WORKER_DEAD, "death")
     arm.close()
     assert worker.exit_status == -signal.SIGKILL  # reaped, no zombie
-    assert leftovers("left") == []
+    assert leftovers() == 0
     assert open_files() == before
     until(lambda: not mock.faults.state().program, "the watchdog's stop")
     until(lambda: set(mock.faults.state().clients) <= {30020}, "closed sockets")
@@ -218,7 +217,7 @@ def test_a_wedged_worker_is_killed(mock: MockUR) -> None:
     arm.close()
     assert time.monotonic() - begun < 15.0  # ten times the promise
     assert worker.exit_status == -signal.SIGKILL
-    assert leftovers("left") == []
+    assert leftovers() == 0
 
 
 @pytest.mark.promise(14)
@@ -240,4 +239,4 @@ def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) 
     finally:
         signal.signal(signal.SIGINT, found)
     assert not workers[0].running
-    assert leftovers("left") == []
+    assert leftovers() == 0

@@ -23,7 +23,7 @@ ROOT = Path(worker.__file__).parents[2]
 NOBODY = f"127.223.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 
 
-def worker_config(segment: str, **changes: object) -> WorkerConfig:
+def worker_config(segment: int, **changes: object) -> WorkerConfig:
     box = Workspace(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
     config = UrArmConfig(
         driver="ur",
@@ -32,12 +32,13 @@ def worker_config(segment: str, **changes: object) -> WorkerConfig:
         limits=ArmLimits(workspace=box),
         mock=MockArmConfig(),
     )
-    return dataclasses.replace(config_of(config, "left", segment, {}), **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(config_of(config, "left", segment, []), **changes)  # type: ignore[arg-type]
 
 
 def start(config: WorkerConfig) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "robot.arm.worker"],
+        pass_fds=[config.segment],
         input=json.dumps(dataclasses.asdict(config)) + "\n",
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -80,43 +81,44 @@ def test_nobody_else_imports_the_library() -> None:
 
 
 def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:
-    segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "failing"), Channel.SIZE)
-    try:
-        done = start(worker_config(segment.name))
-        assert done.returncode == worker.FAILED
-        told = json.loads(done.stdout)
-        assert told["kind"] == "DeviceNotConnectedError"
-        assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["error"]
-        latest = Channel(segment).states.latest()
-        assert latest is not None and latest["status"] == ArmStatus.CONNECTING
-    finally:
-        segment.close()
+    segment = shared_ring.create(Channel.SIZE)
+    done = start(worker_config(segment.descriptor))
+    assert done.returncode == worker.FAILED
+    told = json.loads(done.stdout)
+    assert told["kind"] == "DeviceNotConnectedError"
+    assert f"no controller at {NOBODY}: port 30004 (RTDE)" in told["error"]
+    latest = Channel(segment).states.latest()
+    assert latest is not None and latest["status"] == ArmStatus.CONNECTING
 
 
 def test_without_memory_to_write_to_it_says_so() -> None:
-    done = start(worker_config("tacsim-0-missing"))
+    done = subprocess.run(
+        [sys.executable, "-m", "robot.arm.worker"],
+        input=json.dumps(dataclasses.asdict(worker_config(99))) + "\n",
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert done.returncode == worker.FAILED
-    assert "No such file" in json.loads(done.stdout)["error"]
+    assert "Bad file descriptor" in json.loads(done.stdout)["error"]
 
 
 def test_a_driver_that_died_while_it_connected_leaves_nothing(mock: MockUR) -> None:
-    """Nobody reads the worker's first message: it ends its program and removes the memory all the same."""
-    segment = shared_ring.create(shared_ring.segment_name(os.getpid(), "widow"), Channel.SIZE)
-    try:
-        given = json.dumps(dataclasses.asdict(worker_config(segment.name, host=HOST, parent=1)))  # not this process
-        reader, writer = os.pipe()
-        os.close(reader)
-        with subprocess.Popen(
-            [sys.executable, "-m", "robot.arm.worker"],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdin=subprocess.PIPE,
-            stdout=writer,
-            stderr=subprocess.PIPE,
-        ) as process:
-            os.close(writer)
-            _, errors = process.communicate(given.encode() + b"\n", timeout=PATIENCE)
-        assert (process.returncode, errors.decode()) == (0, "")
-        assert not (shared_ring.FOLDER / segment.name).exists()
-        until(lambda: not mock.faults.state().program, "end of the program")
-    finally:
-        segment.close()
+    """Nobody reads the worker's first message: it ends its program all the same."""
+    segment = shared_ring.create(Channel.SIZE)
+    config = worker_config(segment.descriptor, host=HOST, parent=1)  # not this process
+    reader, writer = os.pipe()
+    os.close(reader)
+    with subprocess.Popen(
+        [sys.executable, "-m", "robot.arm.worker"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        pass_fds=[segment.descriptor],
+        stdin=subprocess.PIPE,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+    ) as process:
+        os.close(writer)
+        _, errors = process.communicate(json.dumps(dataclasses.asdict(config)).encode() + b"\n", timeout=PATIENCE)
+    assert (process.returncode, errors.decode()) == (0, "")
+    until(lambda: not mock.faults.state().program, "end of the program")

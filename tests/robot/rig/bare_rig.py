@@ -6,6 +6,7 @@ BARE is two arms and two cameras with nothing simulated before them, which opens
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,6 @@ import numpy as np
 import pytest
 
 import robot.rig.hardware_rig
-from robot.arm.shared_ring import FOLDER
 from robot.deploy.control_loop import EpisodeFailed, run_episode
 from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.cell import MockCell
@@ -181,11 +181,13 @@ def belongings() -> tuple[int, int, int]:
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             children += stat.read_text().rpartition(")")[2].split()[1] == own
-    sockets = 0
+    gc.collect()
+    sockets = memory = 0
     for link in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
             sockets += str(link.readlink()).startswith("socket:")
-    return children, sockets, len(list(FOLDER.glob(f"*-{own}-*")))
+            memory += str(link.readlink()).startswith("/memfd:tacsim")
+    return children, sockets, memory
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts by /proc")

@@ -23,6 +23,7 @@ from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import VERSION, check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
+from robot.mock.ur.machine.load import Mass
 from robot.mock.ur.wire.controller import Controller, ControllerConfig
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     each = "once for all, or once for each host in their order"
     parser.add_argument("--model", choices=list(MODELS), action="append", help=each)
     parser.add_argument("--joints", action="append", help=f"six angles [rad], with commas; {each}")
+    parser.add_argument("--payload", action="append", help=f"kg and centre x,y,z [m] on the flange; {each}")
     parser.add_argument("--version", default=".".join(map(str, VERSION)))
     parser.add_argument("--fault-port", "--door-port", type=int, default=FAULT_PORT)
     parser.add_argument("--serial", default=MOCK_SERIAL)
@@ -122,9 +124,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tuple(float(angle) for angle in text.split(","))
             for text in _for_each(given.joints or [",".join(map(repr, HOME))], given.hosts, "postures")
         ]
+        tools = [
+            Mass.of([float(number) for number in text.split(",")])
+            for text in _for_each(given.payload or ["0,0,0,0"], given.hosts, "payloads")
+        ]
         config = [
-            ControllerConfig(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial)
-            for host, model, joints in zip(given.hosts, models, postures, strict=True)
+            ControllerConfig(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial, tool)
+            for host, model, joints, tool in zip(given.hosts, models, postures, tools, strict=True)
         ]
         serve(config, given.fault_port, with_parent=given.with_parent)
     except (OSError, ValueError) as error:

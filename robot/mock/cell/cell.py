@@ -78,6 +78,7 @@ class MockCell(Closing):
                     [arm.host for arm in self._arms.values()],
                     model=[arm.model for arm in self._arms.values()],
                     joints=[self._initial_joints(name, arm) for name, arm in self._arms.items()],
+                    payload=[(arm.payload.mass, *arm.payload.centre) for arm in self._arms.values()],
                     realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._arms.values()),
                 )
                 self._controllers = stack.enter_context(controllers)

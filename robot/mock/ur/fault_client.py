@@ -210,7 +210,7 @@ class FaultClient:
         self._ask("force_limit", newtons=newtons)
 
     def payload_mismatch(self, mass: float, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """A mass [kg] on the flange that the controller was not told of; its centre in flange axes [m]."""
+        """Hangs a mass [kg] on the flange, its centre in flange axes [m]: felt until the controller is told of it."""
         self._ask("payload_mismatch", mass=mass, centre=[float(value) for value in centre])
 
     # ----------------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.mock.ur.machine.load import Wall
+from robot.mock.ur.machine.load import Mass, Wall
 from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.controller import PORTS, Controller, open_port
 from robot.mock.ur.wire.fields import INPUTS
@@ -112,7 +112,7 @@ def _state(controller: Controller) -> dict[str, Any]:
         "safety": machine.safety.name,
         "mode": machine.mode.name,
         "stop_reason": machine.stop_reason,
-        "payload": machine.payload,
+        "payload": machine.load.told.mass,
         "watchdog": machine.watchdog is not None,
         "tick_rate": controller.tick_rate,
         "overruns": controller.overruns,
@@ -145,8 +145,7 @@ def _no_wall(controller: Controller) -> None:
 
 
 def _payload_mismatch(controller: Controller, mass: float, centre: list[float]) -> None:
-    controller.machine.load.hidden_mass = float(mass)
-    controller.machine.load.hidden_centre = np.array(centre, dtype=np.float64).reshape(3)
+    controller.machine.load.hidden = Mass.of([mass, *centre])
 
 
 def _force_limit(controller: Controller, newtons: float) -> None:

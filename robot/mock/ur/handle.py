@@ -27,8 +27,9 @@ class MockError(DeviceError):
 class MockArms(Child):
     """Mock controllers in one process of their own, one for each host; a context manager.
 
-    model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6). Raises MockError when they are
-    not ready in time, for example because a port is in use, ValueError for hosts that are not loopback addresses.
+    model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6); payload: what hangs on their
+    flanges, mass [kg] and centre of gravity in flange axes [m], (4,) or (arms, 4). Raises MockError when they are not
+    ready in time, for example because a port is in use, ValueError for hosts that are not loopback addresses.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class MockArms(Child):
         *,
         model: Model | Sequence[Model] = "ur5e",
         joints: Sequence[float] | Sequence[Sequence[float]] | None = None,
+        payload: Sequence[float] | Sequence[Sequence[float]] | None = None,
         version: Version = VERSION,
         fault_port: int = FAULT_PORT,
         serial: str = MOCK_SERIAL,
@@ -48,8 +50,9 @@ class MockArms(Child):
         arguments = [*self.hosts, "--fault-port", str(fault_port), "--serial", serial]
         arguments += [f"--model={each}" for each in ([model] if isinstance(model, str) else model)]
         arguments += ["--version", ".".join(map(str, version)), "--with-parent"]
-        for posture in () if joints is None else np.atleast_2d(np.array(joints, dtype=np.float64)):
-            arguments.append("--joints=" + ",".join(repr(float(angle)) for angle in posture))
+        for option, rows in (("--joints", joints), ("--payload", payload)):
+            for row in () if rows is None else np.atleast_2d(np.array(rows, dtype=np.float64)):
+                arguments.append(f"{option}=" + ",".join(repr(float(number)) for number in row))
         if allow_network:
             arguments.append("--allow-network")
         if realtime:

@@ -8,13 +8,13 @@ import pytest
 
 from robot.arm.ur import URArm
 from robot.mock import MockUR
-from tests.robot.arm.mocked import HOST, config
+from tests.robot.arm.mocked import CARRIED, HOST, config
 
 
 @pytest.fixture(scope="module")
 def controller(measuring: bool) -> Iterator[MockUR]:
     pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this Python")
-    with MockUR(HOST, realtime=measuring) as mock:
+    with MockUR(HOST, realtime=measuring, payload=CARRIED) as mock:
         yield mock
 
 

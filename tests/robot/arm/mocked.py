@@ -25,6 +25,7 @@ from tacsim.models.hardware import ArmLimits, MockArmConfig, Payload, Placement,
 
 HOST, OTHER = (f"127.{net}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" for net in (23, 123))
 PATIENCE = 20.0  # for anything that has to happen [s]
+CARRIED = (0.4, 0.0, 0.0, 0.04)  # what a mock has on its flange: mass [kg], centre [m]
 SERVO = 11  # number of the servoJ command in the registers
 STILL = 1e-3  # slower than this an arm stands [m/s]
 KINEMATICS = Kinematics("ur5e")
@@ -44,7 +45,7 @@ def config(host: str = HOST, *, realtime: bool = False, **changes: object) -> Ur
         world_from_base=BASE,
         flange_from_tool=Placement(position=(0.0, 0.0, 0.03), rotation=(0.1, 0.0, 0.0)),
         tool_from_sensor=TOOL_FROM_SENSOR,
-        payload=Payload(mass=0.4, centre=(0.0, 0.0, 0.04)),
+        payload=Payload(mass=CARRIED[0], centre=CARRIED[1:]),
         limits=ArmLimits(**limits),  # type: ignore[arg-type]
         link_timeout=1.0,
         action_timeout=30.0,

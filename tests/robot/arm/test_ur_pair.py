@@ -22,6 +22,7 @@ from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import (
     BASE,
+    CARRIED,
     OTHER,
     PATIENCE,
     config,
@@ -45,7 +46,7 @@ def pair(mock: MockUR, measuring: bool) -> Iterator[Pair]:
     given = config(realtime=measuring, limits=slow)
     beside = config(OTHER, realtime=measuring, limits=slow, world_from_base=shifted)
     with (
-        MockUR(OTHER, realtime=measuring) as other,
+        MockUR(OTHER, realtime=measuring, payload=CARRIED) as other,
         URArm(given, "left", keep_out={"right": KEEP_OUT}) as left,
         URArm(beside, "right", keep_out={"left": KEEP_OUT}) as right,
     ):

@@ -9,7 +9,7 @@ import pytest
 
 from robot.common.kinematics import displacement, matrix, pose
 from robot.mock.ur.machine.arm import PERIOD
-from robot.mock.ur.machine.load import GRAVITY
+from robot.mock.ur.machine.load import Mass
 from robot.mock.ur.machine.machine import Machine, Safety
 from tests.robot.mock.machine_bench import DOWN, Bench
 from tests.robot.mock.wire_client import control_script
@@ -243,10 +243,10 @@ def test_questions(bench: Bench) -> None:
 
 def test_payload_is_read_back_and_a_zero_centre_keeps_the_old(bench: Bench) -> None:
     bench.call(65, [1.2, 0, 0, 0.05, 1, 2, 3, 4, 5, 6])
-    assert bench.machine.payload == 1.2 and bench.machine.payload_inertia.tolist() == [1, 2, 3, 4, 5, 6]
+    assert bench.machine.load.told == Mass(1.2, (0, 0, 0.05))
+    assert bench.machine.load.inertia.tolist() == [1, 2, 3, 4, 5, 6]
     bench.call(17, [0.7, 0, 0, 0])
-    assert bench.machine.payload == 0.7 and bench.machine.payload_centre.tolist() == [0, 0, 0.05]
-    np.testing.assert_allclose(bench.machine.raw_wrench[:3], bench.arm.frame[:3, :3].T @ [0, 0, -0.7 * GRAVITY])
+    assert bench.machine.load.told == Mass(0.7, (0, 0, 0.05))
 
 
 def test_jog_in_tool_axes(bench: Bench) -> None:

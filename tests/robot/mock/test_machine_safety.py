@@ -9,7 +9,7 @@ import pytest
 
 from robot.common.kinematics import displacement, matrix
 from robot.mock.ur.machine.arm import PERIOD
-from robot.mock.ur.machine.load import GRAVITY, Wall
+from robot.mock.ur.machine.load import GRAVITY, Mass, Wall
 from robot.mock.ur.machine.machine import Mode, Runtime, Safety
 from tests.robot.mock.machine_bench import Bench
 from tests.robot.mock.wire_client import control_script
@@ -101,11 +101,11 @@ def test_too_much_force_is_a_protective_stop(bench: Bench) -> None:
     bench.machine.load.wall = Wall(float(bench.arm.frame[2, 3]), 20e3)
     bench.call(3, [*bench.shifted(0, 0, -0.05), 0.05, 0.5])
     assert bench.machine.safety is Safety.PROTECTIVE_STOP and "force" in bench.machine.stop_reason
-    assert 250 < bench.machine.load.true[2] < 262  # stopped at once, not after a way
+    assert 250 < bench.machine.load.unexplained[2] < 262  # stopped at once, not after a way
 
 
 def test_hidden_payload_weighs_and_turns_with_the_tool(bench: Bench) -> None:
-    bench.machine.load.hidden_mass, bench.machine.load.hidden_centre = 2.0, np.array([0.0, 0.1, 0.0])
+    bench.machine.load.hidden = Mass(2.0, (0.0, 0.1, 0.0))
     bench.tick()
     weight = 2.0 * GRAVITY
     arm_of_force = bench.arm.frame[:3, 1] * 0.1

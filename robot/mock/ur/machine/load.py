@@ -1,8 +1,15 @@
-"""Loads on the tool: wrenches given from outside, a spring table, a payload that the controller does not know of."""
+"""What pulls and pushes on the tool, and what of it the controller shows.
+
+The flange measures everything: wrenches given from outside, a spring table, the weight of what hangs there. The
+controller takes off the weight of the payload that it was told of, in the gravity that it was told of, then what
+zero_ftsensor has found: "subtracting the current measurement from the subsequent" (URScript manual). That offset is the
+sensor's and stays until the next zeroing, so a payload told afterwards shows at once, with its whole weight.
+"""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +20,7 @@ from tacsim.interface import FloatArray
 
 GRAVITY = 9.82  # what the controller compensates with by default [m/s^2] (URScript manual, set_gravity)
 FORCE_LIMIT = 250.0  # |force| beyond which the mock stops for protection [N]
+UP = np.array([0.0, 0.0, GRAVITY])  # acceleration that a standing arm feels, base axes [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -23,57 +31,82 @@ class Wall:
     stiffness: float
 
 
+@dataclass(frozen=True)
+class Mass:
+    """A mass on the flange [kg] and its centre of gravity, flange axes [m]. Raises ValueError."""
+
+    mass: float = 0.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> Mass:
+        """From mass and centre (4,)."""
+        if len(numbers) != 4 or not np.isfinite(numbers).all():
+            raise ValueError(f"a payload is a mass [kg] and its centre x, y, z [m], got {list(numbers)}")
+        mass, x, y, z = (float(number) for number in numbers)
+        return cls(mass, (x, y, z))
+
+
+NOTHING = Mass()
+
+
 @dataclass
 class Load:
     """Wrenches (6,) [N, N m] on the tool. Signs as UR has them: what the surroundings do to the robot, about the TCP,
     in base axes; pressing down on a table gives a positive z force."""
 
+    tool: Mass = NOTHING  # hangs on the flange from power-on
+    hidden: Mass = NOTHING  # hangs there too
     wrench: FloatArray = field(default_factory=lambda: np.zeros(6))  # given from outside
     wall: Wall | None = None
-    hidden_mass: float = 0.0  # hangs on the flange, and the controller does not know of it [kg]
-    hidden_centre: FloatArray = field(default_factory=lambda: np.zeros(3))  # its centre, flange axes [m]
+    told: Mass = NOTHING  # the payload that the controller reckons with
+    inertia: FloatArray = field(default_factory=lambda: np.zeros(6))  # told with it [kg m^2]
+    gravity: FloatArray = field(default_factory=UP.copy)  # as set_gravity has it [m/s^2]
     force_limit: float = FORCE_LIMIT
     bias: FloatArray = field(default_factory=lambda: np.zeros(6))  # of zero_ftsensor: about the flange, in its axes
-    true: FloatArray = field(default_factory=lambda: np.zeros(6))  # all of it, at the present pose
-    felt: FloatArray = field(default_factory=lambda: np.zeros(6))  # the same less the bias: actual_TCP_force
+    measured: FloatArray = field(default_factory=lambda: np.zeros(6))  # all of it
+    unexplained: FloatArray = field(default_factory=lambda: np.zeros(6))  # less the payload told of
+    felt: FloatArray = field(default_factory=lambda: np.zeros(6))  # less the bias too: actual_TCP_force
     history: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=HISTORY))  # of `felt`, a period each
 
     def update(self, arm: Arm) -> None:
-        """Renews `true` and `felt` at the arm's present pose."""
-        true = self.wrench.copy()
+        """Renews what is measured and felt at the arm's present pose."""
+        flange = arm.frame @ inverse_frame(arm.tool)
+        measured = self.wrench.copy()
         if self.wall is not None:
-            true[2] += self.wall.stiffness * max(0.0, self.wall.z - float(arm.frame[2, 3]))
-        if self.hidden_mass != 0.0:
-            flange = arm.kinematics.forward(arm.q)
-            weight = np.array([0.0, 0.0, -self.hidden_mass * GRAVITY])
-            centre = flange[:3, :3] @ self.hidden_centre + flange[:3, 3]
-            true[:3] += weight
-            true[3:] += cross(centre - arm.frame[:3, 3], weight)
-        self.true = true
-        if self.bias.any():
-            self.felt = true - _moved(self.bias, arm.frame @ inverse_frame(arm.tool), arm.frame[:3, 3])
-        else:
-            self.felt = true
+            measured[2] += self.wall.stiffness * max(0.0, self.wall.z - float(arm.frame[2, 3]))
+        for each in (self.tool, self.hidden):
+            measured += _weight(each, UP, flange, arm.frame)
+        self.measured = measured
+        self.unexplained = measured - _weight(self.told, self.gravity, flange, arm.frame)
+        self.felt = self.unexplained - _moved(self.bias, flange, arm.frame[:3, 3])
 
     def zero(self, arm: Arm) -> None:
         """zero_ftsensor: what is felt now counts as nothing. The bias belongs to the sensor and turns with it."""
-        flange = arm.frame @ inverse_frame(arm.tool)
-        self.bias = self.at_flange(self.true, arm, flange)
+        self.bias = at_flange(self.unexplained, arm)
         self.update(arm)
 
-    @staticmethod
-    def at_flange(wrench: FloatArray, arm: Arm, flange: FloatArray | None = None) -> FloatArray:
-        """A wrench about the TCP in base axes as one about the flange in its axes."""
-        if flange is None:
-            flange = arm.frame @ inverse_frame(arm.tool)
-        torque = wrench[3:] + cross(arm.frame[:3, 3] - flange[:3, 3], wrench[:3])
-        return np.concatenate([flange[:3, :3].T @ wrench[:3], flange[:3, :3].T @ torque])
+
+def at_flange(wrench: FloatArray, arm: Arm) -> FloatArray:
+    """A wrench about the TCP in base axes as one about the flange in its axes."""
+    flange = arm.frame @ inverse_frame(arm.tool)
+    torque = wrench[3:] + cross(arm.frame[:3, 3] - flange[:3, 3], wrench[:3])
+    return np.concatenate([flange[:3, :3].T @ wrench[:3], flange[:3, :3].T @ torque])
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """a x b of two (3,); np.cross takes ten times as long for so few numbers."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _weight(of: Mass, gravity: FloatArray, flange: FloatArray, frame: FloatArray) -> FloatArray:
+    """Weight of a mass about the TCP, in base axes."""
+    if of.mass == 0.0:
+        return np.zeros(6)
+    force = -of.mass * gravity
+    centre = flange[:3, :3] @ np.array(of.centre) + flange[:3, 3]
+    return np.concatenate([force, cross(centre - frame[:3, 3], force)])
 
 
 def _moved(wrench: FloatArray, flange: FloatArray, point: FloatArray) -> FloatArray:

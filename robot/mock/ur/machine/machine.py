@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
-from robot.mock.ur.machine.load import GRAVITY, Load, cross
+from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
 from robot.mock.ur.machine.script import Program
 from tacsim.interface import FloatArray
@@ -92,18 +92,20 @@ class Machine:
     """One robot. `log` keeps the last lines of what happened, each with its time [s]."""
 
     def __init__(
-        self, model: Model = "ur5e", joints: Sequence[float] = HOME, version: Version = (5, 11, 0, 108150)
+        self,
+        model: Model = "ur5e",
+        joints: Sequence[float] = HOME,
+        version: Version = (5, 11, 0, 108150),
+        tool: Mass = NOTHING,  # hangs on the flange
     ) -> None:
         self.version = version
-        self.arm, self.load, self.outputs = Arm(model, joints), Load(), Outputs()
+        self.arm, self.load, self.outputs = Arm(model, joints), Load(tool), Outputs()
         self.ticks = 0
         self.mode, self.safety = Mode.RUNNING, Safety.NORMAL
         self.in_int, self.in_double = [0] * REGISTERS, [0.0] * REGISTERS
         self.out_int, self.out_double = [0] * REGISTERS, [0.0] * REGISTERS
         self.in_bits = [False] * 128
         self.slider = 1.0
-        self.payload, self.payload_centre, self.payload_inertia = 0.0, np.zeros(3), np.zeros(6)
-        self.gravity: FloatArray = np.array([0.0, 0.0, GRAVITY])  # acceleration of the base, as set_gravity has it
         self.program: Program | None = None
         self.paused = False
         self.freedrive: tuple[FloatArray, tuple[int, ...]] | None = None  # frame and free axes
@@ -148,12 +150,7 @@ class Machine:
     @property
     def raw_wrench(self) -> FloatArray:
         """Load on the flange in its axes, with the weight of the payload and no zero taken off (6,) [N, N m]."""
-        if self.payload == 0.0 and not self.load.true.any():
-            return np.zeros(6)
-        flange = self.arm.kinematics.forward(self.arm.q)
-        weight = -self.payload * flange[:3, :3].T @ self.gravity
-        own = np.concatenate([weight, cross(self.payload_centre, weight)])
-        return own + self.load.at_flange(self.load.true, self.arm, flange)
+        return at_flange(self.load.measured, self.arm)
 
     @property
     def steady(self) -> bool:
@@ -276,7 +273,7 @@ class Machine:
         assert self.freedrive is not None
         damping = np.repeat([FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING], 3)
         frame, free = self.freedrive
-        comply(self.arm, frame, free, self.load.true / damping, np.array([0.25] * 3 + [1.0] * 3))
+        comply(self.arm, frame, free, self.load.unexplained / damping, np.array([0.25] * 3 + [1.0] * 3))
 
     def _power(self) -> None:
         if self._changing is not None and self.ticks >= self._changing[0]:
@@ -295,7 +292,7 @@ class Machine:
         if self.safety not in (Safety.NORMAL, Safety.REDUCED):
             return
         arm = self.arm
-        force = math.sqrt(sum(value * value for value in self.load.true[:3].tolist()))
+        force = math.sqrt(sum(value * value for value in self.load.unexplained[:3].tolist()))
         if force > self.load.force_limit:
             self.protective_stop(f"force of {force:.0f} N, limit {self.load.force_limit:g} N")
         fast = np.abs(arm.target_qd) > arm.kinematics.joint_speeds * 1.001

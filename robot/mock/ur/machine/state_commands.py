@@ -9,6 +9,7 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
+from robot.mock.ur.machine.load import Mass
 from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
 
@@ -28,18 +29,16 @@ def zero_sensor(p: Program) -> None:
 @command(17)
 def payload(p: Program) -> None:
     """A centre of gravity that is all zero keeps the one before: the script has it so."""
-    mass, centre = p.double(0), p.doubles(1, 3)
-    if not mass >= 0 or not np.isfinite(centre).all():
+    mass, centre, load = p.double(0), p.doubles(1, 3), p.machine.load
+    if not (0 <= mass < np.inf and np.isfinite(centre).all()):
         raise ProgramError(f"set_payload: mass {mass:g} kg, centre {centre.tolist()} m")
-    p.machine.payload = mass
-    if centre.any():
-        p.machine.payload_centre = centre
+    load.told = Mass.of([mass, *(centre if centre.any() else load.told.centre)])
 
 
-@command(65)
+@command(65, needs="set_target_payload(")
 def target_payload(p: Program) -> None:
     payload(p)
-    p.machine.payload_inertia = p.doubles(4)
+    p.machine.load.inertia = p.doubles(4)
 
 
 @command(29)
@@ -51,7 +50,10 @@ def tool(p: Program) -> None:
 
 @command(59)
 def gravity(p: Program) -> None:
-    p.machine.gravity = p.doubles(0, 3)
+    towards = p.doubles(0, 3)
+    if not np.isfinite(towards).all():
+        raise ProgramError(f"set_gravity: {towards.tolist()} m/s^2")
+    p.machine.load.gravity = towards
 
 
 @command(35)
@@ -143,8 +145,8 @@ _query(69, read=lambda p: p.arm.target_qdd, needs="get_target_joint_acceleration
 
 @command(38, every_cycle=True)
 def torques(p: Program) -> None:
-    """What the joints bear of the load on the tool [N m]."""
-    p.answer(-p.arm.kinematics.jacobian(p.arm.q, p.arm.tool).T @ p.machine.load.true)
+    """What the joints bear of the load on the tool, less the payload told of [N m]."""
+    p.answer(-p.arm.kinematics.jacobian(p.arm.q, p.arm.tool).T @ p.machine.load.unexplained)
 
 
 def _answer_matrix(p: Program, values: FloatArray) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from robot.common import MOCK_SERIAL
 from robot.mock.ur.fault_client import Input
 from robot.mock.ur.machine.arm import HOME, PERIOD
+from robot.mock.ur.machine.load import NOTHING, Mass
 from robot.mock.ur.machine.machine import Machine, Version
 from robot.mock.ur.wire import dashboard
 from robot.mock.ur.wire.connection import Connection
@@ -41,6 +42,7 @@ class ControllerConfig:
     joints: tuple[float, ...] = HOME
     version: Version = (5, 11, 0, 108150)
     serial: str = MOCK_SERIAL
+    tool: Mass = NOTHING  # hangs on the flange
 
 
 @dataclass
@@ -65,7 +67,7 @@ class Controller:
     def __init__(self, config: ControllerConfig, selector: selectors.BaseSelector) -> None:
         self.config, self._selector = config, selector
         self.faults = Faults()
-        self.machine = Machine(config.model, config.joints, config.version)
+        self.machine = Machine(config.model, config.joints, config.version, config.tool)
         self.ticks = self.overruns = 0
         self.sent = self.dropped = 0  # data packages
         self.received: deque[Input] = deque(maxlen=KEPT)
@@ -104,7 +106,7 @@ class Controller:
         self.black_hole(False)
         self._boot_at = None
         self.faults = Faults()
-        self.machine = Machine(self.config.model, self.config.joints, self.config.version)
+        self.machine = Machine(self.config.model, self.config.joints, self.config.version, self.config.tool)
         self.received.clear()
         self.listen()
 
@@ -113,7 +115,7 @@ class Controller:
         self.cut(PORTS, reset=True)
         self.refuse()
         joints = tuple(float(angle) for angle in self.machine.arm.q)
-        self.machine = Machine(self.config.model, joints, self.machine.version)
+        self.machine = Machine(self.config.model, joints, self.machine.version, self.config.tool)
         self.machine.power_off()
         self._boot_at = self.ticks + max(1, round(seconds / PERIOD))
 

@@ -1,0 +1,111 @@
+"""What the arm feels of a payload that it carries, was told of, or zeroed away: against statics by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from robot.mock import MockError, MockUR
+from robot.mock.ur.machine.load import GRAVITY, Mass
+from tacsim.interface import FloatArray
+from tests.robot.mock.machine_bench import Bench
+from tests.robot.mock.wire_client import ControlClient, wire_host
+
+CENTRE = (0.03, -0.02, 0.08)
+TURNS = ([0.0] * 6, [0.3, 0.2, -0.4, 0.6, -0.3, 0.8], [-0.5, -0.2, 0.3, -1.2, 1.1, -2.0])
+
+
+def attitudes(bench: Bench) -> Iterator[FloatArray]:
+    """Turns the flange about, and gives what is felt (6,)."""
+    home = bench.arm.target_q.copy()
+    for turn in TURNS:
+        bench.call(1, [*(home + turn), 1.0, 2.0])
+        bench.until(lambda: bench.arm.rests)
+        bench.tick()
+        yield bench.machine.load.felt
+
+
+def weight(bench: Bench, mass: float) -> FloatArray:
+    """Of a mass at CENTRE about the TCP, base axes, by hand."""
+    force = np.array([0.0, 0.0, -mass * GRAVITY])
+    flange = bench.arm.kinematics.forward(bench.arm.q)
+    lever = (flange @ [*CENTRE, 1.0])[:3] - bench.arm.frame[:3, 3]
+    return np.concatenate([force, np.cross(lever, force)])
+
+
+@pytest.mark.parametrize("command", [17, 65])
+def test_a_load_told_with_its_centre_is_not_felt_and_an_untold_one_is(bench: Bench, command: int) -> None:
+    bench.call(29, [0.01, 0.02, 0.15, 0.4, 0, 0])  # a TCP far from the flange
+    bench.machine.load.hidden = Mass(0.5, CENTRE)
+    for felt in attitudes(bench):
+        np.testing.assert_allclose(felt, weight(bench, 0.5), atol=1e-9)
+        assert np.linalg.norm(felt[:3]) == pytest.approx(4.91)
+    bench.call(command, [0.5, *CENTRE])
+    for felt in attitudes(bench):
+        np.testing.assert_allclose(felt, 0, atol=1e-9)
+    bench.call(command, [0.7, *CENTRE])  # told too much: as if something pulled it up
+    for felt in attitudes(bench):
+        np.testing.assert_allclose(felt, -weight(bench, 0.2), atol=1e-9)
+
+
+def test_a_payload_told_after_zeroing_shows_until_the_next_zeroing(bench: Bench) -> None:
+    bench.machine.load.hidden = Mass(0.5, CENTRE)
+    bench.tick()
+    bench.call(8)
+    np.testing.assert_allclose(bench.machine.load.felt, 0, atol=1e-9)
+    bench.call(17, [0.5, *CENTRE])
+    bench.tick()
+    np.testing.assert_allclose(bench.machine.load.felt, -weight(bench, 0.5), atol=1e-9)
+    bench.call(8)
+    for felt in attitudes(bench):
+        np.testing.assert_allclose(felt, 0, atol=1e-9)
+
+
+def test_gravity_told_wrong_takes_off_a_weight_in_the_wrong_direction(bench: Bench) -> None:
+    bench.machine.load.hidden = Mass(0.5)
+    bench.call(17, [0.5, 0, 0, 0])
+    tilt = 0.3
+    bench.call(59, [0, GRAVITY * math.sin(tilt), GRAVITY * math.cos(tilt)])
+    bench.tick()
+    wanted = 0.5 * GRAVITY * np.array([0, math.sin(tilt), math.cos(tilt) - 1.0])
+    np.testing.assert_allclose(bench.machine.load.felt[:3], wanted, atol=1e-9)
+
+
+def test_the_raw_wrench_knows_of_no_payload_and_no_zero(bench: Bench) -> None:
+    bench.machine.load.hidden = Mass(0.5)
+    bench.call(17, [0.5, *CENTRE])
+    bench.call(8)
+    bench.tick()
+    down = bench.arm.frame[:3, :3].T @ [0, 0, -0.5 * GRAVITY]
+    np.testing.assert_allclose(bench.machine.raw_wrench, [*down, 0, 0, 0], atol=1e-9)
+
+
+def test_an_arm_with_a_wrong_payload_drifts_in_freedrive_and_with_the_right_one_stands(bench: Bench) -> None:
+    bench.machine.load.hidden = Mass(0.5)
+    bench.call(17, [0.5, 0, 0, 1e-9])
+    bench.call(52, [0] * 6, [1, 1, 1, 0, 0, 0])
+    z = float(bench.arm.frame[2, 3])
+    bench.tick(250)
+    assert bench.arm.frame[2, 3] == pytest.approx(z, abs=1e-6)
+    bench.call(53)
+    bench.call(17, [0.0, 0, 0, 0])
+    bench.call(52, [0] * 6, [1, 1, 1, 0, 0, 0])
+    bench.tick(250)
+    assert bench.arm.frame[2, 3] < z - 0.005
+
+
+def test_a_mock_carries_what_it_was_started_with() -> None:
+    with MockUR(wire_host(30), payload=(0.4, *CENTRE), ready_timeout=60) as carrier:
+        for _ in range(2):
+            with ControlClient(carrier.host) as client:
+                untold = client.wait(lambda state: True)
+                assert untold["actual_TCP_force"][2] == pytest.approx(-0.4 * GRAVITY)
+                client.call(17, [0.4, *CENTRE])
+                told = client.wait(lambda state: abs(state["actual_TCP_force"][2]) < 1e-9)
+                np.testing.assert_allclose(told["actual_TCP_force"], 0, atol=1e-9)
+            carrier.faults.reset()
+    with pytest.raises(MockError, match="payload"):
+        MockUR(wire_host(30), payload=(0.4, math.nan, 0, 0), ready_timeout=60)

@@ -8,7 +8,7 @@ import typer
 
 from robot.cli.bench import require_checkout
 from robot.cli.options import Overrides
-from robot.cli.output import busy
+from robot.cli.output import SafeConsole, busy
 
 if TYPE_CHECKING:
     from robot.doctor import machine
@@ -78,7 +78,6 @@ def doctor(
 
 
 def _print_checks(checks: list[machine.Check]) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -88,4 +87,4 @@ def _print_checks(checks: list[machine.Check]) -> None:
         if check.advice:
             words.append(f"\n→ {check.advice}", style="italic")
         table.add_row(MARKS[check.state], check.name, words)
-    Console().print(table)
+    SafeConsole().print(table)

@@ -6,9 +6,11 @@ import os
 from typing import Any
 
 import typer
-from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
+
+from robot.cli.output import SafeConsole
+from tacsim.text import printable
 
 OURS = {"tacsim", "calibration", "robot"}
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
@@ -54,7 +56,8 @@ def explain(error: Exception) -> tuple[str, int]:
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
         return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
     if isinstance(error, OSError):
-        where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes | os.PathLike) else ""
+        named = isinstance(error.filename, str | bytes | os.PathLike)
+        where = f"{printable(os.fsdecode(error.filename))}: " if named else ""
         return f"{where}{error.strerror or str(error) or type(error).__name__}", FAILED
     if type(error).__module__.partition(".")[0] in OURS:
         return str(error) or type(error).__name__, FAILED
@@ -75,5 +78,4 @@ def _refused(error: Exception) -> bool:
 
 def complain(message: str) -> None:
     """Prints an error message on stderr."""
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
-    console.print(Text("error: ", style="bold red") + Text(message))
+    SafeConsole(stderr=True, soft_wrap=True, highlight=False).print(Text("error: ", style="bold red") + Text(message))

@@ -9,11 +9,24 @@ from datetime import datetime
 from pathlib import Path
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
 
-results = Console(highlight=False, soft_wrap=True)  # stdout: what the command found
-notes = Console(stderr=True, highlight=False, soft_wrap=True)  # stderr: what it is doing
+from tacsim.text import escaped, printable
+
+
+class SafeConsole(Console):
+    """A console that shows control characters instead of obeying them. What a command prints may hold names and texts
+    of files, recordings and devices, which must not move the cursor, change colours or turn the writing round."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=escaped(segment.text, kept="\n\t"))
+
+
+results = SafeConsole(highlight=False, soft_wrap=True)  # stdout: what the command found
+notes = SafeConsole(stderr=True, highlight=False, soft_wrap=True)  # stderr: what it is doing
 
 
 def new_directory(out: Path | None, what: str) -> Path:
@@ -87,7 +100,7 @@ def busy(words: str) -> Iterator[None]:
 def say_files(*paths: Path) -> None:
     """Prints paths, one a line."""
     for path in paths:
-        results.print(str(path), markup=False)
+        results.print(printable(str(path)), markup=False)
 
 
 def warn(words: str) -> None:
@@ -97,7 +110,7 @@ def warn(words: str) -> None:
 
 def ask(question: str) -> bool:
     """A person's word; without a terminal there is nobody to give it."""
-    return sys.stdin.isatty() and typer.confirm(question, default=False, err=True)
+    return sys.stdin.isatty() and typer.confirm(printable(question), default=False, err=True)
 
 
 def show_table(
@@ -115,4 +128,4 @@ def show_table(
         table.add_column(column, justify="left" if number in left else "right")
     for row in rows:
         table.add_row(*row)
-    Console(width=width, highlight=False).print(table)
+    SafeConsole(width=width, highlight=False).print(table)

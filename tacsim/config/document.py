@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 
 import yaml
 
-from tacsim.config.errors import Place, Problem, printable
+from tacsim.config.errors import Place, Problem
+from tacsim.text import printable
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32

@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from tacsim.text import printable
+
 _SHOWN = 30  # a broken file can have thousands of problems
 
 
@@ -44,14 +46,6 @@ class ConfigError(ValueError):
         if len(self.problems) > _SHOWN:
             lines.append(f"... and {len(self.problems) - _SHOWN} more problems")
         super().__init__("\n".join(lines))
-
-
-def printable(text: str, limit: int = 600) -> str:
-    """`text` for any terminal: one line, control characters escaped, the middle of a very long one left out."""
-    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-    if len(text) <= limit:
-        return text
-    return f"{text[: limit // 2]} ... {text[-limit // 2 :]}"
 
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:

@@ -10,7 +10,8 @@ from pydantic_core import ErrorDetails
 
 from tacsim.config.annotation import allowed, child, keys, members, models, split, tag_of, variant
 from tacsim.config.document import LoadState, Node
-from tacsim.config.errors import did_you_mean, join, printable
+from tacsim.config.errors import did_you_mean, join
+from tacsim.text import printable
 
 
 @dataclass(frozen=True, slots=True)

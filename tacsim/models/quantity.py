@@ -23,8 +23,10 @@ UNITS: dict[str, dict[str, float]] = {
 }
 # pydantic leaves the bounds of a validated number under its own names in the JSON schema.
 _BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
-_NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
-_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*(\S*)\s*")
+# No two neighbours of these patterns take the same character: matching takes linear time.
+_NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+_QUANTITY = re.compile(rf"({_NUMBER})\s*([^\s0-9.]\S*)?")
+MAX_TEXT = 100  # characters of a quantity
 
 
 def units_text(kind: str) -> str:
@@ -55,7 +57,11 @@ def parse(value: Any, kind: str) -> float:
 
 def _parse_text(text: str, kind: str, allowed: str) -> float:
     units = UNITS[kind]
-    match = _QUANTITY.fullmatch(text)
+    if len(text) > MAX_TEXT:
+        raise ValueError(
+            f"the {kind} {text[:20]!r}... has {len(text)} characters, at most {MAX_TEXT} are read; {allowed}"
+        )
+    match = _QUANTITY.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"{text!r} is no {kind}; {allowed}")
     number, unit = match.groups()

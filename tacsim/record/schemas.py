@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from tacsim.interface import RigSpec
 from tacsim.record.episode import EpisodeError, EpisodeMeta
+from tacsim.text import printable
 
 FORMAT = "1"  # of the file; raised when an old reader would misread a new file
 MAX_ATTACHMENT = 64 << 20  # [bytes]
@@ -106,18 +107,22 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
     if values.get("format") != FORMAT:
         raise EpisodeError(f"{what}: episode format '{values.get('format')}', but this tacsim reads '{FORMAT}'")
     try:
+        task = values.get("task")
         meta = EpisodeMeta(
-            rig=values["rig"],
-            task=values.get("task"),
-            policy=values["policy"],
+            rig=printable(values["rig"]),
+            task=None if task is None else printable(task),
+            policy=printable(values["policy"]),
             seed=int(values["seed"]),
             spec=_SPEC.validate_json(values["spec"]),
-            versions=_NAMES.validate_json(values["versions"]),
+            versions={printable(k): printable(v) for k, v in _NAMES.validate_json(values["versions"]).items()},
             goal=_GOAL.validate_json(values["goal"]),
         )
+        for name in (*meta.spec.sensors, *meta.spec.arms):
+            if not name.isprintable():
+                raise ValueError(f"the name {printable(name)} holds control characters")
         return meta, _ATTACHMENTS.validate_json(values["attachments"])
     except (KeyError, ValueError, ValidationError) as failure:
-        raise EpisodeError(f"{what}: its metadata cannot be read: {failure}") from failure
+        raise EpisodeError(f"{what}: its metadata cannot be read: {printable(str(failure))}") from failure
 
 
 def _checksum(values: Mapping[str, str]) -> str:

@@ -68,6 +68,17 @@ def test_refusal_says_what_is_allowed(value: object, message: str) -> None:
     assert "allowed: a number [m]" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "text", ["1" * 1000 + "e ms", "1" * 50_000, " " * 50_000, "1." + "0" * 50_000 + " mm", "m" * 50_000]
+)
+def test_a_text_of_any_length_is_answered_at_once_and_in_short(text: str) -> None:
+    with pytest.raises(
+        ValueError, match=r"has \d+ characters, at most 100 are read; allowed: a number \[m\]"
+    ) as caught:
+        parse(text, "length")
+    assert len(str(caught.value)) < 300
+
+
 def test_an_ambiguous_unit_gets_no_suggestion() -> None:
     with pytest.raises(ValueError) as caught:
         parse("3 xm", "length")  # mm, cm and um are equally near

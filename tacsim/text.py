@@ -1,0 +1,19 @@
+"""Texts from outside (names in files and recordings, answers of devices), made fit for a terminal."""
+
+from __future__ import annotations
+
+
+def escaped(text: str, kept: str = "") -> str:
+    """`text` with control characters, and those that turn the direction of writing, written out (``\\x1b``), except
+    those in `kept`. What is escaped already stays as it is."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def printable(text: str, limit: int = 600) -> str:
+    """`text` for any terminal: one line, control characters escaped, the middle of a very long one left out."""
+    text = escaped(text)
+    if len(text) <= limit:
+        return text
+    return f"{text[: limit // 2]} ... {text[-limit // 2 :]}"

@@ -1,0 +1,84 @@
+"""Texts of files, recordings and devices reach the terminal as text: nothing in them moves the cursor."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.progress import Progress, TextColumn
+from rich.table import Table
+from rich.text import Text
+
+from robot.cli import errors
+from robot.cli.doctor import _print_checks
+from robot.cli.output import SafeConsole
+from robot.doctor.machine import Check
+from tacsim.interface import RigSpec, SensorSpec, TactileFrame
+from tacsim.record.episode import EpisodeMeta, Step
+from tacsim.record.writer import Recorder
+from tests.robot.cli.invoked import tacsim
+
+EVIL = "a\x1b[2J\x1b]0;b\x07\x9b31m\u202ec\u2066\r"
+BAD = "\x1b\x07\x9b\u202e\u2066\r"
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def check(shown: str) -> None:
+    assert not set(BAD) & set(shown), repr(shown)
+    assert "\\x1b[2J" in shown
+
+
+def test_a_console_shows_what_it_is_given_and_obeys_nothing() -> None:
+    table = Table(title=Text(EVIL))
+    table.add_row(EVIL, Text(EVIL))
+    for what in (EVIL, Text(EVIL), table):
+        console = SafeConsole(file=io.StringIO(), width=300)
+        console.print(what, markup=False)
+        check(console.file.getvalue())  # type: ignore[attr-defined]
+
+
+def test_its_own_colours_and_cursor_stay() -> None:
+    there = {"TERM": "xterm", "COLUMNS": "100"}
+    console = SafeConsole(file=io.StringIO(), force_terminal=True, _environ=there)
+    with Progress(TextColumn("{task.description}", markup=False), console=console) as bar:
+        bar.add_task(EVIL)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "\x1b[?25l" in shown  # the bar hides the cursor
+    assert "\\x1b[2J" in shown and "\x1b[2J" not in shown and "\u202e" not in shown
+
+
+def test_errors_and_checks_are_shown_the_same_way(capsys: pytest.CaptureFixture[str]) -> None:
+    errors.complain(EVIL)
+    check(capsys.readouterr().err)
+    _print_checks([Check("serial", "warn", EVIL, "do this")])
+    check(capsys.readouterr().out)
+    message, _ = errors.explain(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
+    check(message)
+    assert "\n" not in message
+
+
+def test_names_in_a_recording_are_shown_not_obeyed(tmp_path: Path) -> None:
+    spec = RigSpec({"lower": SensorSpec((8, 8), False, False, None)}, (), truth=False, period=0.1)
+    meta = EpisodeMeta("rig\nerror: all is lost" + EVIL, None, EVIL, 0, spec, {EVIL: EVIL})
+    frames = {"lower": TactileFrame(np.zeros((8, 8, 3), np.uint8), 0.0, 0)}
+    with Recorder("e.mcap", meta) as recorder:
+        recorder.write(Step(0, 0.0, frames, {}))
+    result = tacsim("replay", "e.mcap", "--out", "r")
+    assert result.exit_code == 0, result.output
+    check(result.stdout)
+    assert "\nerror" not in result.stdout
+    page = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
+    check(page)
+
+
+def test_a_sensor_in_a_recording_has_a_name() -> None:
+    name = "x\x1b[2J"
+    spec = RigSpec({name: SensorSpec((8, 8), False, False, None)}, (), truth=False, period=0.1)
+    with Recorder("e.mcap", EpisodeMeta("r", None, "p", 0, spec, {})) as recorder:
+        recorder.write(Step(0, 0.0, {}, {}))
+    result = tacsim("replay", "e.mcap", "--out", "r")
+    assert result.exit_code != 0
+    check(result.stderr)

@@ -71,7 +71,7 @@ class URArm(Closing):
 
     Connecting moves nothing. Raises, within `timeout`: DeviceNotConnectedError, DeviceBusyError (another program
     controls the arm), ProtectiveStop, EmergencyStop, DeviceError (not powered, or not in remote control),
-    SafetyViolation (it stands outside its workspace), DeviceAlreadyConnectedError.
+    SafetyViolation (it stands outside its workspace, or feels too much), DeviceAlreadyConnectedError.
     """
 
     def __init__(
@@ -102,9 +102,6 @@ class URArm(Closing):
             _open.add(name)
         try:
             self._start()
-            status = self.status()
-            if status == ArmStatus.WORKSPACE_LIMIT:
-                raise self._error(status)
         except BaseException:
             self.close()
             raise
@@ -218,8 +215,8 @@ class URArm(Closing):
         """After a stop, a fault or a lost link: unlocks a protective stop and starts a new worker, which begins at the
         measured pose and moves nothing. Earlier commands are forgotten.
 
-        Raises EmergencyStop while one is engaged (a person must release it), and whatever connecting raises. Only a
-        person decides to call it: nothing here does.
+        Raises EmergencyStop while one is engaged (a person must release it), and whatever connecting raises: the arm
+        stays stopped while what stopped it lasts. Only a person decides to call it: nothing here does.
         """
         with self._lock:
             if self._closed:
@@ -243,7 +240,7 @@ class URArm(Closing):
     # -- the worker ----------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Starts a worker and waits until it is connected."""
+        """Starts a worker and waits until it is connected. Raises the error of a fault that it begins with."""
         self._worker = Child(
             "robot.arm.worker",
             name=f"the worker of arm '{self.name}'",
@@ -260,6 +257,9 @@ class URArm(Closing):
                 f"arm '{self.name}': the controller at {self.config.host} fell silent while connecting; nothing for "
                 f"{self._timeout:g} s. Restart it, or look what else holds it"
             ) from failure
+        status = self.status()
+        if status.is_fault:
+            raise self._error(status)
 
     def _end_worker(self) -> None:
         """Asks the worker to brake and end, then kills it."""

@@ -108,12 +108,20 @@ def test_without_a_sound_partner_it_waits_and_a_moving_arm_stops(partner: ArmSta
     assert bench.servo.resting
 
 
-def test_a_worse_fault_replaces_a_lesser_one() -> None:
+@pytest.mark.promise(7)
+def test_a_fault_stays_and_only_a_stop_of_the_controller_replaces_it() -> None:
+    """A stop of the controller takes more to recover from, so it must be told; a worse one replaces a lesser one."""
     bench = Bench()
     for status, kept in (
         (ArmStatus.FORCE_LIMIT, ArmStatus.FORCE_LIMIT),
+        (ArmStatus.WORKSPACE_LIMIT, ArmStatus.FORCE_LIMIT),
+        (ArmStatus.PARTNER_STOPPED, ArmStatus.FORCE_LIMIT),
+        (ArmStatus.GEL_LIMIT, ArmStatus.FORCE_LIMIT),
+        (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROGRAM_STOPPED),
+        (ArmStatus.PROTECTIVE_STOP, ArmStatus.PROTECTIVE_STOP),
+        (ArmStatus.FORCE_LIMIT, ArmStatus.PROTECTIVE_STOP),
         (ArmStatus.EMERGENCY_STOP, ArmStatus.EMERGENCY_STOP),
-        (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP),
+        (ArmStatus.PROGRAM_STOPPED, ArmStatus.EMERGENCY_STOP),
     ):
         bench.servo.trip(status, bench.now)
         assert bench.servo.status == kept
@@ -178,3 +186,22 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
     bench.run(100)
     assert bench.servo.status == ArmStatus.OK
     assert bench.at.position[0] - held[0] > 5e-3
+
+
+@pytest.mark.promise(15)
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_first_cause_is_kept_when_the_other_arm_stops_over_it(moving: bool) -> None:
+    """Two arms that watch each other: one feels too much, the other stops because of that one. Neither changes its
+    mind when it sees the other's fault."""
+    bench = Bench(action_timeout=60.0, partners=[Partner("none", 0.05)])
+    away = list(bench.at.position + [0.3, 0, 0])
+    bench.partners = [other(away)]
+    if moving:
+        bench.ask(shifted(bench.at, 0.05))
+    bench.run(50)
+    bench.look(force=(0.0, 0.0, 31.0, 0.0, 0.0, 0.0))
+    bench.run(1, force=(0.0, 0.0, 31.0, 0.0, 0.0, 0.0))
+    assert bench.servo.status == ArmStatus.FORCE_LIMIT
+    bench.partners = [other(away, status=ArmStatus.PARTNER_STOPPED)]
+    bench.run(50, force=(0.0, 0.0, 31.0, 0.0, 0.0, 0.0))
+    assert bench.servo.status == ArmStatus.FORCE_LIMIT

@@ -19,6 +19,7 @@ from robot.errors import (
     SafetyViolation,
 )
 from robot.mock import MockUR
+from tacsim.models.hardware import Workspace
 from tests.promises import Record
 from tests.robot.arm.mocked import (
     BASE,
@@ -28,6 +29,7 @@ from tests.robot.arm.mocked import (
     config,
     go,
     in_motion,
+    leftovers,
     moved,
     records,
     until,
@@ -105,6 +107,47 @@ def test_both_arms_stop_when_one_does(pair: Pair, figure: Record) -> None:
     left.recover()
     go(left, a)
     go(right, moved(b, x=0.01))
+
+
+@pytest.mark.promise(15)
+def test_the_arm_that_caused_the_stop_says_so_and_recovering_it_first_brings_both_back(
+    pair: Pair, figure: Record
+) -> None:
+    left, right, other = pair
+    a, b = left.state().pose, right.state().pose
+    in_motion(left, moved(a, x=-0.1))
+    in_motion(right, moved(b, x=0.1))
+    other.faults.wrench([0.0, 0.0, 40.0, 0.0, 0.0, 0.0])
+    until(lambda: left.status() == ArmStatus.PARTNER_STOPPED, "the other arm's stop")
+    until(left.at_rest, "rest")
+    until(right.at_rest, "rest")
+    stopped = records(right)
+    told = set(stopped["status"][stopped["status"] >= ArmStatus.FORCE_LIMIT].tolist())
+    figure("causes that were replaced by their consequence", len(told - {ArmStatus.FORCE_LIMIT}))
+    assert told == {ArmStatus.FORCE_LIMIT}
+    with pytest.raises(SafetyViolation, match=r"felt more than limits.force.*now 40.0 of 30 N"):
+        right.recover()  # it is still pressed: it stands in its fault, and says why
+    left.recover()
+    assert left.status() == ArmStatus.WAITING
+    other.faults.wrench([0.0] * 6)
+    right.recover()
+    until(lambda: {left.status(), right.status()} == {ArmStatus.HOLD}, "both back")
+    go(left, moved(left.state().pose, x=0.01))
+    go(right, moved(right.state().pose, x=-0.01))
+
+
+@pytest.mark.promise(1, 15)
+def test_what_is_wrong_at_connect_refuses_also_beside_another_arm(mock: MockUR) -> None:
+    """The arm before it waits meanwhile, and is neither stopped nor blamed."""
+    elsewhere = {"workspace": Workspace(lower=(2.0, 2.0, 2.0), upper=(3.0, 3.0, 3.0))}
+    with MockUR(OTHER) as other, URArm(config(), "left", keep_out={"right": KEEP_OUT}) as left:
+        with pytest.raises(SafetyViolation, match="arm 'right' is outside its workspace.*mm beyond"):
+            URArm(config(OTHER, limits=elsewhere), "right", keep_out={"left": KEEP_OUT}).close()
+        other.faults.wrench([0.0, 0.0, 40.0, 0.0, 0.0, 0.0])
+        with pytest.raises(SafetyViolation, match=r"arm 'right' felt more than limits.force.*now 40.0 of 30 N"):
+            URArm(config(OTHER), "right", keep_out={"left": KEEP_OUT}).close()
+        assert left.status() == ArmStatus.WAITING
+    assert leftovers("left") == leftovers("right") == []
 
 
 @pytest.mark.promise(15)

@@ -82,8 +82,8 @@ class Servo:
         return None if self.motion is None else stopping_point(self.motion, self.config.acceleration)
 
     def trip(self, status: ArmStatus, measured: Measured | None) -> None:
-        """Enters a fault: brakes hard and moves no more. A fault stays, for what comes later may be its consequence; only
-        a stop of the controller replaces it, and a worse one that, because it takes more to recover from."""
+        """Enters a fault: brakes hard and moves no more. A fault stays, for what comes later may be its consequence;
+        only a stop of the controller replaces it, and a worse one that, because it takes more to recover from."""
         if not self.status.is_fault and self.motion is not None and measured is not None:
             self.motion = MotionState(
                 measured.sensor[:3, 3], measured.sensor[:3, :3], measured.twist[:3], measured.twist[3:]

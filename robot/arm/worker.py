@@ -50,6 +50,7 @@ STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # reco
 MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
 CLOSING = 0.6  # longest braking when the driver closes [s]
 PARENTLESS = 0.5  # longest braking when the driver is gone [s]
+CONNECTING = 60.0  # longest connecting: a driver that is gone cannot kill a worker whose controller is silent [s]
 LIBRARY_PATIENCE = 4.5  # the library gives a call up after this time [s]
 STUCK = 10.0  # the process is ended after this time without a period: the library may wait for ever [s]
 ORPHANED = 3.0  # the same when no driver is left to kill it [s]
@@ -316,16 +317,17 @@ _CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmSt
 
 def main() -> NoReturn:
     parent = Parent()  # the library prints
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which stops the arm gently
     config = WorkerConfig.of(parent.receive())
     if config.realtime:
         ask_for_realtime(WORKER)  # before the library starts its threads
+    _end_if_stuck(CONNECTING)
     try:
         worker = Worker(config)
         worker.connect()
     except (DeviceError, OSError) as failure:
         kind = type(failure) if isinstance(failure, DeviceError) else DeviceNotConnectedError
-        parent.send({"error": str(failure), "kind": kind.__name__})
+        with contextlib.suppress(BrokenPipeError):  # the driver has died
+            parent.send({"error": str(failure), "kind": kind.__name__})
         os._exit(FAILED)
     worker.run(parent)
 

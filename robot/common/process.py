@@ -4,7 +4,8 @@ A message is one line of JSON. Arrays go behind it as bytes: the key "arrays" of
 each. A message with the key "error" says why the child could not do what it was asked; with "kind", a class of
 robot.errors, it is the whole text of that error.
 
-A child ends when its standard input does, so that it never outlives its parent. Ctrl-C reaches the parent alone.
+A child ends when its standard input does or its parent is gone, so that it never outlives that one. Signals that end a
+program (Ctrl-C, SIGTERM, a lost terminal) are for the parent alone, which ends its children in order.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,24 @@ Message = tuple[dict[str, Any], Arrays]  # what is said, and the arrays with it
 LARGEST = 256 * 2**20  # of an array [bytes]
 LONGEST = 2**20  # of a line [bytes]
 PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
+PARENT_CHECK = 0.2  # a child looks so often whether its parent is there [s]
+ENDING = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
 LAST_LINES = 5  # of a dead child's standard error, in errors
+
+
+@contextlib.contextmanager
+def shielded() -> Iterator[None]:
+    """Processes that this thread starts meanwhile never get the signals that end a program: whoever starts them, must
+    end them. (What a thread blocks its children inherit, from their first moment; ignoring would be for all threads.)
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class Child(Closing):
@@ -68,17 +87,19 @@ class Child(Closing):
         self._lock = threading.RLock()
         self._closed = False
         root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+        # An empty entry would be the working folder, whose socket.py or random.py nobody wants to be executed.
+        path = os.pathsep.join(filter(None, [root, *os.environ.get("PYTHONPATH", "").split(os.pathsep)]))
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            start_new_session=True,  # Ctrl-C is for the parent, which ends its children in order
-            env={**os.environ, **(environment or {}), "PYTHONPATH": path},
-            pass_fds=descriptors,
-        )
+        with shielded():
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", module, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                start_new_session=True,
+                env={**os.environ, **(environment or {}), "PYTHONPATH": path},
+                pass_fds=descriptors,
+            )
         self.pid = self._process.pid
         self.ready: dict[str, Any] = {}
         if ready_timeout is not None:
@@ -200,7 +221,11 @@ class Parent:
         write_message(self._answers, message, arrays)
 
     def serve(self, answer: Callable[[dict[str, Any], Arrays], Message]) -> None:
-        """Answers requests until standard input ends. Whatever `answer` raises goes to the parent as an error."""
+        """Answers requests until standard input ends. Whatever `answer` raises goes to the parent as an error.
+
+        When the parent is gone, the process ends also in the middle of an answer, or where a copy of the parent (a fork
+        of it) still holds the other end of standard input."""
+        threading.Thread(target=_end_without_parent, args=(os.getppid(),), daemon=True).start()
         while True:
             try:
                 request = read_message(sys.stdin.buffer)
@@ -209,6 +234,12 @@ class Parent:
                 self.send(*answer(*request))
             except Exception as failure:
                 self.send({"error": f"{type(failure).__name__}: {failure}"})
+
+
+def _end_without_parent(parent: int) -> NoReturn:
+    while os.getppid() == parent:
+        time.sleep(PARENT_CHECK)
+    os._exit(1)
 
 
 def write_message(pipe: IO[bytes], message: dict[str, Any], arrays: Arrays | None = None) -> None:

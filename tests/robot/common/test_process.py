@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import signal
 import subprocess
@@ -206,17 +205,48 @@ def test_it_may_be_closed_while_another_thread_waits_for_an_answer(child: Callab
     assert len(failures) == 1 and not alive(running.pid)
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
-def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals) -> None:
-    (tmp_path / "stand_in.py").write_text(STAND_IN.replace("act()", "pass"))
-    code = (
-        "import time; from robot.common.process import Child\n"
-        "child = Child('stand_in', name='stand-in'); child.receive(60.0); print(child.pid, flush=True); time.sleep(600)"
-    )
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_a_signal_to_all_leaves_the_child_to_its_parent(child: Callable[..., Child], number: signal.Signals) -> None:
+    """A lost terminal, `systemctl stop`, Ctrl-C; also before the child has come to set anything up."""
+    early = f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(0.05)\n"
+    with child(stand_in=early + STAND_IN.replace("act()", "pass")) as running:
+        assert running.receive(PATIENCE)[0] == {"ready": True}
+        os.kill(running.pid, number)
+        assert running.ask({"x": 1}, timeout=PATIENCE)[0] == {"echo": {"x": 1}}
+    assert running.exit_status == 0
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()  # here they come as before
+
+
+WAITING = """
+import os, sys, time
+from robot.common.process import Child, write_message
+child = Child("stand_in", name="stand-in")
+child.receive(60.0)
+again = os.fork() if sys.argv[1] == "forked" else 1  # as multiprocessing does: a copy of the pipe stays open
+if sys.argv[1] == "busy":
+    write_message(child._process.stdin, {})
+if again:
+    print(child.pid, again, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "state"),
+    [(signal.SIGKILL, "waits"), (signal.SIGTERM, "waits"), (signal.SIGHUP, "busy"), (signal.SIGKILL, "forked")],
+)
+def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state: str) -> None:
+    (tmp_path / "stand_in.py").write_text(STAND_IN.replace("act()", "time.sleep(600)"))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment) as parent:
+    words = [sys.executable, "-c", WAITING, state]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment) as parent:
         assert parent.stdout is not None
-        pid = int(json.loads(parent.stdout.readline()))
+        pid, copy = map(int, parent.stdout.readline().split())
         assert alive(pid)
         parent.send_signal(end)
-    until(lambda: not alive(pid), "the end of the child")
+        parent.wait()
+        try:
+            until(lambda: not alive(pid), "the end of the child")
+        finally:
+            if copy > 1:
+                os.kill(copy, signal.SIGKILL)

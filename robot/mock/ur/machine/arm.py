@@ -28,6 +28,7 @@ BRAKE = 20.0  # the same in a protective or emergency stop [rad/s^2]
 HOME = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)  # tool down, in front of the base
 HISTORY = 2500  # periods of joint positions that are kept
 REST = 1e-9  # joint speed below which the arm rests [rad/s]
+JUMP = 1.0  # farthest that a motion may take a joint in one period; no arm follows that [rad]
 
 MotionSteps = Iterator[None]  # a motion as a generator: one `yield` is one control period
 
@@ -59,8 +60,8 @@ class Arm:
 
     def follow(self, q: FloatArray) -> None:
         """Asks for joints q at the end of this control period."""
-        if not np.isfinite(q).all():
-            raise ProgramError("motion command with a number that is not finite")
+        if not float(np.abs(q - self.target_q).max()) <= JUMP:  # not a number is none either
+            raise ProgramError(f"motion command that jumps by more than {JUMP:g} rad in one control period")
         if self._next is not None:
             raise ProgramError("another thread is already controlling the robot")
         self._next = q

@@ -9,6 +9,7 @@ controller may only pause it).
 from __future__ import annotations
 
 import math
+import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robot.common.kinematics import JOINT_RANGE
 from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
 from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
@@ -29,6 +31,7 @@ REGISTERS = 48  # of each kind and direction
 POWER_UP = 50  # periods from power on to idle
 RELEASE = 50  # periods from idle to running
 SLIDER_RATE = 5.0  # how fast the speed scaling follows the slider [1/s]
+LINE = 500  # longest text of the log
 UNLOCK_DELAY = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
 
 Version = tuple[int, int, int, int]
@@ -159,7 +162,8 @@ class Machine:
         return self.arm.rests and not compliant
 
     def write_log(self, text: str) -> None:
-        self.log.append((self.time, text))
+        shown = "".join(letter if letter.isprintable() else "?" for letter in text[:LINE])
+        self.log.append((self.time, shown))
 
     # -- program -----------------------------------------------------------------------------------------------------
 
@@ -168,7 +172,12 @@ class Machine:
         if not self.operational:
             self.write_log(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
             return False
-        program = Program(self, text)
+        try:
+            program = Program(self, text)
+        except ProgramError as error:
+            self.stop_reason = f"not run: {error}"
+            self.write_log(self.stop_reason)
+            return False
         if program.kind != "def":
             self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
             return False
@@ -209,6 +218,15 @@ class Machine:
         elif not on and self.safety is Safety.SAFEGUARD_STOP:
             self.safety, self.paused = Safety.NORMAL, False
 
+    def fail(self, error: Exception) -> None:
+        """The arm cannot be computed any more: a safety fault. It stands unloaded where it could last be computed."""
+        traceback.print_exc()
+        self.stop(f"error of the mock: {type(error).__name__}: {error}")
+        self.safety, self.stop_reason = Safety.FAULT, f"fault, error of the mock: {type(error).__name__}: {error}"
+        self.write_log(self.stop_reason)
+        sound = (q for q in reversed(self.arm.history) if float(np.abs(q).max()) <= JOINT_RANGE)
+        self.arm, self.load = Arm(self.arm.kinematics.model, next(sound, np.array(HOME)).tolist()), Load()
+
     def unlock(self) -> bool:
         """Ends a protective stop; False where it is too early."""
         if self.safety is Safety.PROTECTIVE_STOP:
@@ -246,8 +264,14 @@ class Machine:
     # -- one control period ------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """Watchdog, program, motion, forces, safety: in this order."""
+        """Watchdog, program, motion, forces, safety: in this order. Raises nothing."""
         self.ticks += 1
+        try:
+            self._tick()
+        except Exception as error:
+            self.fail(error)
+
+    def _tick(self) -> None:
         self._power()
         if self.watchdog is not None and (self.ticks - self.watchdog_reset) * PERIOD > self.watchdog[1]:
             self.stop(
@@ -268,6 +292,9 @@ class Machine:
             work()
         except ProgramError as error:
             self.stop(str(error))
+        except Exception as error:  # what the mock did not foresee is the end of this program, not of the other arms
+            traceback.print_exc()
+            self.stop(f"error of the mock: {type(error).__name__}: {error}")
 
     def _follow_hand(self) -> None:
         assert self.freedrive is not None

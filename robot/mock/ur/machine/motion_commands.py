@@ -7,7 +7,8 @@ torque, mass matrix, Coriolis torques, external force sensors, force modes 1 and
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +17,7 @@ from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
 from robot.mock.ur.machine.motion import Waypoint
-from robot.mock.ur.machine.registry import command
-from robot.mock.ur.machine.state_commands import finite_joints
+from robot.mock.ur.machine.registry import LARGEST, command
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ CONTACT_FOUND = 254  # the script gives it itself
 CONTACT_FORCE, CONTACT_ONSET = 5.0, 1.0  # a contact is felt from the one, and began at the other [N]
 
 _MOVE = re.compile(r"(movej|movel|movep)\((p?)\[([^\]]*)\],\s*a=([^,]+),\s*v=([^,]+)(?:,\s*r=([^,)]+))?\)")
-_PROGRESS = re.compile(r"signal_async_progress\((\d+)\)")
+_PROGRESS = re.compile(r"signal_async_progress\((\d{1,9})\)")
 
 # -- moves -----------------------------------------------------------------------------------------------------------
 
@@ -50,20 +50,30 @@ def _forward(p: Program, q: FloatArray) -> FloatArray:
     return p.arm.kinematics.forward(q, p.arm.tool)
 
 
+def _numbers(texts: Sequence[str | None], count: int) -> FloatArray:
+    """Of a line of a path; what is left out is 0."""
+    try:
+        values = np.array([float(text or 0) for text in texts])
+    except ValueError:
+        values = np.array([])
+    if len(values) != count or not float(np.abs(values).max()) <= LARGEST:
+        raise ProgramError(f"path: a waypoint needs six numbers, a, v and r, got {texts}"[:200])
+    return values
+
+
 def _path(p: Program) -> MotionSteps:
     """The path in the text. Blended waypoints are one motion; their progress is signalled when it begins."""
-    block = re.search(r"# inject move path\n(.*?)\n\s*end", p.text, re.S)
+    lines = map(str.strip, p.text.partition("# inject move path\n")[2].splitlines())
     waiting: list[Waypoint] = []
-    for line in filter(None, map(str.strip, block.group(1).splitlines() if block else ())):
+    for line in filter(None, takewhile(lambda line: not line.startswith("end"), lines)):
         if progress := _PROGRESS.fullmatch(line):
             p.signal(int(progress.group(1)))
             continue
         move = _MOVE.fullmatch(line)
         if move is None:
-            raise ProgramError(f"path: the mock does not know '{line}'")
+            raise ProgramError(f"path: the mock does not know '{line[:80]}'")
         kind, is_pose, numbers, *rest = move.groups()
-        target = np.array([float(number) for number in numbers.split(",")])
-        acceleration, speed, blend = (float(number or 0) for number in rest)
+        target, (acceleration, speed, blend) = _numbers(numbers.split(","), 6), _numbers(rest, 3)
         if kind == "movej":
             yield from motion.path(p.arm, waiting)
             waiting = []
@@ -80,7 +90,7 @@ def _path(p: Program) -> MotionSteps:
 _move(1, lambda p: motion.movej(p.arm, p.doubles(0), p.double(7), p.double(6)))
 _move(2, lambda p: motion.movej(p.arm, p.arm.solve(p.frame(0)), p.double(7), p.double(6)))
 _move(3, lambda p: motion.movel(p.arm, p.frame(0), p.double(7), p.double(6)))
-_move(4, lambda p: motion.movel(p.arm, _forward(p, finite_joints(p)), p.double(7), p.double(6)))
+_move(4, lambda p: motion.movel(p.arm, _forward(p, p.doubles(0)), p.double(7), p.double(6)))
 _move(45, _path)
 
 

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 Work = Callable[["Program"], MotionSteps | None]
 
+LARGEST = 1e6  # of a number in a command; what a controller takes is not known, and no arm needs more [SI]
+
 
 @dataclass(frozen=True)
 class Command:

@@ -8,7 +8,7 @@ it, and the path that was written into it. Its loop, its threads and its answers
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion_commands, state_commands  # noqa: F401  # their functions enter COMMANDS
 from robot.mock.ur.machine.arm import Arm, MotionSteps, ProgramError
-from robot.mock.ur.machine.registry import COMMANDS
+from robot.mock.ur.machine.registry import COMMANDS, LARGEST
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 READY, DONE = 1, 2  # answers in output_int_register_0
 STOP_SCRIPT = 255  # the command that ends the script
+LAST_OFFSET = 24  # of the registers: ur_rtde uses the 24 of each kind that begin at 0, or at 24
 _ENDED = object()
 
 
@@ -34,7 +35,7 @@ class Program:
         self.machine: Machine = machine
         self.arm: Arm = machine.arm
         self.text = _of_version(text, machine.version)
-        named = re.search(r"^\s*(def|sec)\s+(\w+)", self.text, re.M)
+        named = re.search(r"^[ \t]*(def|sec)[ \t]+(\w+)", self.text, re.M)
         self.kind, self.name = named.groups() if named else ("", "?")
         self.known = self.name == "rtde_control"
         self.int_offset, self.float_offset = (self._offset(kind) for kind in ("int", "float"))
@@ -64,18 +65,19 @@ class Program:
     # -- registers ---------------------------------------------------------------------------------------------------
 
     def double(self, index: int) -> float:
-        return self.machine.in_double[index + self.float_offset]
+        return float(self.doubles(index, 1)[0])
 
     def doubles(self, first: int, count: int = 6) -> FloatArray:
+        """Numbers of a command (count,). Raises ProgramError for any that no arm could follow."""
         begin = first + self.float_offset
-        return np.array(self.machine.in_double[begin : begin + count])
+        values = np.array(self.machine.in_double[begin : begin + count])
+        if not float(np.abs(values).max()) <= LARGEST:
+            raise ProgramError(f"command with a number that is not finite, or beyond {LARGEST:g}: {values.tolist()}")
+        return values
 
     def frame(self, first: int) -> FloatArray:
         """The pose in six registers, as frame (4, 4)."""
-        values = self.doubles(first)
-        if not np.isfinite(values).all():
-            raise ProgramError("pose with a number that is not finite")
-        return matrix(values)
+        return matrix(self.doubles(first))
 
     def integer(self, index: int) -> int:
         return self.machine.in_int[index + self.int_offset]
@@ -89,7 +91,10 @@ class Program:
 
     def _offset(self, kind: str) -> int:
         found = re.search(rf"reg_offset_{kind} = # {kind} register offset\s*(\d+)", self.text)
-        return int(found.group(1)) if found else 0
+        offset = found.group(1) if found else "0"
+        if len(offset) > 9 or int(offset) > LAST_OFFSET:
+            raise ProgramError(f"{kind} register offset {offset[:9]}: at most {LAST_OFFSET}")
+        return int(offset)
 
     # -- threads -----------------------------------------------------------------------------------------------------
 
@@ -170,15 +175,8 @@ def _go_on(work: MotionSteps) -> bool:
 def _of_version(text: str, version: tuple[int, ...]) -> str:
     """The text without lines for newer controllers. `$5.10|3.15 line` needs 5.10, or 3.15 of that major version."""
 
-    def kept(line: str) -> Iterator[str]:
-        mark = re.match(r"\s*\$([\d.|]+)(.*)", line)
-        if mark is None:
-            yield line
-            return
-        for least in mark.group(1).split("|"):
-            wanted = tuple(int(number) for number in least.split(".") if number)
-            if wanted[:1] == version[:1] and version >= wanted:
-                yield mark.group(2)
-                return
+    def kept(line: re.Match[str]) -> str:
+        needed = (tuple(int(number) for number in least.split(".") if number) for least in line[1].split("|"))
+        return line[2] if any(least[:1] == version[:1] and version >= least for least in needed) else ""
 
-    return "\n".join(part for line in text.splitlines() for part in kept(line))
+    return re.sub(r"^[ \t]*\$([\d.|]{1,99})(.*)", kept, text, flags=re.M)

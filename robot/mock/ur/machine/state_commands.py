@@ -30,7 +30,7 @@ def zero_sensor(p: Program) -> None:
 def payload(p: Program) -> None:
     """A centre of gravity that is all zero keeps the one before: the script has it so."""
     mass, centre, load = p.double(0), p.doubles(1, 3), p.machine.load
-    if not (0 <= mass < np.inf and np.isfinite(centre).all()):
+    if mass < 0:
         raise ProgramError(f"set_payload: mass {mass:g} kg, centre {centre.tolist()} m")
     load.told = Mass.of([mass, *(centre if centre.any() else load.told.centre)])
 
@@ -94,13 +94,6 @@ def external_sensor(p: Program) -> None:
 # -- queries ---------------------------------------------------------------------------------------------------------
 
 
-def finite_joints(p: Program, first: int = 0) -> FloatArray:
-    q = p.doubles(first)
-    if not np.isfinite(q).all():
-        raise ProgramError("joints with a number that is not finite")
-    return q
-
-
 def _reaches(p: Program, seed: FloatArray) -> bool:
     return p.arm.kinematics.inverse(p.frame(0), seed, p.arm.tool) is not None
 
@@ -122,13 +115,13 @@ def _query(
 
 
 _query(46, read=lambda p: p.arm.solve(p.frame(0)))
-_query(30, read=lambda p: p.arm.solve(p.frame(0), finite_joints(p, 6)))
+_query(30, read=lambda p: p.arm.solve(p.frame(0), p.doubles(6)))
 _query(36, read=lambda p: _reaches(p, p.arm.target_q))
 _query(60, read=lambda p: _reaches(p, p.arm.target_q), needs="get_inverse_kin_has_solution(")
-_query(61, read=lambda p: _reaches(p, finite_joints(p, 6)), needs="get_inverse_kin_has_solution(")
+_query(61, read=lambda p: _reaches(p, p.doubles(6)), needs="get_inverse_kin_has_solution(")
 _query(37, read=lambda p: bool(np.abs(p.doubles(0)).max() <= 2 * np.pi))
 _query(39, read=lambda p: pose(p.frame(0) @ p.frame(6)))
-_query(44, read=lambda p: pose(p.arm.kinematics.forward(finite_joints(p), p.frame(6))))
+_query(44, read=lambda p: pose(p.arm.kinematics.forward(p.doubles(0), p.frame(6))))
 _query(40, read=lambda p: pose(p.arm.tool), needs="get_tcp_offset(")
 _query(43, read=lambda p: pose(p.arm.target_frame))
 _query(58, read=lambda p: pose(p.arm.kinematics.forward(p.arm.q)), every_cycle=True)

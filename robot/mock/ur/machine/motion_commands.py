@@ -64,8 +64,9 @@ def _numbers(texts: Sequence[str | None], count: int) -> FloatArray:
 def _path(p: Program) -> MotionSteps:
     """The path in the text. Blended waypoints are one motion; their progress is signalled when it begins."""
     lines = map(str.strip, p.text.partition("# inject move path\n")[2].splitlines())
+    block = takewhile(lambda line: not line.startswith("end"), lines)
     waiting: list[Waypoint] = []
-    for line in filter(None, takewhile(lambda line: not line.startswith("end"), lines)):
+    for line in filter(None, block):
         if progress := _PROGRESS.fullmatch(line):
             p.signal(int(progress.group(1)))
             continue

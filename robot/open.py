@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from tacsim.config import LoadedRig, load_rig
+from tacsim.interface import RigSpec
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.rig import Rig
@@ -28,6 +29,7 @@ def open_rig(
     overrides: Sequence[str] = (),
     confirm: Callable[[str], bool] | None = None,
     dry_run: bool = False,
+    check: Callable[[RigSpec], None] | None = None,
 ) -> Rig:
     """Opens a rig by its name ("sim", "mock", "ur5e", "replay"), the path of its file, or a loaded configuration.
 
@@ -37,6 +39,7 @@ def open_rig(
         task, overrides: as for tacsim.config.load_rig; not for a configuration that is loaded already.
         confirm: asks a person a question and returns the answer; real arms approach nothing without a yes.
         dry_run: a rig of hardware does everything but move.
+        check: is told what the rig delivers, before anything of its hardware is opened; raises to refuse it.
 
     Raises:
         ConfigError: the file is wrong.
@@ -56,14 +59,22 @@ def open_rig(
     if config.clock == "wall":  # each kind loads what it needs and no more
         from robot.rig.hardware_rig import open_hardware
 
-        return open_hardware(config, confirm, dry_run=dry_run)
+        return open_hardware(config, confirm, dry_run=dry_run, check=check)
     if config.clock == "sim":
         from robot.rig.sim_rig import open_sim
 
-        return open_sim(config)
-    from robot.rig.replay_rig import open_replay
+        opened = open_sim(config)
+    else:
+        from robot.rig.replay_rig import open_replay
 
-    return open_replay(config)
+        opened = open_replay(config)
+    if check is not None:
+        try:
+            check(opened.spec)
+        except BaseException:
+            opened.close()
+            raise
+    return opened
 
 
 def make_env(

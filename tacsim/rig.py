@@ -100,10 +100,7 @@ class Rig:
 
     def require(self, needs: Needs, who: str) -> None:
         """Raises IncompatibleRig with the difference when `who` needs what this rig does not deliver."""
-        missing = needs.missing(self.spec)
-        if missing:
-            has = f"sensors {', '.join(self.spec.sensors)}; arms {', '.join(self.spec.arms) or '(none)'}"
-            raise IncompatibleRig(f"{who} cannot run on rig '{self.name}': it lacks {'; '.join(missing)}. It has {has}")
+        require(self.name, self.spec, needs, who)
 
     def reset(self, seed: int = 0) -> Observation:
         """Starts an episode: references without contact, then gentle contact. The same seed gives the same start."""
@@ -173,6 +170,15 @@ class Rig:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def require(rig: str, spec: RigSpec, needs: Needs, who: str, advice: str = "") -> None:
+    """Raises IncompatibleRig with the difference, and `advice`, when `who` needs what the rig does not deliver."""
+    missing = needs.missing(spec)
+    if missing:
+        has = f"sensors {', '.join(spec.sensors)}; arms {', '.join(spec.arms) or '(none)'}"
+        words = f"{who} cannot run on rig '{rig}': it lacks {'; '.join(missing)}. It has {has}"
+        raise IncompatibleRig(f"{words}. {advice}" if advice else words)
 
 
 def _run_all(calls: list[Callable[[], None]]) -> None:

@@ -15,17 +15,22 @@ from tacsim.models.hardware import UrArmConfig
 
 
 def check_host(config: UrArmConfig, name: str) -> None:
-    """Raises DeviceNotConnectedError unless a mock is on loopback and a real arm is not."""
+    """Raises DeviceNotConnectedError unless a mock or simulator is on loopback and a real arm is not."""
     loopback = is_loopback(config.host)
     if config.mock is not None and not loopback:
         raise DeviceNotConnectedError(
             f"arm '{name}' has a `mock:` block, but its host {config.host} is outside this machine; a mock's host is a "
             "loopback address such as 127.0.0.2. Remove `mock:` to talk to the real arm"
         )
-    if config.mock is None and loopback:
+    if config.simulator and not loopback:
+        raise DeviceNotConnectedError(
+            f"arm '{name}' is said to be a simulator (`simulator: true`), but its host {config.host} is outside this "
+            "machine, where a real arm may answer; remove `simulator: true`, or give the simulator's loopback address"
+        )
+    if config.mock is None and not config.simulator and loopback:
         raise DeviceNotConnectedError(
             f"arm '{name}' is a real one, but its host {config.host} is this machine; give its address, or add `mock: "
-            "{}` for a mock controller"
+            "{}` for a mock controller, or `simulator: true` for the maker's simulator (URSim)"
         )
 
 

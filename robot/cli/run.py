@@ -18,18 +18,21 @@ from robot.cli.output import ask, busy, new_directory, notes, progress, results,
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
     from tacsim.config import LoadedRig
-    from tacsim.interface import Policy
+    from tacsim.interface import Policy, RigSpec
     from tacsim.record.episode import Episode, EpisodeMeta, Step
     from tacsim.record.writer import Recorder
     from tacsim.rig import Rig
     from tacsim.tasks import Task
 
 STARTING = "starting (the first run compiles the kernels, up to half a minute)"
-NO_END = 1_000_000  # steps of a rig without task: its recording ends it
+NO_END = 1_000_000  # steps of a replay: its recording ends it
+WITHOUT_TASK = 40  # steps where neither a task nor a recording has an end
 
 
 def run(
-    rig: Annotated[str, typer.Argument(help="A rig (sim, mock, ur5e, replay), or the path of its file.")] = "sim",
+    rig: Annotated[
+        str, typer.Argument(help="A rig (sim, mock, ur5e, ur5e-one, replay), or the path of its file.")
+    ] = "sim",
     task: Annotated[
         str | None, typer.Option(help="squeeze, reposition, or the path of a task file.", show_default="the rig's own")
     ] = None,
@@ -38,7 +41,7 @@ def run(
         typer.Option(help="scripted, grip, or package.module:name.", show_default="scripted; grip without a task"),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=0, help="Exactly so many control steps.", show_default="the task's")
+        int | None, typer.Option(min=0, help="Exactly so many control steps.", show_default="the task's; else 40")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episode.")] = 0,
     dry_run: Annotated[
@@ -59,7 +62,8 @@ def run(
     own_task = loaded.config.task
     folder = new_directory(out, loaded.config.name if own_task is None else own_task.kind)
     if steps is None:
-        steps = NO_END if own_task is None else own_task.steps
+        endless = NO_END if loaded.config.clock == "replay" else WITHOUT_TASK
+        steps = endless if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     with Interrupt() as interrupt:
@@ -78,7 +82,7 @@ def _run(
     run that cannot start leaves none."""
     with busy("loading"):
         from robot.deploy.control_loop import EpisodeSetup
-        from robot.deploy.policy import load_policy
+        from robot.deploy.policy import load_policy, require_fit
         from robot.open import open_rig
         from tacsim.physics.failure.dump import dumps_in
         from tacsim.record.writer import Recorder
@@ -88,18 +92,26 @@ def _run(
     task = None if loaded.config.task is None else make_task(loaded.config.task)
     setup = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()})
     recorder: Recorder | None = None
-    with dumps_in(folder / "diverged"), open_rig(loaded, confirm=ask, dry_run=dry_run) as rig:
-        acting = load_policy(policy, task, rig.spec)
-        with ExitStack() as stack:
+    fitting: list[Policy] = []
 
-            def record(meta: EpisodeMeta) -> Recorder:
-                nonlocal recorder
-                with writing(folder, new=True):
-                    file = Recorder(folder / "episode.mcap", meta, pitch=loaded.config.canonical.pitch)
-                    recorder = stack.enter_context(file)
-                return recorder
+    def fit(spec: RigSpec) -> None:
+        fitting.append(load_policy(policy, task, spec))
+        require_fit(loaded.config.name, spec, fitting[0], policy, task)
 
-            episode, failure = _drive(rig, acting, task, steps, setup, record, interrupt)
+    with (
+        dumps_in(folder / "diverged"),
+        open_rig(loaded, confirm=ask, dry_run=dry_run, check=fit) as rig,
+        ExitStack() as stack,
+    ):
+
+        def record(meta: EpisodeMeta) -> Recorder:
+            nonlocal recorder
+            with writing(folder, new=True):
+                file = Recorder(folder / "episode.mcap", meta, pitch=loaded.config.canonical.pitch)
+                recorder = stack.enter_context(file)
+            return recorder
+
+        episode, failure = _drive(rig, fitting[0], task, steps, setup, record, interrupt)
     lost = ""
     if recorder is not None and (recorder.error or recorder.dropped):
         why = recorder.error or "the disk was too slow"

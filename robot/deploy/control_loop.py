@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Protocol
 
+from robot.deploy.policy import require_fit
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.record.episode import Episode, EpisodeMeta, Step
@@ -76,9 +77,7 @@ def run_episode(
     """
     if steps < 0:
         raise ValueError(f"steps must be 0 or more, got {steps}")
-    rig.require(policy.needs, f"policy '{setup.policy}'")
-    if task is not None:
-        rig.require(task.needs, f"task '{task.config.kind}'")
+    require_fit(rig.name, rig.spec, policy, setup.policy, task)
     started = time.perf_counter()
     observation = rig.reset(setup.seed)
     start = rig.truth()

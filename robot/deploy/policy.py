@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tacsim.interface import Action, Needs, Observation, Policy, RigSpec
+from tacsim.rig import require
 from tacsim.tasks import Task
 
 PACKAGES = ("tacsim", "calibration", "robot")
@@ -55,6 +56,16 @@ def load_policy(name: str, task: Task | None, spec: RigSpec) -> Policy:
     if ":" not in name:
         raise PolicyNotFound(f"no policy '{name}'; allowed: 'scripted', 'grip', or 'package.module:attribute'")
     return _as_policy(_attribute(name), name)
+
+
+def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task | None) -> None:
+    """Raises IncompatibleRig, which says what to choose instead, where a rig that delivers `spec` lacks what the task
+    or the policy called `name` needs."""
+    if task is not None:
+        advice = "Leave the task out (task: null in the rig file, or --set task=null): then nothing is judged"
+        require(rig, spec, task.needs, f"task '{task.config.kind}'", advice)
+    advice = "" if name == "grip" else "Take --policy grip, which needs pictures alone, or one of your own"
+    require(rig, spec, policy.needs, f"policy '{name}'", advice)
 
 
 def _attribute(name: str) -> object:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 
 from calibration.errors import error_context
 from calibration.normaliser import FrameNormaliser, normaliser_for_camera, normaliser_for_simulation
 from robot.arm.ur import URArm
+from robot.arm.worker_config import check_host
 from robot.camera.camera import Camera
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock.cell.cell import MockCell
@@ -19,25 +19,21 @@ from robot.rig.reset import HardwareReset
 from tacsim.control.contact_signal import contact_signal
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
-from tacsim.interface import Normaliser, Pose, SensorSpec, TactileFrame, TactileSource
+from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.report.diagnostics import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
 
 Confirm = Callable[[str], bool]
-QUESTION = "Is the body in its place between the sensors, and everybody out of reach of the arms?"
+QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
 
 
 class CellSensor:
     """A simulated sensor on a real or mock arm, without a camera: the mock cell's gel at the arm's measured pose."""
 
     def __init__(self, cell: MockCell, name: str, config: SimSensorConfig) -> None:
-        geometry = config.model.geometry
-        self._cell, self._name = cell, name
-        self.spec = SensorSpec(
-            (geometry.height, geometry.width), height=True, flow=config.model.markers is not None, arm=config.arm
-        )
+        self._cell, self._name, self.spec = cell, name, _sensor_spec(config)
 
     def read(self, timeout: float) -> TactileFrame:
         """The picture of the newest simulated state. Raises TimeoutError when there is none within `timeout` [s]."""
@@ -52,18 +48,32 @@ class CellSensor:
         """The rig closes the cell."""
 
 
-def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool = False) -> Rig:
+def open_hardware(
+    config: RigConfig,
+    confirm: Confirm | None,
+    *,
+    dry_run: bool = False,
+    check: Callable[[RigSpec], None] | None = None,
+) -> Rig:
     """Opens a rig of hardware. Starts the mocks that its file asks for. Connects; moves nothing.
 
     confirm: asks a person before anything approaches the body; not needed where all arms are mocks.
     dry_run: connects, observes and records, but sends no motion, neither in a reset nor in a step.
+    check: is told what the rig delivers before anything is opened; raises to refuse it.
 
     Raises DeviceError for what cannot be opened, calibration.errors.CalibrationError for a calibration,
     ValueError for a rig that makes no sense.
     """
     real = [name for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is None]
-    # first: a wrong calibration is known before anything is connected
+    # first: a wrong calibration, host or limit, and what lacks, are known before anything is connected
     normalisers = {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()}
+    spec = _spec(config, normalisers)
+    _gel_monitor(config, spec.sensors, {})
+    for name, arm in config.arms.items():
+        assert isinstance(arm, UrArmConfig)
+        check_host(arm, name)
+    if check is not None:
+        check(spec)
     with ExitStack() as stack:
         cell = stack.enter_context(MockCell(config))
         sensors: dict[str, TactileSource] = {}
@@ -89,9 +99,8 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
             clock = WallClock(config.period, cell.catch_up)
         else:
             clock = WallClock(config.period)
-        for name, camera in cameras.items():  # what the normaliser finds in the picture is delivered too
-            normaliser = normalisers[name]
-            camera.spec = replace(camera.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
+        for name, camera in cameras.items():
+            camera.spec = spec.sensors[name]
         task = config.task
         reset = HardwareReset(
             arms={} if dry_run else arms,
@@ -120,11 +129,30 @@ def open_hardware(config: RigConfig, confirm: Confirm | None, *, dry_run: bool =
             truth=cell.truth if cell.knows_truth else None,
             diagnostics=diagnostics,
             on_close=cell.close,
-            on_tactile=_gel_monitor(config, sensors, arms),
+            on_tactile=_gel_monitor(config, spec.sensors, arms),
             load_control=load_controller(config.task),
         )
         stack.pop_all()
         return rig
+
+
+def _spec(config: RigConfig, normalisers: Mapping[str, FrameNormaliser]) -> RigSpec:
+    """What the rig will deliver; for cameras also what the normaliser finds in the picture."""
+    sensors = {}
+    for name, sensor in config.sensors.items():
+        if isinstance(sensor, CameraSensorConfig):
+            found = normalisers[name]
+            size = (sensor.height, sensor.width)
+            sensors[name] = SensorSpec(size, height=found.finds_height, flow=found.finds_flow, arm=sensor.arm)
+        else:
+            assert isinstance(sensor, SimSensorConfig)
+            sensors[name] = _sensor_spec(sensor)
+    return RigSpec(sensors, tuple(config.arms), MockCell.will_know_truth(config), config.period)
+
+
+def _sensor_spec(config: SimSensorConfig) -> SensorSpec:
+    geometry, markers = config.model.geometry, config.model.markers
+    return SensorSpec((geometry.height, geometry.width), height=True, flow=markers is not None, arm=config.arm)
 
 
 def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
@@ -168,15 +196,13 @@ def _contact_measure(
     return contact_by_force
 
 
-def _gel_monitor(
-    config: RigConfig, sensors: Mapping[str, TactileSource], arms: Mapping[str, CommandedArm]
-) -> GelMonitor:
+def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Mapping[str, CommandedArm]) -> GelMonitor:
     """Reports to the arms what their gels show, and guards the gels. Raises DeviceError for a limit that cannot be
     guarded because its sensor delivers no height or flow."""
     limits = {name: arm.limits for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
     report = {name: arm.driver.report_tactile for name, arm in arms.items()}
     try:
-        return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, report, SafetyViolation)
+        return GelMonitor(sensors, limits, report, SafetyViolation)
     except ValueError as failure:
         raise DeviceError(str(failure)) from None
 
@@ -184,7 +210,10 @@ def _gel_monitor(
 def _confirmation(config: RigConfig, cell: MockCell, confirm: Confirm | None, *, real: bool) -> Callable[[], bool]:
     def ask() -> bool:
         if real:
-            return confirm is not None and confirm(f"Rig '{config.name}': {QUESTION}")
+            question = (
+                QUESTION if len(config.arms) == 1 else QUESTION.replace("sensor", "sensors").replace("arm", "arms")
+            )
+            return confirm is not None and confirm(f"Rig '{config.name}': {question}")
         cell.place()
         return True
 

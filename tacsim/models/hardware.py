@@ -123,7 +123,15 @@ class UrArmConfig(Config):
     lookahead: Annotated[Time, Field(ge=0.03, le=0.2)] = 0.03  # of servoj [s]
     gain: Annotated[float, Field(ge=100, le=2000)] = 600.0  # of servoj
     latency: Annotated[Time, Field(ge=0, le=1.0)] = 0.0  # how old a state is when its package arrives [s]
+    # The controller at `host` is the maker's simulator (URSim) on this machine; in all else it counts as a real arm.
+    simulator: bool = False
     mock: MockArmConfig | None = None
+
+    @model_validator(mode="after")
+    def _simulator_or_mock(self) -> Self:
+        if self.simulator and self.mock is not None:
+            raise ValueError("is either a maker's simulator (simulator: true) or our mock (mock: {}), not both")
+        return self
 
     @model_validator(mode="after")
     def _real_arms_have_a_watchdog(self) -> Self:

@@ -64,7 +64,7 @@ class MockCell(Closing):
         self._failure: Exception | None = None  # of that thread
         self._steps = 0  # of that thread
         with ExitStack() as stack:
-            models = self._models()
+            models = _models(config)
             if config.scene is not None and models:
                 self._sim_server = stack.enter_context(
                     SimServer(config.scene, models, config.canonical, config.contact)
@@ -84,17 +84,6 @@ class MockCell(Closing):
                 self._controllers = stack.enter_context(controllers)
                 self.faults = dict(zip(self._arms, controllers.fault_clients, strict=True))
             self._mocks = stack.pop_all()
-
-    def _models(self) -> dict[str, SensorModel]:
-        """Of the sensors that are simulated: before a mock camera, or read without one."""
-        found: dict[str, SensorModel] = {}
-        for name, sensor in self._config.sensors.items():
-            if isinstance(sensor, SimSensorConfig):
-                found[name] = sensor.model
-            elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-                assert sensor.model is not None  # the loader refuses a mock camera without one
-                found[name] = sensor.model
-        return found
 
     def _start_pose(self, name: str, arm: UrArmConfig) -> Pose:
         """By the rig file; else where the scene has the arm's sensor at its beginning."""
@@ -133,8 +122,13 @@ class MockCell(Closing):
     @property
     def knows_truth(self) -> bool:
         """True if there is a simulated body."""
-        scene = self._config.scene
-        return self.simulated and self._config.contact == "simulated" and scene is not None and scene.body is not None
+        return self.will_know_truth(self._config)
+
+    @staticmethod
+    def will_know_truth(config: RigConfig) -> bool:
+        """Whether the cell of a rig file has a simulated body."""
+        body = None if config.scene is None else config.scene.body
+        return body is not None and config.contact == "simulated" and bool(_models(config))
 
     @property
     def scene_frame(self) -> SceneFrame | None:
@@ -233,6 +227,18 @@ class MockCell(Closing):
         if self._follower is not None:
             self._follower.join(5.0)
         self._mocks.close()  # each is closed even when another fails
+
+
+def _models(config: RigConfig) -> dict[str, SensorModel]:
+    """Of the sensors that are simulated: before a mock camera, or read without one."""
+    found: dict[str, SensorModel] = {}
+    for name, sensor in config.sensors.items():
+        if isinstance(sensor, SimSensorConfig):
+            found[name] = sensor.model
+        elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
+            assert sensor.model is not None  # the loader refuses a mock camera without one
+            found[name] = sensor.model
+    return found
 
 
 def _camera(name: str, config: CameraSensorConfig) -> MockCamera:

@@ -186,6 +186,10 @@ def test_mock_and_real_are_never_mistaken(mock: MockUR, monkeypatch: pytest.Monk
     for host in (HOST, "localhost", "127.0.0.1", "::1"):
         with pytest.raises(DeviceNotConnectedError, match="is this machine"):
             URArm(config(host, mock=None), "left").close()
+    with pytest.raises(DeviceNotConnectedError, match=r"`simulator: true`.*outside this machine"):
+        URArm(config("192.0.2.7", mock=None, simulator=True), "left").close()
+    with pytest.raises(DeviceNotConnectedError, match="is a mock controller"):  # no simulator of the maker
+        URArm(config(mock=None, simulator=True), "left").close()
     assert MOCK_SERIAL  # a mock that is reached under another address gives itself away
     monkeypatch.setattr(ur, "check_host", lambda *_: None)
     with pytest.raises(DeviceNotConnectedError, match="is a mock controller"):

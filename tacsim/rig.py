@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, Self
 
@@ -103,11 +104,13 @@ class Rig:
         require(self.name, self.spec, needs, who)
 
     def reset(self, seed: int = 0) -> Observation:
-        """Starts an episode: references without contact, then gentle contact. The same seed gives the same start."""
-        self.references = dict(self._reset.clear(seed))
-        for name, normaliser in self.normalisers.items():
-            normaliser.take_reference(self.references[name])
-        self._reset.touch()
+        """Starts an episode: references without contact, then gentle contact. The same seed gives the same start. A
+        reset that fails leaves the arms stopped."""
+        with self._stopped_together():
+            self.references = dict(self._reset.clear(seed))
+            for name, normaliser in self.normalisers.items():
+                normaliser.take_reference(self.references[name])
+            self._reset.touch()
         if self._load_control is not None:
             self._load_control.reset()
         return self.observe()
@@ -132,12 +135,14 @@ class Rig:
         """One control period: commands the arms, lets the clock run, observes.
 
         Returns the observation and what each arm was really sent (None: nothing was executed).
-        Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged.
+        Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged. An
+        arm that cannot follow stops the others.
         """
         check_action(action, self._addressable, self.name)
         if self._load_control is not None:
             action = self._load_control(action, self._arm_states)
-        sent: dict[str, Pose | None] = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
+        with self._stopped_together():
+            sent = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
         if self._load_control is not None:
             self._load_control.sent(sent)
         self._clock.tick()
@@ -160,10 +165,20 @@ class Rig:
         _run_all([arm.stop for arm in self.arms.values()])
 
     def close(self) -> None:
-        """Stops the arms and closes everything, each even when another fails."""
-        arms = [step for arm in self.arms.values() for step in (arm.stop, arm.close)]
+        """Stops all arms, then closes everything, each even when another fails."""
+        arms = [*(arm.stop for arm in self.arms.values()), *(arm.close for arm in self.arms.values())]
         others = [] if self._on_close is None else [self._on_close]
         _run_all([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
+
+    @contextmanager
+    def _stopped_together(self) -> Iterator[None]:
+        """No arm goes on when something fails that concerns all of them."""
+        try:
+            yield
+        except BaseException:
+            with suppress(Exception):  # what failed first is raised
+                self.stop()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -182,14 +197,15 @@ def require(rig: str, spec: RigSpec, needs: Needs, who: str, advice: str = "") -
 
 
 def _run_all(calls: list[Callable[[], None]]) -> None:
-    """Runs all calls, then raises what failed."""
-    failures: list[Exception] = []
+    """Runs all calls, then raises what failed; also when they are interrupted: every arm must get its stop."""
+    failures: list[BaseException] = []
     for call in calls:
         try:
             call()
-        except Exception as failure:  # every arm must get its stop
+        except BaseException as failure:
             failures.append(failure)
-    if len(failures) == 1:
-        raise failures[0]
+    for each in failures:
+        if len(failures) == 1 or not isinstance(each, Exception):
+            raise each
     if failures:
-        raise ExceptionGroup("several parts of the rig failed to stop or close", failures)
+        raise BaseExceptionGroup("several parts of the rig failed to stop or close", failures)

@@ -212,6 +212,61 @@ def test_everything_is_closed_even_when_parts_fail() -> None:
     assert [str(failure) for failure in caught.value.exceptions] == ["stop failed", "close failed", "close failed"]
 
 
+class Hand(Parts):
+    """One of several arms, which note in one log. `broken`: what it fails at, and how."""
+
+    def __init__(self, name: str, log: list[str], broken: Mapping[str, BaseException] | None = None) -> None:
+        super().__init__()
+        self.name, self.log, self.fails = name, log, broken or {}
+
+    def note(self, what: str) -> None:
+        self.log.append(f"{self.name} {what}")
+        if what in self.fails:
+            raise self.fails[what]
+
+
+def two_hands(**left_fails: BaseException) -> tuple[Rig, list[str]]:
+    log: list[str] = []
+    parts = Parts(arm=None)
+    parts.log = log
+    arms = {"left": Hand("left", log, left_fails), "right": Hand("right", log)}
+    normalisers = {"finger": parts}
+    made = Rig(name="two", sensors={"finger": parts}, arms=arms, clock=parts, normalisers=normalisers, reset=parts)
+    return made, log
+
+
+@pytest.mark.parametrize("failure", [None, OSError("gone"), KeyboardInterrupt()])
+@pytest.mark.parametrize("part", ["stop", "close"])
+def test_all_arms_are_stopped_before_any_is_closed(part: str, failure: BaseException | None) -> None:
+    """Closing an arm takes a second; the others must not move meanwhile. Nor may one that fails keep them from it."""
+    rig, log = two_hands(**({} if failure is None else {part: failure}))
+    if failure is None:
+        rig.close()
+    else:
+        with pytest.raises(type(failure)):
+            rig.close()
+    assert log == ["left stop", "right stop", "left close", "right close", "close"]
+
+
+@pytest.mark.parametrize("failure", [OSError("gone"), KeyboardInterrupt()])
+def test_when_an_arm_refuses_its_part_of_a_step_all_are_stopped(failure: BaseException) -> None:
+    rig, log = two_hands()
+    rig.reset()
+    rig.arms["right"].fails = {"command move": failure}  # type: ignore[attr-defined]
+    log.clear()
+    with pytest.raises(type(failure)):
+        rig.step(Action({"left": FORWARD, "right": FORWARD}))
+    assert log == ["left command move", "right command move", "left stop", "right stop"]
+
+
+@pytest.mark.parametrize("phase", ["clear 3", "touch"])
+def test_a_reset_that_fails_stops_all_arms(phase: str) -> None:
+    parts = Parts(broken=(phase,))
+    with pytest.raises(OSError, match=f"{phase} failed"):
+        make_rig(parts).reset(3)
+    assert parts.log[-1] == "stop"
+
+
 def test_each_sensor_needs_its_normaliser() -> None:
     parts = Parts()
     with pytest.raises(ValueError, match=r"sensors \['finger'\] but normalisers \[\]"):

@@ -2,7 +2,8 @@
 
 A test marked `@pytest.mark.promise(n)` may take the fixture `figure` and say what it measured. In `make test` nobody
 keeps that; `pytest -m promise --repeat 5 --reliability FILE` runs those tests so often, with the time-outs that are
-promised, and writes the report that docs/reliability.md is made from (benchmarks/pages/reliability.py).
+promised, and writes the report that docs/reliability.md is made from (benchmarks/pages/reliability.py). A test marked
+`often` runs four times as often.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, Protocol
 
 import pytest
 
+OFTEN = 4
 COUNT = "count"  # unit of what must not happen even once
 
 
@@ -34,6 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "promise(n): checks promise n of docs/reliability.md")
+    config.addinivalue_line("markers", "often: is repeated four times as often where figures are measured")
     if config.getoption("reliability") is not None:
         config.pluginmanager.register(_Recorder(config.getoption("reliability"), config.getoption("repeat") or 1))
 
@@ -42,7 +45,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     repeat = metafunc.config.getoption("repeat")
     if repeat is not None and "figure" in metafunc.fixturenames:
         metafunc.fixturenames.append("repetition")
-        metafunc.parametrize("repetition", range(repeat), indirect=True)
+        often = metafunc.definition.get_closest_marker("often") is not None
+        metafunc.parametrize("repetition", range(OFTEN * repeat if often else repeat), indirect=True)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,0 +1,45 @@
+"""A mock controller for each module of tests, and the processes of a trial for each test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from robot.mock import MockUR
+from tests.robot.arm.mocked import HOST
+from tests.robot.stops.watched import Trial
+
+BACK = (0.1, 1.0, 3.0, 0.0)  # a line is whole again after so long, one after the other in repetitions [s]
+
+
+@pytest.fixture(scope="module")
+def controller(measuring: bool) -> Iterator[MockUR]:
+    pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this Python")
+    with MockUR(HOST, realtime=measuring) as mock:
+        yield mock
+
+
+@pytest.fixture
+def trial(controller: MockUR, tmp_path: Path, measuring: bool) -> Iterator[Trial]:
+    controller.faults.reset()
+    made = Trial(controller, tmp_path, measuring=measuring)
+    try:
+        made.begin()
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture
+def watch(measuring: bool) -> float:
+    """How long an arm is watched after its first standstill [s]."""
+    return 5.0 if measuring else 2.0
+
+
+@pytest.fixture
+def back(request: pytest.FixtureRequest) -> float:
+    """After how long a broken line is whole again [s]."""
+    callspec = getattr(request.node, "callspec", None)
+    return BACK[(callspec.params.get("repetition", 0) if callspec else 0) % len(BACK)]

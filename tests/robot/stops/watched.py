@@ -1,0 +1,185 @@
+"""A user's program that moves an arm through a network that fails, and an observer of what the arm then does."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from robot.mock import MockUR
+from tests.promises import Record
+from tests.robot.arm.mocked import PATIENCE, config, until
+from tests.robot.stops.observer import PACKAGE
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[2]
+PROXY = f"127.24.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+GOES = 0.28  # how far the arm is sent [m]
+BEFORE = 0.08  # it has gone so far when something happens [m]
+STILL, PACKAGES = 1e-3, 5  # the tool stands that is slower [m/s] for so many packages of 2 ms
+PLAYING = 2  # runtime_state: a program runs
+PORTS = {"RTDE": (30004,), "script": (30003,), "dashboard": (29999,), "all": (29999, 30001, 30002, 30003, 30004)}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an observer saw of one event. Times since the event [s], by the controller's clock."""
+
+    still: float  # first standstill
+    path: float  # covered until then [m]
+    moved: float  # farthest from there that it was later [m]
+    ended: float | None  # when the program had ended for good; None: it runs at the end of the watch
+    told: float | None  # when the user's program saw another status; None: it never did
+    statuses: tuple[str, ...]  # that it saw
+    speed: float  # before the event [m/s]
+
+
+class Trial:
+    """The processes of one trial. `policy` is the user's program, `worker` the process id of its arm's worker."""
+
+    def __init__(self, mock: MockUR, folder: Path, *, measuring: bool) -> None:
+        # Measured are the time-outs as shipped; otherwise such that a busy machine is no fault.
+        waits = {"link_timeout": 0.05, "action_timeout": 0.2, "watchdog": 10.0} if measuring else {}
+        limits = {"workspace": {"lower": (-0.4, -0.9, 0.1), "upper": (0.4, -0.1, 0.9)}, "speed": 0.1}
+        wanted = config(PROXY, realtime=measuring, **waits).model_dump()
+        wanted["limits"] |= limits
+        self.mock, self.file = mock, folder / "seen.npy"
+        self.lines: queue.Queue[str] = queue.Queue()
+        self.worker: int | None = None
+        self.proxy = _start("proxy.py", PROXY, mock.host)
+        self.observer = _start("observer.py", mock.host, str(self.file))
+        self.policy = _start("policy.py", json.dumps(wanted), str(GOES), start_new_session=True)
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+
+    def begin(self) -> None:
+        """Waits until the arm is on its way at full speed."""
+        mock = self.mock
+        assert _line(self.proxy) == _line(self.observer) == "ready"
+        self.worker = int(json.loads(self.lines.get(timeout=PATIENCE))["worker"])
+        start = np.array(mock.faults.state().pose[:3])
+        until(lambda: float(np.linalg.norm(np.array(mock.faults.state().pose[:3]) - start)) > BEFORE, "motion")
+
+    def network(self, **wish: Any) -> float:
+        """Breaks the network (proxy.py says how); returns when."""
+        assert self.proxy.stdin is not None
+        self.proxy.stdin.write(json.dumps(wish) + "\n")
+        self.proxy.stdin.flush()
+        return float(_line(self.proxy))
+
+    def cut(self, ports: tuple[int, ...]) -> float:
+        """The controller itself resets all connections to these ports, and takes new ones at once."""
+        now = time.monotonic()
+        self.mock.faults.cut(ports, reset=True)
+        return now
+
+    def signal(self, process: int | None, number: signal.Signals, *, group: bool = False) -> float:
+        assert process is not None
+        now = time.monotonic()
+        (os.killpg if group else os.kill)(process, number)
+        return now
+
+    def watch(self, event: float, seconds: float) -> Outcome:
+        """What happened since the time `event` until now, and `seconds` [s] more after the first standstill."""
+        until(lambda: self.mock.faults.state().rests, "rest", pause=0.05)
+        time.sleep(seconds)
+        assert self.observer.stdin is not None
+        self.observer.stdin.close()
+        assert self.observer.wait(PATIENCE) == 0
+        said = [json.loads(line) for line in self._said()]
+        after = [each for each in said if each["time"] > event]
+        return outcome(np.load(self.file), event, after)
+
+    def close(self) -> None:
+        processes = (self.policy, self.proxy, self.observer)
+        for pid in (*(process.pid for process in processes), self.worker):
+            with contextlib.suppress(ProcessLookupError):
+                if pid is not None:
+                    os.kill(pid, signal.SIGKILL)  # also ends one that is stopped
+        for process in processes:
+            with process:  # closes its pipes
+                process.wait()
+        self.reader.join()
+
+    def _said(self) -> Iterator[str]:
+        while not self.lines.empty():
+            yield self.lines.get()
+
+    def _read(self) -> None:
+        assert self.policy.stdout is not None
+        for line in self.policy.stdout:
+            self.lines.put(line)
+
+
+def outcome(seen: np.ndarray, event: float, said: list[dict[str, Any]]) -> Outcome:
+    """seen: PACKAGE (n,); event: monotonic [s]; said: what the user's program said after it."""
+    assert seen.dtype == PACKAGE
+    # The package that was on its way for the shortest time tells how the clocks stand to each other.
+    stamps = seen["timestamp"] - (event - (seen["received"] - seen["timestamp"]).min())
+    assert np.diff(stamps).max() < 0.5, "the observer itself missed packages"
+    speeds = np.linalg.norm(seen["velocity"], axis=1)
+    now = int(np.searchsorted(stamps, 0.0))
+    slow = np.convolve(speeds[now:] < STILL, np.ones(PACKAGES), "valid") == PACKAGES
+    assert slow.any(), "the arm never stood"
+    first = now + int(slow.argmax())
+    rest = seen["position"][first + PACKAGES - 1]
+    runs = np.flatnonzero(seen["runtime_state"] == PLAYING)
+    return Outcome(
+        still=float(stamps[first]),
+        path=float(np.linalg.norm(np.diff(seen["position"][now : first + 1], axis=0), axis=1).sum()),
+        moved=float(np.linalg.norm(seen["position"][first + PACKAGES - 1 :] - rest, axis=1).max()),
+        ended=None if runs[-1] == len(seen) - 1 else float(max(stamps[runs[-1]], 0.0)),
+        told=said[0]["time"] - event if said else None,
+        statuses=tuple(each["status"] for each in said),
+        speed=float(speeds[max(now - 10, 0) : now].mean()),
+    )
+
+
+SETTLES = 50e-6  # an arm slower than 1 mm/s settles to less [m]
+
+
+def judge(event: str, seen: Outcome, figure: Record, *, goes_on: bool = False) -> None:
+    """Records a row of the table of events, and checks what must hold on any machine.
+
+    goes_on: the program may run on: the driver holds the arm, or was not disturbed at all."""
+    if seen.told is None and goes_on:
+        figure(f"{event} · goes on", 1, "", at_most=None)
+        return
+    figure(f"{event} · still after", 1e3 * seen.still, "ms", at_most=None)
+    figure(f"{event} · path", 1e3 * seen.path, "mm", at_most=None)
+    if seen.told is not None:
+        figure(f"{event} · told after", 1e3 * seen.told, "ms", at_most=None)
+    figure(f"{event} · moved after standstill", 1e3 * seen.moved, "mm", at_most=1e3 * SETTLES)
+    figure(f"{event} · programs left running", float(seen.ended is None and not goes_on))
+    assert seen.speed > 0.05, "it did not move when the event came"
+    assert seen.moved <= SETTLES, seen
+    assert seen.ended is not None or goes_on, f"the program runs on: {seen}"
+
+
+def _start(script: str, *words: str, start_new_session: bool = False) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(HERE / script), *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=start_new_session,
+        text=True,
+    )
+
+
+def _line(process: subprocess.Popen[str]) -> str:
+    stream: IO[str] | None = process.stdout
+    assert stream is not None
+    return stream.readline().strip()

@@ -52,7 +52,7 @@ def run(
 ) -> None:
     """Run one episode: a policy on a rig. Records it and writes a report.
 
-    Ctrl-C or SIGTERM ends the episode after the step that is under way; what was done is saved and reported.
+    Ctrl-C, SIGTERM or a lost terminal ends the episode after the step under way; what was done is saved and reported.
 
     Example: tacsim run sim --task squeeze --steps 30 --out runs/first
     """

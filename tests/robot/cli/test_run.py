@@ -70,7 +70,7 @@ def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) 
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_the_episode_and_saves_it(tmp_path: Path, number: signal.Signals, code: int) -> None:
     words = ("run", "--steps", "100000", "--task", "reposition", "--out", "r", *TINY)
     process = subprocess.Popen(

@@ -1,0 +1,117 @@
+"""Signals that end a command: at once where nothing asks about them, in order where something does."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import typer
+
+from robot.cli.interrupt import Interrupt
+from tests.robot.cli.invoked import environment
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in NUMBERS}
+    yield
+    assert {number: signal.getsignal(number) for number in NUMBERS} == before
+
+
+def exit_of(act: Callable[[Interrupt], object]) -> int:
+    """How a command ends in which `act` happens."""
+    try:
+        with Interrupt() as interrupt:
+            act(interrupt)
+    except typer.Exit as ended:
+        return ended.exit_code
+    return 0
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_before_anybody_asks_a_signal_ends_the_command_at_once(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Opening a rig, the reset with its approach, a question to a person: nothing there looks at the flag."""
+    gone_on: list[bool] = []
+    assert exit_of(lambda _: (os.kill(os.getpid(), number), gone_on.append(True))) == 128 + number  # type: ignore[func-returns-value]
+    assert not gone_on
+    assert f"stopped by {number.name}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_who_asks_ends_in_order_unless_a_second_signal_comes(number: signal.Signals) -> None:
+    with Interrupt() as interrupt:
+        assert not interrupt() and interrupt.exit_code == 0
+        os.kill(os.getpid(), number)
+        assert interrupt() and interrupt.exit_code == 128 + number
+
+    def twice(interrupt: Interrupt) -> None:
+        interrupt()
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    assert exit_of(twice) == 128 + number
+
+
+def test_a_question_that_is_broken_off_is_a_signal_too() -> None:
+    def asked(_: Interrupt) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise typer.Abort from None  # as typer.confirm does
+
+    assert exit_of(asked) == 130
+
+
+def test_what_nohup_started_goes_on() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupt() as interrupt:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not interrupt()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+LOST = """
+import sys, time
+from pathlib import Path
+from robot.cli.errors import complain
+from robot.cli.interrupt import Interrupt
+from robot.cli.output import progress, results
+with Interrupt() as interrupt, progress() as bar:
+    row = bar.add_task("at work", total=None)
+    interrupt()
+    print("ready", flush=True)
+    while not interrupt():
+        time.sleep(0.01)
+    bar.update(row, completed=1)
+Path(sys.argv[1]).write_text("saved")
+results.print("the report")
+complain("stopped by a signal")
+sys.exit(interrupt.exit_code)
+"""
+
+
+def test_a_lost_terminal_does_not_keep_it_from_saving(tmp_path: Path) -> None:
+    """Each print to such a terminal is an OSError."""
+    master, slave = pty.openpty()
+    words = [sys.executable, "-c", LOST, str(tmp_path / "report")]
+    with subprocess.Popen(words, env=environment(), stdin=slave, stdout=slave, stderr=slave) as process:
+        os.close(slave)
+        said = b""
+        while b"ready" not in said:
+            said += os.read(master, 1000)
+        os.close(master)
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(60) == 129
+    assert (tmp_path / "report").read_text() == "saved"

@@ -11,6 +11,7 @@ from robot.common.kinematics import displacement, matrix, pose
 from robot.mock.ur.machine.arm import PERIOD
 from robot.mock.ur.machine.load import Mass
 from robot.mock.ur.machine.machine import Machine, Safety
+from tacsim.interface import FloatArray
 from tests.robot.mock.machine_bench import DOWN, Bench
 from tests.robot.mock.wire_client import control_script
 
@@ -95,6 +96,30 @@ def test_servo_to_a_far_target_respects_joint_speed_and_acceleration(bench: Benc
         assert bench.arm.target_q[0] <= goal[0] + 1e-3
     assert bench.machine.safety is Safety.NORMAL
     np.testing.assert_allclose(bench.arm.q, goal, atol=1e-5)
+
+
+def test_speed_slider_reaches_servoj(bench: Bench) -> None:
+    """At half the slider its time runs at half the speed: twice the lag behind a steady motion, half the top speed."""
+    bench.machine.set_slider(0.5)
+    bench.tick(200)
+    start, lookahead, speed = bench.arm.target_q.copy(), 0.1, 0.2
+
+    def follow(seconds: float) -> FloatArray:
+        for tick in range(round(seconds / PERIOD)):
+            goal = start + [speed * tick * PERIOD, 0, 0, 0, 0, 0]
+            bench.write(11, [*goal, 0, 0, 0.002, lookahead, 300])
+            bench.tick()
+        return goal
+
+    goal = follow(2.0)
+    assert bench.arm.target_qd[0] == pytest.approx(speed, rel=1e-3)
+    assert (goal - bench.arm.target_q)[0] == pytest.approx(speed * lookahead / 0.5, rel=0.02)
+    bench.write(11, [*(start + [3.0, 0, 0, 0, 0, 0]), 0, 0, 0.002, 0.03, 300])
+    bench.tick(150)
+    assert bench.arm.target_qd[0] == pytest.approx(0.5 * bench.arm.kinematics.joint_speeds[0], rel=1e-3)
+    bench.machine.set_slider(0.0)
+    bench.tick(300)
+    assert bench.arm.rests and bench.machine.program is not None
 
 
 @pytest.mark.parametrize("command", [11, 24])

@@ -7,7 +7,8 @@ What is not published of a real controller is modelled in the simplest way:
 * paths: waypoints with a blend radius are rounded by a parabola that begins and ends that far from the waypoint. A
   blended stretch is run at the smallest speed and acceleration of its waypoints. movej in a path stops at each one.
 * servoj: a lag of first order with the time constant `lookahead_time`, within the joints' top speeds and 40 rad/s^2.
-  `gain` has no effect.
+  `gain` has no effect. The speed scaling slows it too: "the robot will only make half of the way towards the target
+  configuration when a scaling factor of 0.5 is given" (ros2_controllers, "Speed scaling", of UR arms).
 * force mode: an admittance. A compliant axis moves at (force missing) / FORCE_DAMPING, within its limit; the others
   hold still. Only frames of type 2, and no other motion besides.
 * freedrive, teach mode: an admittance to the wrench on the tool.
@@ -187,10 +188,10 @@ def servoj(arm: Arm, q: FloatArray, time: float, lookahead: float) -> MotionStep
         left = q - arm.target_q
         # As fast as the lag asks for, but never faster than could still be braked.
         brakable = np.sqrt(JOINT_ACCELERATION * np.abs(left))
-        top = np.minimum(arm.kinematics.joint_speeds, brakable)
-        wanted = np.clip(left / max(lookahead, PERIOD), -top, top)
+        top = arm.scale * np.minimum(arm.kinematics.joint_speeds, brakable)
+        wanted = np.clip(arm.scale * left / max(lookahead, PERIOD), -top, top)
         change = np.clip(wanted - arm.target_qd, -JOINT_ACCELERATION * PERIOD, JOINT_ACCELERATION * PERIOD)
-        arm.drive((arm.target_qd + change) * (1.0 if arm.scale > 0 else 0.0))
+        arm.drive(arm.target_qd + change)
         yield
 
 

@@ -208,7 +208,6 @@ def test_speed_slider_halves_the_speed(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("command", "doubles", "integers", "words"),
     [
-        (6, [0] * 18, [3, 0, 0, 1, 0, 0, 0], "force_mode of type 3"),
         (66, [0] * 18, [], "direct_torque"),
         (67, [0] * 6, [], "get_mass_matrix"),
         (68, [0] * 12, [], "get_coriolis"),

@@ -124,18 +124,6 @@ def test_hidden_payload_weighs_and_turns_with_the_tool(bench: Bench) -> None:
     )
 
 
-def test_force_mode_presses_with_the_force_asked_for(bench: Bench) -> None:
-    bench.machine.load.wall = Wall(float(bench.arm.frame[2, 3]) - 0.005, 2000.0)
-    other = bench.arm.target_q.copy()
-    bench.write(6, [0] * 6 + [0, 0, -10, 0, 0, 0] + [0.1, 0.1, 0.05, 1, 1, 1], [2, 0, 0, 1, 0, 0, 0])
-    bench.tick(3000)
-    assert bench.machine.load.felt[2] == pytest.approx(10.0, abs=0.05)
-    np.testing.assert_allclose(bench.arm.target_frame[:2, 3], bench.arm.kinematics.forward(other)[:2, 3], atol=1e-5)
-    assert not bench.machine.steady
-    bench.call(7)
-    assert bench.machine.program is not None
-
-
 def test_contact_is_found_and_the_arm_returns_to_it(bench: Bench) -> None:
     top = float(bench.arm.frame[2, 3]) - 0.02
     bench.machine.load.wall = Wall(top, 5000.0)

@@ -1,20 +1,21 @@
 """The arm of the mock: where its joints are wanted, where they are, and what lies between.
 
-The target is what the controller's interpolator asks for; the actual joints follow it as a critically damped servo of
-second order does. With SERVO_RATE = 500 rad/s the actual joints trail a steady motion by 4 ms and settle within about
-20 ms; real arms are in this order, and their true dynamics are not modelled (no masses, no friction, no flexibility).
+The target is what the program's motion asks for. The set point is where the joint servos shall be: the target, or in
+force mode what giving way makes of it. The actual joints follow it as a critically damped servo of second order does.
+With SERVO_RATE = 500 rad/s they trail a steady motion by 4 ms and settle within about 20 ms; real arms are in this
+order, and their true dynamics are not modelled (no masses, no friction, no flexibility).
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.common.kinematics import JOINT_RANGE, Kinematics, pose
+from robot.common.kinematics import JOINT_RANGE, Kinematics, displacement, pose, rotation
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ class Arm:
         if float(np.abs(self.target_q).max()) > JOINT_RANGE:
             raise ValueError(f"joints must lie within +-2 pi rad, got {list(joints)}")
         self.target_qd, self.target_qdd = np.zeros(6), np.zeros(6)
+        self.set_q, self.set_qd = self.target_q.copy(), np.zeros(6)
         self.q, self.qd = self.target_q.copy(), np.zeros(6)
         self.scale = 1.0  # speed scaling now, 0 to 1
         self.waypoint: FloatArray | None = None  # (4, 4) where the present move ends
@@ -93,9 +95,10 @@ class Arm:
         """True once a motion has asked for something in this control period."""
         return self._next is not None
 
-    def advance(self, deceleration: float = COAST) -> None:
-        """Ends the control period; an arm without a command is braked."""
-        wanted, before, start = self._next, self.target_qd, self.target_q
+    def advance(self, deceleration: float = COAST, give_way: Callable[[FloatArray], FloatArray] | None = None) -> bool:
+        """Ends the control period; an arm without a command is braked. give_way: in force mode, the program's twist
+        to that of the set point. Returns False where the set point is out of reach, and holds it."""
+        wanted, before, begin, frame = self._next, self.target_qd, self.set_q, self.target_frame
         self._next = None
         if wanted is not None:
             self.target_qd = (wanted - self.target_q) / PERIOD
@@ -104,22 +107,43 @@ class Arm:
             self.target_qd = slowed(before, deceleration)
             self.target_q = self.target_q + self.target_qd * PERIOD
         self.target_qdd = (self.target_qd - before) / PERIOD
-        self._servo(start)
+        self._update_target()
+        reached: FloatArray | None = self.target_q
+        if give_way is not None:
+            step = PERIOD * give_way(displacement(frame, self.target_frame) / PERIOD)
+            goal = self.kinematics.forward(begin, self.tool)
+            goal[:3, :3], goal[:3, 3] = rotation(step[3:]) @ goal[:3, :3], goal[:3, 3] + step[:3]
+            reached = self.kinematics.inverse(goal, begin, self.tool)
+        self.set_q = begin if reached is None else reached
+        self.set_qd = (self.set_q - begin) / PERIOD
+        self._servo(begin)
         self.history.append(self.q)
-        self.update()
+        self._update_actual()
+        return reached is not None
+
+    def settle(self) -> None:
+        """Force mode has ended: the program goes on from the set point."""
+        self.target_q, self.target_qd = self.set_q, self.set_qd
+        self._update_target()
 
     def halt(self) -> None:
         """Brakes have closed: speeds are zero, and the target is where the arm is."""
         self.target_q, self.target_qd, self.target_qdd = self.q.copy(), np.zeros(6), np.zeros(6)
-        self.qd = np.zeros(6)
+        self.set_q, self.set_qd, self.qd = self.target_q, np.zeros(6), np.zeros(6)
         self._next = None
         self.update()
 
     def update(self) -> None:
         """Renews frames, Jacobian and twists after the joints or the tool have changed."""
+        self._update_target()
+        self._update_actual()
+
+    def _update_target(self) -> None:
         self.target_frame, self.jacobian = self.kinematics.forward_and_jacobian(self.target_q, self.tool)
-        self.frame, actual_jacobian = self.kinematics.forward_and_jacobian(self.q, self.tool)
         self.target_twist: FloatArray = self.jacobian @ self.target_qd
+
+    def _update_actual(self) -> None:
+        self.frame, actual_jacobian = self.kinematics.forward_and_jacobian(self.q, self.tool)
         self.twist: FloatArray = actual_jacobian @ self.qd
 
     @property
@@ -129,18 +153,18 @@ class Arm:
 
     @property
     def rests(self) -> bool:
-        """True when neither target nor actual joints move."""
-        return not self.target_qd.any() and float(np.abs(self.qd).max()) < REST
+        """True when neither target, set point nor actual joints move."""
+        return not self.target_qd.any() and not self.set_qd.any() and float(np.abs(self.qd).max()) < REST
 
     def _servo(self, before: FloatArray) -> None:
-        """One period of q'' = w^2 (target - q) - 2 w q', solved exactly for a target in steady motion."""
-        speed, trail = self.target_qd, 2.0 / SERVO_RATE * self.target_qd
+        """One period of q'' = w^2 (set - q) - 2 w q', solved exactly for a set point in steady motion."""
+        speed, trail = self.set_qd, 2.0 / SERVO_RATE * self.set_qd
         error, rate = self.q - before + trail, self.qd - speed
         drift, decay = (rate + SERVO_RATE * error) * PERIOD, math.exp(-SERVO_RATE * PERIOD)
         error, rate = (error + drift) * decay, (rate - SERVO_RATE * drift) * decay
-        self.q, self.qd = self.target_q - trail + error, rate + speed
+        self.q, self.qd = self.set_q - trail + error, rate + speed
         if not speed.any() and float(np.abs(rate).max()) < REST and float(np.abs(error).max()) < 1e-12:
-            self.q, self.qd = self.target_q.copy(), np.zeros(6)  # the tail of the exponential has no meaning
+            self.q, self.qd = self.set_q.copy(), np.zeros(6)  # the tail of the exponential has no meaning
 
 
 def slowed(speeds: FloatArray, deceleration: float) -> FloatArray:

@@ -13,12 +13,14 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robot.common.kinematics import JOINT_RANGE
 from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
+from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
 from robot.mock.ur.machine.script import Program
@@ -112,6 +114,7 @@ class Machine:
         self.program: Program | None = None
         self.paused = False
         self.freedrive: tuple[FloatArray, tuple[int, ...]] | None = None  # frame and free axes
+        self.force_mode: ForceMode | None = None
         self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
         self.watchdog_reset = 0  # tick at which its register was last written
         self.stop_reason = ""  # why the last program ended
@@ -158,8 +161,7 @@ class Machine:
     @property
     def steady(self) -> bool:
         """is_steady(): at rest, and not compliant."""
-        compliant = self.freedrive is not None or (self.program is not None and self.program.compliant)
-        return self.arm.rests and not compliant
+        return self.arm.rests and self.freedrive is None and self.force_mode is None
 
     def write_log(self, text: str) -> None:
         shown = "".join(letter if letter.isprintable() else "?" for letter in text[:LINE])
@@ -193,9 +195,15 @@ class Machine:
     def stop(self, why: str) -> None:
         """Ends the program; the arm coasts to rest."""
         self.watchdog, self.freedrive, self.arm.waypoint = None, None, None
+        self.end_force_mode()
         if self.program is not None:
             self.program, self.stop_reason = None, why
             self.write_log(f"program stopped: {why}")
+
+    def end_force_mode(self) -> None:
+        if self.force_mode is not None:
+            self.force_mode = None
+            self.arm.settle()
 
     # -- safety and power --------------------------------------------------------------------------------------------
 
@@ -282,7 +290,11 @@ class Machine:
             self._guarded(self.program.step)
         if self.freedrive is not None and not self.arm.commanded:
             self._guarded(self._follow_hand)
-        self.arm.advance(COAST if self.safety in (Safety.NORMAL, Safety.REDUCED) else BRAKE)
+        if self.force_mode is not None:
+            self._guarded(partial(self.force_mode.update, self.arm, self.load.felt))
+        give_way = None if self.force_mode is None else partial(self.force_mode.mix, scale=self.arm.scale)
+        if not self.arm.advance(COAST if self.safety in (Safety.NORMAL, Safety.REDUCED) else BRAKE, give_way):
+            self.stop("force_mode: the arm cannot give way any further")
         self.load.update(self.arm)
         self.load.history.append(self.load.felt)
         self._check_limits()
@@ -322,12 +334,12 @@ class Machine:
         force = math.sqrt(sum(value * value for value in self.load.unexplained[:3].tolist()))
         if force > self.load.force_limit:
             self.protective_stop(f"force of {force:.0f} N, limit {self.load.force_limit:g} N")
-        fast = np.abs(arm.target_qd) > arm.kinematics.joint_speeds * 1.001
+        fast = np.abs(arm.set_qd) > arm.kinematics.joint_speeds * 1.001
         if fast.any():
             joint = int(np.argmax(fast))
-            self.protective_stop(f"joint {joint + 1} at {abs(arm.target_qd[joint]):.2f} rad/s, too fast")
-        beyond = np.abs(arm.target_q) > 2 * math.pi
-        if beyond.any() and arm.target_qd.any():
+            self.protective_stop(f"joint {joint + 1} at {abs(arm.set_qd[joint]):.2f} rad/s, too fast")
+        beyond = np.abs(arm.set_q) > 2 * math.pi
+        if beyond.any() and arm.set_qd.any():
             self.protective_stop(f"joint {int(np.argmax(beyond)) + 1} at the end of its range")
 
     # -- what comes in -----------------------------------------------------------------------------------------------

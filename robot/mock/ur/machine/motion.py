@@ -9,8 +9,6 @@ What is not published of a real controller is modelled in the simplest way:
 * servoj: a lag of first order with the time constant `lookahead_time`, within the joints' top speeds and 40 rad/s^2.
   `gain` has no effect. The speed scaling slows it too: "the robot will only make half of the way towards the target
   configuration when a scaling factor of 0.5 is given" (ros2_controllers, "Speed scaling", of UR arms).
-* force mode: an admittance. A compliant axis moves at (force missing) / FORCE_DAMPING, within its limit; the others
-  hold still. Only frames of type 2, and no other motion besides.
 * freedrive, teach mode: an admittance to the wrench on the tool.
 """
 
@@ -27,10 +25,9 @@ from robot.common.kinematics import displacement, rotation, rotation_vector
 from robot.mock.ur.machine.arm import JOINT_ACCELERATION, PERIOD, Arm, MotionSteps, ProgramError, slowed
 from tacsim.interface import FloatArray
 
-FORCE_DAMPING = 1000.0  # [N/(m/s)], and [N m/(rad/s)]
 FREEDRIVE_DAMPING = 200.0  # [N/(m/s)]
 FREEDRIVE_TURN_DAMPING = 20.0  # [N m/(rad/s)]
-ADMITTANCE_ACCELERATION = 2.0  # of force mode and freedrive [m/s^2, rad/s^2]
+FREEDRIVE_ACCELERATION = 2.0  # [m/s^2, rad/s^2]
 
 
 def between(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
@@ -252,7 +249,7 @@ def comply(arm: Arm, frame: FloatArray, free: Sequence[float], push: FloatArray,
     local = np.concatenate([turn.T @ push[:3], turn.T @ push[3:]])
     local = np.where(np.asarray(free) != 0, np.clip(local, -limits, limits), 0.0)
     wanted = np.concatenate([turn @ local[:3], turn @ local[3:]])
-    twist, _ = _ramp(arm.target_twist, arm.scale * wanted, ADMITTANCE_ACCELERATION, joint=False)
+    twist, _ = _ramp(arm.target_twist, arm.scale * wanted, FREEDRIVE_ACCELERATION, joint=False)
     arm.drive(arm.joint_speeds_of(twist))
 
 

@@ -1,7 +1,7 @@
 """Commands of ur_rtde's control script that move the arm, or feel for a contact.
 
 Whatever has no sound model ends the program with a line in the log, as a run-time error does on a controller: direct
-torque, mass matrix, Coriolis torques, external force sensors, force modes 1 and 3, motion during force mode.
+torque, mass matrix, Coriolis torques, external force sensors.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from robot.common.kinematics import matrix
 from robot.mock.ur.machine import motion
 from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
+from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.motion import Waypoint
 from robot.mock.ur.machine.registry import LARGEST, command
 from tacsim.interface import FloatArray
@@ -161,42 +162,37 @@ def speed_stop(p: Program) -> MotionSteps:
 
 
 @command(6, every_cycle=True)
-def force(p: Program) -> None:
-    kind = p.integer(1)
-    if kind != 2:
-        raise ProgramError(f"force_mode of type {kind} is not modelled by the mock, only type 2")
-    frame, selection = p.frame(0), [p.integer(index) for index in range(2, 8)]
-    turn, wrench, limits = frame[:3, :3], p.doubles(6), np.abs(p.doubles(12))
-    wanted = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
-
-    def comply() -> MotionSteps:
-        if p.arm.commanded:
-            raise ProgramError("motion during force_mode is not modelled by the mock")
-        motion.comply(p.arm, frame, selection, (wanted + p.machine.load.felt) / motion.FORCE_DAMPING, limits)
-        yield
-
-    p.repeat("force", comply)
+def force_begin(p: Program) -> None:
+    kind, free = p.integer(1), np.array([p.integer(index) != 0 for index in range(2, 8)])
+    wrench, limits = p.doubles(6), np.abs(p.doubles(12))
+    if kind not in (1, 2, 3) or not np.isfinite([wrench, limits]).all():
+        raise ProgramError(f"force_mode: type {kind}, wrench {wrench.tolist()}, limits {limits.tolist()}")
+    made = ForceMode(kind, p.frame(0), free, wrench, limits, p.force_gain, p.force_damping)
+    if p.machine.force_mode is not None:
+        made.twist, made.turn = p.machine.force_mode.twist, p.machine.force_mode.turn
+    p.machine.force_mode = made
 
 
 @command(7)
-def force_stop(p: Program) -> MotionSteps:
-    p.kill("force")
+def force_end(p: Program) -> MotionSteps:
+    p.machine.end_force_mode()
     return motion.stopl(p.arm, 10.0)
 
 
 @command(20, needs="force_mode_set_damping(")
 def force_damping(p: Program) -> None:
-    _within(p.double(0), 1.0, "force_mode_set_damping")
+    p.force_damping = _within(p.double(0), 1.0, "force_mode_set_damping")
 
 
 @command(21, needs="force_mode_set_gain_scaling(")
 def force_gain(p: Program) -> None:
-    _within(p.double(0), 2.0, "force_mode_set_gain_scaling")
+    p.force_gain = _within(p.double(0), 2.0, "force_mode_set_gain_scaling")
 
 
-def _within(value: float, most: float, call: str) -> None:
+def _within(value: float, most: float, call: str) -> float:
     if not 0 <= value <= most:
         raise ProgramError(f"{call}: {value:g} is not within 0 and {most:g}")
+    return value
 
 
 @command(41)

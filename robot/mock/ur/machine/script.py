@@ -43,15 +43,12 @@ class Program:
         self.calls: dict[str, Callable[[], MotionSteps]] = {}  # what a repeating thread does next
         self.stops_linear = False  # whether stopJ and stopL are stopl: see motion_commands.stop
         self.speeds_linear = True  # whether the last speed command was speedl
+        self.force_gain, self.force_damping = 0.5, 0.025  # the script begins with these
         self.internal = 0  # a command that the script gives itself
         self.contact_steps = 0
         self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # pose asked for, its joints
         self._writes = self._operation = 0  # of the asynchronous word
         self._main = self._loop()
-
-    @property
-    def compliant(self) -> bool:
-        return "force" in self.threads
 
     def step(self) -> None:
         """Main program, then its threads. Raises ProgramError where the program ends with an error."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 from enum import IntEnum
@@ -125,7 +126,14 @@ STATE = np.dtype(
         ("period", np.float64, 3),  # median, 99th percentile and maximum of the last 500 [s]
     ]
 )
-COMMAND = np.dtype([("time", np.float64), ("kind", np.int64), ("pose", np.float64, 7)])  # position, quaternion x y z w
+COMMAND = np.dtype(
+    [
+        ("time", np.float64),
+        ("kind", np.int64),
+        ("pose", np.float64, 7),  # position, quaternion x y z w
+        ("speed", np.float64),  # at most this fast, and never faster than limits.speed [m/s]
+    ]
+)
 # What the driver reports after every observation: exposure time of the oldest picture (NaN: do not guard by pictures
 # now), indentation depth and shear of the arm's own gel (NaN: unknown).
 TACTILE = np.dtype([("exposed", np.float64), ("depth", np.float64), ("shear", np.float64)])
@@ -214,9 +222,11 @@ def segment_of(arm: str) -> shared_ring.Segment:
         return segment
 
 
-def command_record(time: float, kind: CommandKind, pose: FloatArray | None = None) -> shared_ring.Record:
-    """A command record; `pose` (7,) for CommandKind.TARGET."""
-    return np.array((time, kind, np.zeros(7) if pose is None else pose), COMMAND)
+def command_record(
+    time: float, kind: CommandKind, pose: FloatArray | None = None, speed: float = math.inf
+) -> shared_ring.Record:
+    """A command record; `pose` (7,) and top `speed` [m/s] for CommandKind.TARGET."""
+    return np.array((time, kind, np.zeros(7) if pose is None else pose, speed), COMMAND)
 
 
 def tactile_record(exposed: float, depth: float, shear: float) -> shared_ring.Record:

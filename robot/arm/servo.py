@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from robot.arm.channel import ArmStatus, CommandKind, WorkerConfig
 from robot.arm.shared_ring import Record
-from robot.arm.trajectory import PERIOD, MotionState, braking, resting, stopping_point, towards
+from robot.arm.trajectory import PERIOD, MotionState, Rates, braking, resting, stopping_point, towards
 from robot.common.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured
 from tacsim.interface import FloatArray
@@ -64,6 +65,7 @@ class Servo:
         self._sent: FloatArray | None = None  # joints
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position (3,), rotation (3, 3)
         self._goal_time = -math.inf
+        self._rates: Rates = config  # of the way to the goal
         self._tactile_read, self._exposed = tactile_read, math.nan  # reports read; exposure of the oldest picture [s]
         # joints, and their margin to a singularity
         self._last_singularity_check: tuple[FloatArray, float] | None = None
@@ -140,6 +142,8 @@ class Servo:
             pose = command["pose"]
             self._goal = pose[:3].copy(), _rotation(pose[3:])
             self._goal_time = float(command["time"])
+            slow = float(command["speed"])
+            self._rates = replace(self.config, speed=slow) if slow < self.config.speed else self.config
             if self.motion is not None:
                 self._clip_goal(self.motion)
         elif kind in (CommandKind.HOLD, CommandKind.CLOSE, CommandKind.ZERO_WRENCH):
@@ -174,7 +178,7 @@ class Servo:
                 return False
             return all(new >= 0.0 or new >= old for new, old in zip(self._gaps(motion, partners), gaps, strict=True))
 
-        wanted = towards(self.motion, *goal, self.config, allowed)
+        wanted = towards(self.motion, *goal, self._rates, allowed)
         joints = self._joints(wanted, measured)
         if joints is not None:
             self.status = ArmStatus.OK

@@ -156,9 +156,10 @@ class URArm(Closing):
 
     # -- commands ------------------------------------------------------------------------------------------------
 
-    def command(self, target: Pose | None) -> Pose | None:
-        """Moves towards `target` (world_from_sensor); None holds. Returns the pose that is sent: a target outside the
-        workspace, or too near to another arm, is clipped on the straight path there.
+    def command(self, target: Pose | None, speed: float | None = None) -> Pose | None:
+        """Moves towards `target` (world_from_sensor), at most at `speed` [m/s] and limits.speed; None holds. Returns
+        the pose that is sent: a target outside the workspace, or too near to another arm, is clipped on the straight
+        path there.
 
         Must be repeated within `action_timeout`, else the arm holds. Raises ActionError for what is not a pose or is
         out of reach, and the error of its status (ProtectiveStop, EmergencyStop, SafetyViolation, LinkLost,
@@ -170,6 +171,8 @@ class URArm(Closing):
                 self._send(CommandKind.HOLD)
                 return None
             check_action(Action({self.name: target}), (self.name,), self.name)
+            if speed is not None and not speed > 0.0:
+                raise ActionError(f"arm '{self.name}' was asked for a speed of {speed} m/s; it must be positive")
             state = self.state()
             allowed, _ = clip_to_region(target, state.pose, self._region, self._spheres())
             flange = self._frames.flange(se3.to_matrix(allowed))
@@ -179,7 +182,7 @@ class URArm(Closing):
                     f"target of arm '{self.name}' at {np.round(allowed.position, 4).tolist()} m is out of its reach; "
                     "ask for a pose nearer to the arm, or turned less"
                 )
-            self._send(CommandKind.TARGET, allowed)
+            self._send(CommandKind.TARGET, allowed, math.inf if speed is None else speed)
             return allowed
 
     def stop(self) -> None:
@@ -272,9 +275,9 @@ class URArm(Closing):
         self._worker.close(CLOSE_TIMEOUT if connected else 0.0)
         self._worker = None
 
-    def _send(self, kind: CommandKind, target: Pose | None = None) -> None:
+    def _send(self, kind: CommandKind, target: Pose | None = None, speed: float = math.inf) -> None:
         vector = None if target is None else np.concatenate([target.position, target.quaternion])
-        self._channel.commands.write(command_record(time.monotonic(), kind, vector))
+        self._channel.commands.write(command_record(time.monotonic(), kind, vector, speed))
 
     def _await(self, done: Callable[[], bool], timeout: float, otherwise: str) -> None:
         deadline = time.monotonic() + timeout

@@ -56,9 +56,9 @@ class CommandedArm:
         self.limits_hit += target is not None and sent is not None and max(se3.distance(target, sent)) > SHORTENED
         return sent
 
-    def send(self, target: Pose | None) -> Pose | None:
-        """`command` for motions of a reset, which count no limits."""
-        self.target = self.driver.command(target)
+    def send(self, target: Pose | None, speed: float | None = None) -> Pose | None:
+        """`command` for motions of a reset, which count no limits, at most at `speed` [m/s]."""
+        self.target = self.driver.command(target, speed)
         return self.target
 
     def advance(self) -> bool:

@@ -84,10 +84,10 @@ class Bench:
     def at(self) -> Pose:
         return pose_of(self.now.sensor)
 
-    def ask(self, target: Pose | np.ndarray, kind: CommandKind = CommandKind.TARGET) -> None:
+    def ask(self, target: Pose | np.ndarray, kind: CommandKind = CommandKind.TARGET, speed: float = math.inf) -> None:
         row = target if isinstance(target, np.ndarray) else np.array([*target.position, *target.quaternion])
         self.number += 1
-        self.servo.on_command(self.number, command_record(self.time, kind, row))
+        self.servo.on_command(self.number, command_record(self.time, kind, row, speed))
 
     def run(self, periods: int, force: tuple[float, ...] = (0.0,) * 6) -> None:
         for _ in range(periods):

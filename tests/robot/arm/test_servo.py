@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -82,6 +83,16 @@ def test_a_target_outside_is_cut_at_the_wall_and_counted() -> None:
     bench.run(1500)
     assert bench.servo.shortened == 1
     assert bench.path()[:, 2].min() == pytest.approx(0.3, abs=1e-8)
+
+
+@pytest.mark.parametrize(("asked", "wanted"), [(2e-3, 2e-3), (math.inf, 0.05), (1.0, 0.05)])
+def test_a_command_may_ask_for_less_than_the_speed_limit_never_for_more(asked: float, wanted: float) -> None:
+    bench = Bench(action_timeout=60.0, speed=0.05)
+    bench.ask(shifted(bench.at, 0.1), speed=asked)
+    bench.run(300)
+    speeds = np.linalg.norm(np.diff(bench.path(), axis=0), axis=1) / PERIOD
+    assert speeds[150:].max() == pytest.approx(wanted, rel=1e-3)
+    assert speeds.max() <= wanted * (1 + 1e-3)
 
 
 def test_a_turn_at_full_speed_close_to_a_wall_does_not_bulge_out() -> None:

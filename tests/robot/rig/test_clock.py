@@ -53,7 +53,7 @@ class StubArm:
     def arrived(self, target: Pose, **within: float) -> bool:
         return len(self.commands) >= self._needs
 
-    def command(self, target: Pose) -> Pose:
+    def command(self, target: Pose, speed: float | None = None) -> Pose:
         if self._error is not None:
             raise self._error
         self.commands.append(target)

@@ -34,7 +34,7 @@ class StubArm:
     def state(self) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
 
-    def command(self, target: Pose) -> Pose:
+    def command(self, target: Pose, speed: float | None = None) -> Pose:
         if self.stopped:
             raise EmergencyStop(f"arm '{self.name}' has an emergency stop")
         self.pose = target

@@ -10,12 +10,15 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from robot.arm import ur
 from robot.arm.channel import ArmStatus
+from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.common.process import Child
 from robot.errors import (
@@ -28,12 +31,15 @@ from tests.promises import Record
 from tests.robot.arm.mocked import (
     PATIENCE,
     at_full_speed,
+    check_path,
     config,
     go,
     in_motion,
     leftovers,
     moved,
     records,
+    sensor_path,
+    servo_targets,
     stands,
     until,
 )
@@ -122,6 +128,59 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
     until(lambda: 30004 not in mock.faults.state().clients, "closed sockets")
     until(lambda: not running(int(worker)), "end of the worker")
     figure("processes, sockets left by a killed policy", 0, promise=14)  # else one of these waits failed
+
+
+COMMAND = """
+import os, sys, time
+from robot.arm.ur import URArm
+from robot.cli.interrupt import Interrupt
+from tacsim.models.hardware import UrArmConfig
+from tests.robot.arm.mocked import at_full_speed, moved
+with Interrupt() as stop:
+    with URArm(UrArmConfig.model_validate_json(sys.argv[1]), "policy") as arm:
+        at_full_speed(arm, moved(arm.state().pose, x=0.14))
+        stop()
+        print(arm._worker.pid, flush=True)
+        while not stop():
+            time.sleep(0.01)
+    sys.exit(stop.exit_code)
+"""
+
+
+@pytest.mark.promise(6, 14)
+@pytest.mark.parametrize(
+    ("program", "number"),
+    [
+        (POLICY, signal.SIGTERM),
+        pytest.param(POLICY, signal.SIGHUP, marks=pytest.mark.deep),
+        pytest.param(COMMAND, signal.SIGTERM, marks=pytest.mark.deep),
+        (COMMAND, signal.SIGHUP),
+    ],
+)
+def test_a_signal_to_every_process_ends_with_a_ramp(mock: MockUR, program: str, number: signal.Signals) -> None:
+    """A lost terminal, `kill -- -GROUP`, `systemctl stop`. A command brakes within its limits; the arm of a script that
+    handles nothing, and is gone at once, as after a fault."""
+    given = config()
+    words, path = [sys.executable, "-c", program, given.model_dump_json()], str(Path(ur.__file__).parents[2])
+    since = mock.faults.received().last
+    with subprocess.Popen(
+        words, env={**os.environ, "PYTHONPATH": path}, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as policy:
+        assert policy.stdout is not None
+        worker = int(policy.stdout.readline())
+        assert not mock.faults.state().rests
+        os.kill(worker, number)
+        os.killpg(policy.pid, number)
+        assert policy.wait(PATIENCE) == (128 + number if program == COMMAND else -number)
+    until(lambda: not running(worker), "end of the worker")
+    until(lambda: not mock.faults.state().program, "end of the program")
+    assert "watchdog" not in mock.faults.state().stop_reason.lower()
+    sent = servo_targets(mock.faults.received(since).entries)
+    arm = cast("URArm", SimpleNamespace(config=given))
+    if program == COMMAND:
+        check_path(arm, sent)
+    steps = np.linalg.norm(np.diff(sensor_path(arm, sent)[:, :3, 3], axis=0), axis=1) / PERIOD
+    assert steps[-1] < 0.05 * given.limits.speed
 
 
 # -- one commander ---------------------------------------------------------------------------------------------------

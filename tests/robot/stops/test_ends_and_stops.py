@@ -17,12 +17,21 @@ from tests.promises import Record
 from tests.robot.arm.mocked import PATIENCE
 from tests.robot.stops.watched import Trial, judge
 
+
+def to_all(trial: Trial, number: signal.Signals) -> float:
+    """As `systemctl stop` does, or the end of a session."""
+    event = trial.signal(trial.worker, number)
+    trial.signal(trial.policy.pid, number, group=True)
+    return event
+
+
 ENDS: dict[str, Callable[[Trial], float]] = {
     "policy killed (SIGKILL)": lambda trial: trial.signal(trial.policy.pid, signal.SIGKILL),
     "policy hung (SIGSTOP)": lambda trial: trial.signal(trial.policy.pid, signal.SIGSTOP),
     "Ctrl-C": lambda trial: trial.signal(trial.policy.pid, signal.SIGINT, group=True),
     "SIGHUP to the group": lambda trial: trial.signal(trial.policy.pid, signal.SIGHUP, group=True),
     "SIGTERM to the group": lambda trial: trial.signal(trial.policy.pid, signal.SIGTERM, group=True),
+    "SIGTERM to every process": lambda trial: to_all(trial, signal.SIGTERM),
     "worker killed (SIGKILL)": lambda trial: trial.signal(trial.worker, signal.SIGKILL),
     "worker hung (SIGSTOP)": lambda trial: trial.signal(trial.worker, signal.SIGSTOP),
 }

@@ -21,9 +21,10 @@ from robot.common.process import write_message
 from robot.common.realtime import CONTROLLER, ask_for_realtime
 from robot.mock.ur.fault_client import FAULT_PORT
 from robot.mock.ur.fault_server import FaultServer
-from robot.mock.ur.handle import VERSION, check_hosts
+from robot.mock.ur.handle import check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.load import Mass
+from robot.mock.ur.machine.version import VERSION, parse_version
 from robot.mock.ur.wire.controller import Controller, ControllerConfig
 
 if TYPE_CHECKING:
@@ -118,7 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ask_for_realtime(CONTROLLER)
     try:
         check_hosts(given.hosts, given.allow_network)
-        major, minor, bugfix, build = map(int, given.version.split("."))
         models = _for_each(given.model or ["ur5e"], given.hosts, "models")
         postures = [
             tuple(float(angle) for angle in text.split(","))
@@ -129,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for text in _for_each(given.payload or ["0,0,0,0"], given.hosts, "payloads")
         ]
         config = [
-            ControllerConfig(host, cast("Model", model), joints, (major, minor, bugfix, build), given.serial, tool)
+            ControllerConfig(host, cast("Model", model), joints, parse_version(given.version), given.serial, tool)
             for host, model, joints, tool in zip(given.hosts, models, postures, tools, strict=True)
         ]
         serve(config, given.fault_port, with_parent=given.with_parent)

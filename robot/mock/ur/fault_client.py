@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +67,7 @@ class FaultClient:
 
     def __init__(self, host: str, port: int = FAULT_PORT, timeout: float = TIMEOUT) -> None:
         self.host, self.port, self.timeout = host, port, timeout
+        self.last_words: Callable[[], str] = str  # why the mock has ended; set by the handle of its process
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None
         self._received = b""
@@ -226,7 +227,7 @@ class FaultClient:
             except (OSError, ValueError) as error:
                 self._hang_up()
                 reason = "no answer in time" if isinstance(error, TimeoutError) else str(error)
-                raise FaultError(f"mock {self.host}:{self.port}, {action}: {reason}") from error
+                raise FaultError(f"mock {self.host}:{self.port}, {action}: {reason}{self.last_words()}") from error
         if not answer["ok"]:
             raise FaultError(f"mock {self.host}:{self.port}, {action}: {answer['error']}")
         return answer["result"]

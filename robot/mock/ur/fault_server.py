@@ -11,19 +11,22 @@ import selectors
 import time
 from collections.abc import Callable
 from functools import partial
-from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from robot.mock.ur.machine.load import Mass, Wall
+from robot.mock.ur.machine.registry import LARGEST
+from robot.mock.ur.machine.version import check_version
 from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.controller import PORTS, Controller, open_port
+from robot.mock.ur.wire.controller import PORTS, Controller, accept, lines, open_port
 from robot.mock.ur.wire.fields import INPUTS
 from tacsim.interface import FloatArray
 
 PAGE = 500  # input packages in one reply
 MAX_REQUEST = 1 << 16  # bytes
+MAX_CLIENTS = 64  # more are closed at once
+MAX_DELAY = 60.0  # of a slow line [s]
 
 
 class FaultServer:
@@ -32,6 +35,7 @@ class FaultServer:
     def __init__(self, controller: Controller, selector: selectors.BaseSelector, port: int) -> None:
         self._controller, self._selector = controller, selector
         self._clients: set[Connection] = set()
+        self._behind: set[Connection] = set()  # which sent more than one request
         self._listener = open_port(controller.config.host, port)
         self.port = port
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
@@ -47,29 +51,35 @@ class FaultServer:
         for client in list(self._clients):
             if not client.flush(0.0):
                 self._drop(client)
+            elif client in self._behind:
+                self._serve(client)
 
     def _accept(self) -> None:
-        try:
-            sock, _ = self._listener.accept()
-        except OSError:
+        client = accept(self._listener, self.port)
+        if client is None:
             return
-        client = Connection(sock, self.port)
+        if len(self._clients) >= MAX_CLIENTS:
+            client.close()
+            return
         self._clients.add(client)
-        self._selector.register(sock, selectors.EVENT_READ, partial(self._read, client))
+        self._selector.register(client.socket, selectors.EVENT_READ, partial(self._serve, client))
 
     def _drop(self, client: Connection) -> None:
         self._clients.discard(client)
+        self._behind.discard(client)
         self._selector.unregister(client.socket)
         client.close()
 
-    def _read(self, client: Connection) -> None:
-        alive = client.read()
-        while (end := client.received.find(b"\n")) >= 0:
-            line = bytes(client.received[:end])
-            del client.received[: end + 1]
+    def _serve(self, client: Connection) -> None:
+        """Answers one request; nothing more is read from a client that has sent others."""
+        alive = client in self._behind or client.read()
+        line = next(lines(client.received), None)
+        if line is not None:
             client.send(json.dumps(self.answer(line)).encode() + b"\n")
-        if not alive or len(client.received) > MAX_REQUEST:
+        if not alive or (line is None and len(client.received) > MAX_REQUEST):
             self._drop(client)
+        else:
+            (self._behind.add if b"\n" in client.received else self._behind.discard)(client)
 
     def answer(self, line: bytes) -> dict[str, Any]:
         """What a request brings about, or why not."""
@@ -79,20 +89,20 @@ class FaultServer:
             if action is None:
                 return {"ok": False, "error": f"no such action; allowed: {', '.join(sorted(ACTIONS))}"}
             return {"ok": True, "result": action(self._controller, **request)}
-        except (ValueError, TypeError, KeyError, AttributeError, OSError) as error:
+        except Exception as error:  # whatever is asked, the arms go on
             return {"ok": False, "error": f"{type(error).__name__}: {error}"}
 
 
 def _six(values: list[float]) -> FloatArray:
     array = np.array(values, dtype=np.float64)
-    if array.shape != (6,) or not np.isfinite(array).all():
-        raise ValueError(f"need 6 finite numbers, got {values}")
+    if array.shape != (6,) or not float(np.abs(array).max()) <= LARGEST:
+        raise ValueError(f"need 6 finite numbers of at most {LARGEST:g}, got {values}")
     return array
 
 
-def _not_negative(value: float, name: str) -> float:
-    if not 0 <= value < float("inf"):
-        raise ValueError(f"{name} must be at least 0 and finite, got {value}")
+def _number(value: float, name: str, least: float = -LARGEST, most: float = LARGEST) -> float:
+    if not least <= value <= most:  # not a number is none either
+        raise ValueError(f"{name} must lie within {least:g} and {most:g}, got {value}")
     return float(value)
 
 
@@ -118,18 +128,15 @@ def _state(controller: Controller) -> dict[str, Any]:
         "overruns": controller.overruns,
         "packages_sent": controller.sent,
         "packages_dropped": controller.dropped,
-        "packages_received": controller.arrived,
+        "packages_received": controller.inputs.arrived,
         "clients": sorted(client.port for client in controller.clients),
     }
 
 
 def _received(controller: Controller, since: int) -> dict[str, Any]:
-    kept = controller.received
-    oldest = controller.arrived - len(kept)  # number of the last one that is gone
-    begin = max(0, since - oldest)
-    page = islice(kept, begin, begin + PAGE)
-    entries = [(entry.number, entry.tick, entry.values) for entry in page]
-    return {"entries": entries, "lost": max(0, oldest - since), "last": controller.arrived}
+    entries, lost = controller.inputs.after(since, PAGE)
+    told = [(entry.number, entry.tick, entry.values) for entry in entries]
+    return {"entries": told, "lost": lost, "last": controller.inputs.arrived}
 
 
 def _wrench(controller: Controller, wrench: list[float]) -> None:
@@ -137,7 +144,7 @@ def _wrench(controller: Controller, wrench: list[float]) -> None:
 
 
 def _wall(controller: Controller, z: float, stiffness: float) -> None:
-    controller.machine.load.wall = Wall(float(z), _not_negative(stiffness, "stiffness"))
+    controller.machine.load.wall = Wall(_number(z, "z"), _number(stiffness, "stiffness", 0.0, 1e9))
 
 
 def _no_wall(controller: Controller) -> None:
@@ -149,7 +156,7 @@ def _payload_mismatch(controller: Controller, mass: float, centre: list[float]) 
 
 
 def _force_limit(controller: Controller, newtons: float) -> None:
-    controller.machine.load.force_limit = _not_negative(newtons, "force limit")
+    controller.machine.load.force_limit = _number(newtons, "force limit", 0.0)
 
 
 def _drop(controller: Controller, probability: float, seed: int) -> None:
@@ -159,7 +166,7 @@ def _drop(controller: Controller, probability: float, seed: int) -> None:
 
 
 def _delay(controller: Controller, seconds: float) -> None:
-    controller.faults.delay = _not_negative(seconds, "delay")
+    controller.faults.delay = _number(seconds, "delay", 0.0, MAX_DELAY)
 
 
 def _claim(controller: Controller, names: list[str]) -> None:
@@ -170,20 +177,19 @@ def _claim(controller: Controller, names: list[str]) -> None:
 
 
 def _version(controller: Controller, version: list[int]) -> None:
-    major, minor, bugfix, build = (int(number) for number in version)
-    controller.machine.version = (major, minor, bugfix, build)
+    controller.machine.version = check_version(version)
 
 
 def _clock_jump(controller: Controller, seconds: float) -> None:
-    controller.machine.clock_offset += float(seconds)
+    controller.machine.clock_offset += _number(seconds, "seconds")
 
 
 def _tick_overrun(controller: Controller, seconds: float) -> None:
-    time.sleep(min(_not_negative(seconds, "seconds"), 30.0))  # the whole controller stands still, as asked
+    time.sleep(_number(seconds, "seconds", 0.0, 30.0))  # the whole controller stands still, as asked
 
 
 def _unlock_delay(controller: Controller, seconds: float) -> None:
-    controller.machine.unlock_delay = _not_negative(seconds, "unlock delay")
+    controller.machine.unlock_delay = _number(seconds, "unlock delay", 0.0)
 
 
 def _switch(name: str) -> Callable[[Controller, bool], None]:
@@ -203,7 +209,7 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "release": lambda controller: controller.machine.release_emergency_stop(),
     "safeguard_stop": lambda controller, on: controller.machine.safeguard_stop(on),
     "recover": lambda controller: controller.machine.recover(),
-    "power_cycle": lambda controller, seconds: controller.power_cycle(_not_negative(seconds, "seconds")),
+    "power_cycle": lambda controller, seconds: controller.power_cycle(_number(seconds, "seconds", 0.0)),
     "silence": _switch("silence"),
     "partial_packages": _switch("partial"),
     "nan_state": _switch("nan"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import subprocess
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +14,13 @@ from robot.common.loopback import require_loopback
 from robot.common.process import PATIENCE, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
-from robot.mock.ur.machine.machine import Version
+from robot.mock.ur.machine.version import VERSION, Version, check_version
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
 
-VERSION: Version = (5, 11, 0, 108150)
+
+DYING = 0.2  # between the end of a process's connections and its own [s]
 
 
 class MockError(DeviceError):
@@ -49,7 +52,7 @@ class MockArms(Child):
         self.hosts = tuple(hosts)
         arguments = [*self.hosts, "--fault-port", str(fault_port), "--serial", serial]
         arguments += [f"--model={each}" for each in ([model] if isinstance(model, str) else model)]
-        arguments += ["--version", ".".join(map(str, version)), "--with-parent"]
+        arguments += ["--version", ".".join(map(str, check_version(version))), "--with-parent"]
         for option, rows in (("--joints", joints), ("--payload", payload)):
             for row in () if rows is None else np.atleast_2d(np.array(rows, dtype=np.float64)):
                 arguments.append(f"{option}=" + ",".join(repr(float(number)) for number in row))
@@ -61,6 +64,18 @@ class MockArms(Child):
         self.fault_clients = tuple(FaultClient(host, fault_port) for host in self.hosts)
         name = f"mock controller on {', '.join(hosts)}"
         super().__init__("robot.mock", arguments, name=name, error=MockError, ready_timeout=ready_timeout)
+        for faults in self.fault_clients:
+            faults.last_words = self._last_words
+
+    def _last_words(self) -> str:
+        """Why the process has ended, to be added to an error; nothing while it runs."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(DYING)
+        try:
+            self.check()
+        except MockError as error:
+            return f"; {error}"
+        return ""
 
     def close(self, patience: float = PATIENCE) -> None:
         for faults in self.fault_clients:

@@ -23,7 +23,9 @@ from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramEr
 from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
+from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.machine.script import Program
+from robot.mock.ur.machine.version import VERSION, Version
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
@@ -35,8 +37,6 @@ RELEASE = 50  # periods from idle to running
 SLIDER_RATE = 5.0  # how fast the speed scaling follows the slider [1/s]
 LINE = 500  # longest text of the log
 UNLOCK_DELAY = 0.0  # least time from a protective stop to its unlocking [s]; real robots want 5 s
-
-Version = tuple[int, int, int, int]
 
 
 class Mode(IntEnum):
@@ -100,7 +100,7 @@ class Machine:
         self,
         model: Model = "ur5e",
         joints: Sequence[float] = HOME,
-        version: Version = (5, 11, 0, 108150),
+        version: Version = VERSION,
         tool: Mass = NOTHING,  # hangs on the flange
     ) -> None:
         self.version = version
@@ -233,7 +233,7 @@ class Machine:
         self.safety, self.stop_reason = Safety.FAULT, f"fault, error of the mock: {type(error).__name__}: {error}"
         self.write_log(self.stop_reason)
         sound = (q for q in reversed(self.arm.history) if float(np.abs(q).max()) <= JOINT_RANGE)
-        self.arm, self.load = Arm(self.arm.kinematics.model, next(sound, np.array(HOME)).tolist()), Load()
+        self.arm, self.load = Arm(self.arm.kinematics.model, next(sound, np.array(HOME)).tolist()), Load(self.load.tool)
 
     def unlock(self) -> bool:
         """Ends a protective stop; False where it is too early."""
@@ -348,6 +348,12 @@ class Machine:
         """An input_int_register was written: the watchdog starts anew if it is its own."""
         if self.watchdog is not None and register == self.watchdog[0]:
             self.watchdog_reset = self.ticks
+
+    def on_short_command(self, name: str, number: int, told: str) -> None:
+        """A command arrived without all of its numbers: the program ends if that is the register it reads."""
+        program = self.program
+        if program is not None and name == f"input_int_register_{program.int_offset}" and number in COMMANDS:
+            self.stop(f"command {number} of a wrong length, such as moveJ with three angles: {told}")
 
     def set_slider(self, fraction: float) -> None:
         if 0.0 <= fraction <= 1.0:

@@ -8,6 +8,7 @@ from collections import deque
 RECEIVE = 1 << 16  # bytes read at a time
 SEND_BUFFER = 1 << 16  # of the system: a slow reader gets packages that are old, but not seconds old [bytes]
 BACKLOG = 1 << 20  # replies that a client does not fetch, before it is cut [bytes]
+LATE = 1 << 26  # what a slow line may hold, before its client is cut [bytes]
 
 
 class Connection:
@@ -20,7 +21,9 @@ class Connection:
     def __init__(self, sock: socket.socket, port: int) -> None:
         self.socket, self.port = sock, port
         self.received = bytearray()
+        self.searched = 0  # bytes of it, from the front, that hold no end of a program
         self.sent = self.dropped = 0  # stream packages
+        self._late_size = 0
         self._late: deque[tuple[float, bytes, bool, bool]] = deque()  # (due, bytes, droppable, halved): a slow line
         self._waiting = bytearray()
         self._half = b""  # what is left of a package that is sent in two parts
@@ -43,6 +46,7 @@ class Connection:
         """Sends now, or at the time `due` [s]: see `flush`. `halved`: the second half comes with the next flush."""
         if due > 0.0 or self._late:
             self._late.append((due, data, droppable, halved))
+            self._late_size += len(data)
             return
         self._push(data, droppable, halved)
 
@@ -51,8 +55,9 @@ class Connection:
         self._push(b"", False, False)
         while self._late and self._late[0][0] <= now:
             _, data, droppable, halved = self._late.popleft()
+            self._late_size -= len(data)
             self._push(data, droppable, halved)
-        return self._drain() and len(self._waiting) <= BACKLOG
+        return self._drain() and len(self._waiting) <= BACKLOG and self._late_size <= LATE
 
     def close(self, *, reset: bool = False) -> None:
         """Ends the connection: with FIN, or with RST."""

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import re
 import selectors
 import socket
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robot.common import MOCK_SERIAL
-from robot.mock.ur.fault_client import Input
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.load import NOTHING, Mass
-from robot.mock.ur.machine.machine import Machine, Version
+from robot.mock.ur.machine.machine import Machine
+from robot.mock.ur.machine.version import VERSION, Version
 from robot.mock.ur.wire import dashboard
 from robot.mock.ur.wire.connection import Connection
-from robot.mock.ur.wire.fields import Value, apply
-from robot.mock.ur.wire.rtde import BadPackage, Session, packages
+from robot.mock.ur.wire.fields import apply
+from robot.mock.ur.wire.inputs import Inputs
+from robot.mock.ur.wire.rtde import BadPackage, InputRecipe, Session, packages
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
@@ -30,7 +33,8 @@ RTDE, DASHBOARD, SCRIPTS = 30004, 29999, (30001, 30002, 30003)
 PORTS = (RTDE, DASHBOARD, *SCRIPTS)
 MAX_CLIENTS = 256  # of one controller; more are closed at once
 MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
-KEPT = 200_000  # input packages that are remembered
+BURST = 16  # packages or lines of one client that are served in one go; the others wait, and nothing more is read
+_PROGRAM_END = re.compile(rb"^end[ \t\r]*$", re.M)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class ControllerConfig:
     host: str
     model: Model = "ur5e"
     joints: tuple[float, ...] = HOME
-    version: Version = (5, 11, 0, 108150)
+    version: Version = VERSION
     serial: str = MOCK_SERIAL
     tool: Mass = NOTHING  # hangs on the flange
 
@@ -70,9 +74,9 @@ class Controller:
         self.machine = Machine(config.model, config.joints, config.version, config.tool)
         self.ticks = self.overruns = 0
         self.sent = self.dropped = 0  # data packages
-        self.received: deque[Input] = deque(maxlen=KEPT)
-        self.arrived = 0  # input packages so far
+        self.inputs = Inputs()
         self.clients: dict[Connection, Session | None] = {}
+        self._behind: set[Connection] = set()  # clients that sent more than was served so far
         self._listeners: list[socket.socket] = []
         self._boot_at: int | None = None  # tick at which a power cycle ends
         self._rate = (time.monotonic(), 0, 0.0)  # begun, ticks then, rate of the span before
@@ -107,7 +111,7 @@ class Controller:
         self._boot_at = None
         self.faults = Faults()
         self.machine = Machine(self.config.model, self.config.joints, self.config.version, self.config.tool)
-        self.received.clear()
+        self.inputs.clear()
         self.listen()
 
     def power_cycle(self, seconds: float) -> None:
@@ -135,7 +139,7 @@ class Controller:
             if on:
                 self._selector.unregister(client.socket)
             else:
-                self._register(client.socket, partial(self._read, client))
+                self._register(client.socket, partial(self._serve, client))
         for listener in self._listeners:
             if on:
                 self._selector.unregister(listener)
@@ -154,6 +158,8 @@ class Controller:
             self.listen()
         self.machine.tick()
         if not self.faults.black_hole:
+            for client in list(self._behind):
+                self._serve(client)
             self._publish()
         if self.ticks % 500 == 0:
             now, (then, count, _) = time.monotonic(), self._rate
@@ -178,10 +184,14 @@ class Controller:
                 if self.faults.drop > 0 and self.faults.chance.random() < self.faults.drop:
                     self.dropped += 1
                     continue
-                data = made.get(recipe.names)
-                if data is None:
-                    data = made[recipe.names] = recipe.pack(self.machine, nan=self.faults.nan)
-                self._stream(client, data)
+                try:
+                    data = made.get(recipe.names)
+                    if data is None:
+                        data = made[recipe.names] = recipe.pack(self.machine, nan=self.faults.nan)
+                except Exception as error:
+                    self._cut(client, error)
+                else:
+                    self._stream(client, data)
 
     def _stream(self, client: Connection, data: bytes) -> None:
         sent, dropped = client.sent, client.dropped
@@ -198,88 +208,99 @@ class Controller:
         self._selector.register(sock, selectors.EVENT_READ, work)
 
     def _accept(self, listener: socket.socket, port: int) -> None:
-        try:
-            sock, _ = listener.accept()
-        except OSError:
-            return  # gone again
+        client = accept(listener, port)
+        if client is None:
+            return
         if len(self.clients) >= MAX_CLIENTS:
             self.machine.write_log(f"client of port {port} closed: {MAX_CLIENTS} are connected already")
-            sock.close()
+            client.close()
             return
-        client = Connection(sock, port)
         session = None
         if port == RTDE:
             session = Session(lambda: self.machine, self._names_in_use, self._write)
         self.clients[client] = session
-        self._register(sock, partial(self._read, client))
+        self._register(client.socket, partial(self._serve, client))
         if port == DASHBOARD and not self.faults.dashboard_mute:
             client.send(dashboard.GREETING.encode() + b"\n", due=self._due())
 
     def _drop(self, client: Connection, *, reset: bool = False) -> None:
         if client in self.clients:
             del self.clients[client]
+            self._behind.discard(client)
             if not self.faults.black_hole:
                 self._selector.unregister(client.socket)
             client.close(reset=reset)
 
-    def _read(self, client: Connection) -> None:
+    def _cut(self, client: Connection, error: Exception) -> None:
+        """Ends the connection of a client that cannot be served; the others go on."""
+        if not isinstance(error, BadPackage):
+            traceback.print_exc()
+        self.machine.write_log(f"port {client.port}: client cut: {type(error).__name__}: {error}")
+        self._drop(client)
+
+    def _serve(self, client: Connection) -> None:
+        """Reads, and serves a burst of what has come. Nothing more is read from a client that is behind."""
         if client not in self.clients:
             return
-        alive = client.read()
+        alive = client in self._behind or client.read()
         try:
             if client.port == RTDE:
-                self._serve_rtde(client)
+                behind = self._serve_rtde(client)
             elif client.port == DASHBOARD:
-                self._serve_dashboard(client)
+                behind = self._serve_dashboard(client)
             else:
-                self._serve_script(client)
-        except BadPackage as error:
-            self.machine.write_log(f"port {client.port}: client cut: {error}")
-            alive = False
+                behind = self._serve_script(client)
+        except Exception as error:
+            self._cut(client, error)
+            return
         if not alive:
             self._drop(client)
+        elif client in self.clients:
+            (self._behind.add if behind else self._behind.discard)(client)
 
-    def _serve_rtde(self, client: Connection) -> None:
+    def _serve_rtde(self, client: Connection) -> bool:
         session = self.clients[client]
         assert session is not None
-        for kind, payload in packages(client.received):
+        served = 0
+        for kind, payload in islice(packages(client.received), BURST):
             reply = session.handle(kind, payload)
             if reply is not None:
                 client.send(reply, due=self._due())
+            served += 1
+        return served == BURST
 
-    def _serve_dashboard(self, client: Connection) -> None:
-        while (end := client.received.find(b"\n")) >= 0:
-            line = client.received[:end].decode("utf-8", errors="replace").strip()
-            del client.received[: end + 1]
+    def _serve_dashboard(self, client: Connection) -> bool:
+        for line in islice(lines(client.received), BURST):
+            request = line.decode("utf-8", errors="replace").strip()
             if self.faults.dashboard_mute:
                 continue
-            if line.lower() in ("quit", "shutdown"):
-                client.send(b"Disconnected\n" if line.lower() == "quit" else b"Shutting down\n")
+            if request.lower() in ("quit", "shutdown"):
+                client.send(b"Disconnected\n" if request.lower() == "quit" else b"Shutting down\n")
                 self._drop(client)
-                return
-            reply = dashboard.answer(self.machine, line, self.config.serial, remote=self.faults.remote_control)
+                return False
+            reply = dashboard.answer(self.machine, request, self.config.serial, remote=self.faults.remote_control)
             client.send(reply.encode() + b"\n", due=self._due())
-        if len(client.received) > MAX_LINE:
+        behind = b"\n" in client.received
+        if not behind and len(client.received) > MAX_LINE:
             raise BadPackage(f"a dashboard line of more than {MAX_LINE} bytes")
+        return behind
 
-    def _serve_script(self, client: Connection) -> None:
-        """A program begins with `def` or `sec` and ends with an `end` that is not indented."""
-        while True:
-            text = bytes(client.received)
-            lines = text.split(b"\n")
-            last = next((i for i, line in enumerate(lines[:-1]) if line.rstrip() == b"end"), None)
-            if last is None and lines[-1] == b"end":
-                last = len(lines) - 1
-            if last is None:
-                break
-            program = b"\n".join(lines[: last + 1]).decode("utf-8", errors="replace")
-            client.received[:] = b"\n".join(lines[last + 1 :])
-            if self.faults.remote_control:
-                self.machine.start(program)
-            else:
-                self.machine.write_log("program refused: the robot is not in remote control")
-        if len(client.received) > MAX_PROGRAM:
-            raise BadPackage(f"a program of more than {MAX_PROGRAM} bytes")
+    def _serve_script(self, client: Connection) -> bool:
+        """A program begins with `def` or `sec` and ends with an `end` that is not indented; one of them is run."""
+        found = _PROGRAM_END.search(client.received, client.searched)
+        if found is None:
+            client.searched = max(0, client.received.rfind(b"\n"))
+            if len(client.received) > MAX_PROGRAM:
+                raise BadPackage(f"a program of more than {MAX_PROGRAM} bytes")
+            return False
+        program = client.received[: found.end()].decode("utf-8", errors="replace")
+        del client.received[: found.end()]
+        client.searched = 0
+        if self.faults.remote_control:
+            self.machine.start(program)
+        else:
+            self.machine.write_log("program refused: the robot is not in remote control")
+        return True
 
     # -- input registers ---------------------------------------------------------------------------------------------
 
@@ -287,10 +308,30 @@ class Controller:
         others = (session.claims for session in self.clients.values() if session is not None and session is not asking)
         return self.faults.claimed.union(*others)
 
-    def _write(self, values: dict[str, Value | tuple[Value, ...]]) -> None:
-        self.arrived += 1
-        self.received.append(Input(self.arrived, self.ticks, values))
-        apply(self.machine, values)
+    def _write(self, recipe: InputRecipe, payload: bytes) -> None:
+        self.inputs.add(self.ticks, recipe, payload)
+        apply(self.machine, recipe.unpack(payload))
+
+
+def lines(buffer: bytearray) -> Iterator[bytes]:
+    """Takes whole lines from the front of the buffer, without their ends."""
+    while (end := buffer.find(b"\n")) >= 0:
+        line = bytes(buffer[:end])
+        del buffer[: end + 1]
+        yield line
+
+
+def accept(listener: socket.socket, port: int) -> Connection | None:
+    """A client that waits at the port; None for one that is gone again."""
+    try:
+        sock, _ = listener.accept()
+    except OSError:
+        return None
+    try:
+        return Connection(sock, port)
+    except OSError:
+        sock.close()
+        return None
 
 
 def open_port(host: str, port: int) -> socket.socket:

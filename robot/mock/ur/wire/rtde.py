@@ -18,6 +18,7 @@ HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, MESSAGE, DATA = ord("V"), ord("v"), ord("M"), ord("U")
 OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE = ord("O"), ord("I"), ord("S"), ord("P")
 MAX_RECIPES = 255
+MAX_NAMES = 2048  # of one recipe (manual of PolyScope X 10.10, chapter RTDE, which does not say what follows) [bytes]
 
 
 class BadPackage(ValueError):
@@ -87,12 +88,12 @@ class OutputRecipe:
 class Session:
     """What one client of the port has set up.
 
-    `names_in_use` gives the input names that others hold; `write` takes the values of an input package.
+    `names_in_use` gives the input names that others hold; `write` takes the payload of an input package.
     """
 
     machine: Callable[[], Machine]
     names_in_use: Callable[[Session], set[str]]
-    write: Callable[[dict[str, Value | tuple[Value, ...]]], None]
+    write: Callable[[InputRecipe, bytes], None]
     recipes: dict[int, InputRecipe] = field(default_factory=dict)
     output: OutputRecipe | None = None
     streaming: bool = False
@@ -130,7 +131,7 @@ class Session:
             self.machine().write_log("RTDE: output recipe without a frequency refused")
             return b"\0"
         (frequency,) = struct.unpack_from(">d", payload)
-        names = _names(payload[8:])
+        names = self._names(payload[8:])
         version = self.machine().version
         fields = [output for name in names if (output := OUTPUTS.get(name)) and output.known(version)]
         types = [OUTPUTS[name].type if OUTPUTS.get(name) in fields else "NOT_FOUND" for name in names]
@@ -142,7 +143,7 @@ class Session:
         return b"\1" + ",".join(types).encode()
 
     def _ask_inputs(self, payload: bytes) -> bytes:
-        names, names_in_use = _names(payload), self.names_in_use(self)
+        names, names_in_use = self._names(payload), self.names_in_use(self)
         types = ["IN_USE" if name in names_in_use else INPUTS.get(name, "NOT_FOUND") for name in names]
         number = len(self.recipes) + 1
         if not names or not all(kind in FORMATS for kind in types) or number > MAX_RECIPES:
@@ -153,19 +154,30 @@ class Session:
         self.recipes[number] = InputRecipe(tuple(names), layout, counts)
         return bytes([number]) + ",".join(types).encode()
 
+    def _names(self, payload: bytes) -> list[str]:
+        """Names of a list with commas, in which a last comma is no name; none of a list that is too long."""
+        if len(payload) > MAX_NAMES:
+            self.machine().write_log(f"RTDE: recipe of {len(payload)} bytes of names, at most {MAX_NAMES}")
+            return []
+        return [name for name in payload.decode("ascii", errors="replace").split(",") if name]
+
     def _data(self, payload: bytes) -> None:
         recipe = self.recipes.get(payload[0]) if payload else None
         if recipe is None:
             self.machine().write_log(f"RTDE: data for an unknown recipe ignored: {payload[:1].hex() or 'none'}")
         else:
             # What a controller does with a wrong size is not known. Too much is read as far as the recipe goes (ur_rtde
-            # 1.6.5 sends command 44 so), too little is ignored (command 55).
+            # 1.6.5 sends command 44 so), too little is ignored (command 55); but a command that the program knows, and
+            # that is not whole (moveJ of three numbers), ends it, so that its client does not wait in vain.
             given, size = len(payload) - 1, recipe.layout.size
             if given != size:
                 done = "ignored" if given < size else "cut"
-                self.machine().write_log(f"RTDE: data package {done}: {given} bytes, recipe {payload[0]} has {size}")
+                told = f"data package {done}: {given} bytes, recipe {payload[0]} has {size}"
+                self.machine().write_log(f"RTDE: {told}")
+                if 4 <= given < size:
+                    self.machine().on_short_command(recipe.names[0], struct.unpack_from(">i", payload, 1)[0], told)
             if given >= size:
-                self.write(recipe.unpack(payload[1 : 1 + size]))
+                self.write(recipe, payload[1 : 1 + size])
 
     def _message(self, payload: bytes) -> None:
         self.machine().write_log(f"RTDE: message of a client: {payload[:200]!r}")
@@ -181,8 +193,3 @@ _HANDLERS: dict[int, Callable[[Session, bytes], bytes | None]] = {
     DATA: Session._data,
     MESSAGE: Session._message,
 }
-
-
-def _names(payload: bytes) -> list[str]:
-    """Names of a list with commas; a last comma is no name."""
-    return [name for name in payload.decode("ascii", errors="replace").split(",") if name]

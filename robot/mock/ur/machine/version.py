@@ -1,0 +1,27 @@
+"""The version of PolyScope that a mock claims."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+Version = tuple[int, int, int, int]  # major, minor, bugfix, build
+
+VERSION: Version = (5, 11, 0, 108150)
+LARGEST_NUMBER = 2**32 - 1  # the RTDE tells each as a uint32
+
+
+def check_version(numbers: Sequence[float]) -> Version:
+    """Four whole numbers that the RTDE can tell. Raises ValueError."""
+    if len(numbers) != 4 or not all(0 <= number <= LARGEST_NUMBER and number == int(number) for number in numbers):
+        raise ValueError(f"a version is four whole numbers from 0 to {LARGEST_NUMBER}, got {list(numbers)}")
+    major, minor, bugfix, build = map(int, numbers)
+    return major, minor, bugfix, build
+
+
+def parse_version(text: str) -> Version:
+    """From "5.11", "5.11.0" or "5.11.0.108150"; what is left out is 0. Raises ValueError."""
+    if re.fullmatch(r"\d{1,10}(\.\d{1,10}){1,3}", text, re.ASCII) is None:
+        raise ValueError(f"a version of PolyScope is like 5.11 or 5.11.0.108150, got '{text[:40]}'")
+    numbers = [int(number) for number in text.split(".")]
+    return check_version([*numbers, *[0] * (4 - len(numbers))])

@@ -169,6 +169,8 @@ class CameraSensorConfig(Config):
     exposure: float | None = None  # fixed, in the driver's own unit, and read back; None: left as it is
     white_balance: Annotated[float, Field(gt=0)] | None = None  # colour temperature, fixed and read back [K]
     stamped: bool = False  # frames carry the strip with number and clock that tacsim's mock camera burns in
+    # The source may show the very same picture for long, as no real sensor does: whether it has frozen cannot be told.
+    repeats: bool = False
     max_age: Annotated[Time, Field(gt=0, le=60.0)] = 0.2  # an older frame is refused [s]
     latency: Annotated[Time, Field(ge=0, le=2.0)] = 0.0  # from exposure to arrival [s]
     mock: MockCameraConfig | None = None

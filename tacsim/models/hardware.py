@@ -97,6 +97,8 @@ class MockArmConfig(Config):
     """A mock controller on loopback is started for this arm and stopped with the rig."""
 
     joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
+    # Of PolyScope, which the controller claims: "5.11", "5.11.0.108150"; None: a version that can do all this needs.
+    version: Annotated[str, Field(pattern=r"^[0-9]{1,9}(\.[0-9]{1,9}){1,3}$")] | None = None
     # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
     # they share a busy machine with whatever else the mock rig needs.
     realtime: bool = False

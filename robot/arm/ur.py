@@ -355,6 +355,8 @@ class URArm(Closing):
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
                 text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
+        if status == ArmStatus.WORKER_DEAD and self._worker is not None and (words := self._worker.last_words):
+            text += f" ({words})"
         return text
 
 

@@ -1,8 +1,9 @@
 """The process that talks to one UR arm: `python -m robot.arm.worker`, with its WorkerConfig as JSON on stdin.
 
 The only importer of ur_rtde, in a process of its own because the library may crash, hang, or hold the interpreter's
-lock while it waits for a silent controller. It is never asked to reconnect: a worker that has lost its connection ends,
-and the driver starts another one. For a real arm it asks for real-time priority, and runs on without it.
+lock while it waits for a silent controller. It cannot reconnect (robot.arm.confinement): a worker that has lost its
+connection ends, and the driver starts another one. For a real arm it asks for real-time priority, and runs on without
+it.
 
 The loop, every 2 ms, in this order: read the newest package and publish it; end if the driver or the connection is
 gone; check safety bits, force, region, other arms and gels, and publish a fault before anything that may block; read
@@ -14,23 +15,25 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import signal
 import socket
-import sys
 import time
+import traceback
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 import numpy as np
 
 from robot.arm.channel import STATE, ArmStatus, Channel, WorkerConfig
+from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
 from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
 from robot.arm.shared_ring import Segment
 from robot.arm.trajectory import PERIOD
-from robot.common.kinematics import Kinematics, displacement
+from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.common.process import Parent
 from robot.common.realtime import WORKER, ask_for_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
+from tacsim.interface import FloatArray
 
 PORTS = {30004: "RTDE", 30003: "script"}
 PROBE_TIMEOUT = 2.0  # of a TCP connection [s]
@@ -50,10 +53,11 @@ STOP_BITS = 1 << 3 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9  # reco
 MODEL_LENGTH, MODEL_TURN = 20e-3, 0.05  # FK of the named model and the controller's pose agree within [m, rad]
 CLOSING = 0.6  # longest braking when the driver closes [s]
 PARENTLESS = 0.5  # longest braking when the driver is gone [s]
-CONNECTING = 60.0  # longest connecting: a driver that is gone cannot kill a worker whose controller is silent [s]
-LIBRARY_PATIENCE = 4.5  # the library gives a call up after this time [s]
-STUCK = 10.0  # the process is ended after this time without a period: the library may wait for ever [s]
-ORPHANED = 3.0  # the same when no driver is left to kill it [s]
+CONNECTING = 60.0  # longest time to connect; the driver waits less, but it may be gone [s]
+MARGIN = 10e-3  # a call in the loop takes at most so much longer than link_timeout: the driver tells then [s]
+ZEROING = 2.0  # longest time to zero the force sensor [s]
+ENDING = 3.0  # longest time to end the program; the driver waits less, but it may be gone [s]
+BLIND = 5  # periods without a new package; then nothing is sent
 GRACE = 5  # periods in which a package may say why the controller takes no more commands
 FAILED = 3  # exit status; the reason is on stdout, as JSON
 WINDOW = 500  # periods in the statistics
@@ -71,6 +75,7 @@ class Worker:
         self.partners = [Channel(Segment(partner.segment)) for partner in config.partners]
         self.servo = Servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(WINDOW, PERIOD)
+        self._limit = TimeLimit(config.link_timeout + MARGIN)  # of calls into the library
         self._last = 0.0  # when the last period ended
         self._rereads = 0  # of the same package
         self._refused = 0  # periods since the controller refused a command; 0: it did not
@@ -103,18 +108,27 @@ class Worker:
                 "3.11 or 3.12 on x86-64 Linux"
             ) from failure
         try:
-            self.receive: Any = rtde_receive.RTDEReceiveInterface(config.host, 500.0, VARIABLES)
-            self.control: Any = rtde_control.RTDEControlInterface(config.host, 500.0)
+            with last_connections():
+                self.receive: Any = rtde_receive.RTDEReceiveInterface(config.host, 500.0, VARIABLES)
+                self.control: Any = rtde_control.RTDEControlInterface(config.host, 500.0)
         except Exception as failure:  # the library raises RuntimeError for everything
             if "in use" in str(failure).lower():
                 raise DeviceBusyError(
                     f"arm '{config.name}' at {config.host} is controlled by another program; end that one first"
                 ) from failure
             raise DeviceNotConnectedError(f"arm '{config.name}' at {config.host}: {failure}") from failure
-        self._call("the watchdog", self.control.setWatchdog, config.watchdog)
-        self._call("the TCP", self.control.setTcp, config.tcp)
-        self._call("the payload", self.control.setPayload, config.mass, config.mass_centre)
-        self._check_model()
+        try:
+            self._check_model(lambda: matrix(self.control.getTCPOffset()), "model")
+            self._set("the watchdog", self.control.setWatchdog, config.watchdog)
+            self._set("the TCP", self.control.setTcp, config.tcp)
+            self._set("the payload", self.control.setPayload, config.mass, config.mass_centre)
+            self._check_model(lambda: self.frames.flange_from_tool, "model and flange_from_tool")
+        except RuntimeError as failure:
+            if isinstance(failure, DeviceError):
+                raise
+            raise DeviceNotConnectedError(
+                f"arm '{config.name}': the controller at {config.host} closed the connection; look why, then try again"
+            ) from failure
 
     def _check_identity(self, dashboard: Dashboard) -> None:
         config = self.config
@@ -128,25 +142,25 @@ class Worker:
                 f"arm '{config.name}' is a {model.upper()}, but its file says model: {config.model}"
             )
 
-    def _call(self, what: str, method: Any, *arguments: Any) -> None:
+    def _set(self, what: str, method: Any, *arguments: Any) -> None:
         if not method(*arguments):
             raise DeviceNotConnectedError(f"arm '{self.config.name}': the controller did not take {what} {arguments}")
 
-    def _check_model(self) -> None:
-        """Raises unless the controller's pose agrees with the forward kinematics of the model and the TCP."""
+    def _check_model(self, tool: Callable[[], FloatArray], advice: str) -> None:
+        """Raises unless the controller's pose agrees with the forward kinematics of the model and of `tool`, which
+        gives flange_from_tool (4, 4)."""
         kinematics = Kinematics(self.config.model)  # type: ignore[arg-type]  # a Model, from JSON
-        tool = np.array(self.config.flange_from_tool)
         deadline = time.monotonic() + 1.0
         while True:
             if self._read():
-                expected = kinematics.forward(self.record["joints"], tool)
-                difference = displacement(expected, self.state.flange @ tool)
+                expected = kinematics.forward(self.record["joints"], tool())
+                difference = displacement(expected, matrix(self.record["tcp_pose"]))
                 shift, turn = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
                 if shift <= MODEL_LENGTH and turn <= MODEL_TURN:
                     return
                 found = (
                     f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would "
-                    "have it; check model and flange_from_tool"
+                    f"have it; check {advice}"
                 )
             else:
                 found = "no RTDE package with a pose arrived within 1 s"
@@ -163,15 +177,16 @@ class Worker:
         deadline = self._last + PERIOD
         ending: float | None = None  # when the last braking is cut off
         while True:
-            self._rereads = 0 if self._read() else self._rereads + 1
+            with self._limit:
+                self._rereads = 0 if self._read() else self._rereads + 1
+                connected = self.receive.isConnected() and self.control.isConnected()
             self._publish(self.servo.status)
             orphan = os.getppid() != self.config.parent
-            _end_if_stuck(ORPHANED if orphan else STUCK)
             now = time.monotonic()
-            # A process that was suspended reads again first: packages may be waiting.
-            if self._rereads > 5 and now - float(self.record["time"]) > self.config.link_timeout:
-                self._publish(ArmStatus.LINK_LOST)
-                self._leave()
+            # Periods count, not time: a process that was suspended reads again first, packages may be waiting.
+            blind = self._rereads > BLIND
+            if not connected or (blind and now - float(self.record["time"]) > self.config.link_timeout):
+                self._lose_link()
             partners = self._read_partners(now)
             before = self.servo.status
             stopped = self._controller_stop()
@@ -195,7 +210,8 @@ class Worker:
                 if ending is not None:
                     self._leave()
             else:
-                self._act(now, partners)
+                if not blind:
+                    self._act(now, partners)
                 if ending is not None and (self.servo.resting or now > ending):
                     self._end_program()
                     self._leave()
@@ -207,19 +223,24 @@ class Worker:
             return
         joints = self.servo.step(now, self.state, partners)
         config, control = self.config, self.control
-        if joints is None:
-            alive = control.kickWatchdog()
-        else:
-            alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, config.lookahead, config.gain)
+        with self._limit, self._lost_link():
+            if joints is None:
+                alive = control.kickWatchdog()
+            else:
+                alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, config.lookahead, config.gain)
         if not alive:
             self._refused = 1
         elif self.servo.zero_requested and self.servo.resting:
-            self.servo.zero_requested = False
-            self.record["busy_until"] = time.monotonic() + LIBRARY_PATIENCE
-            self._publish(self.servo.status)
-            if control.zeroFtSensor():
+            self._zero_wrench()
+
+    def _zero_wrench(self) -> None:
+        self.servo.zero_requested = False
+        self.record["busy_until"] = time.monotonic() + ZEROING
+        self._publish(self.servo.status)
+        with TimeLimit(ZEROING), self._lost_link():
+            if self.control.zeroFtSensor():
                 self.record["zeroed"] += 1
-            self.record["busy_until"] = 0.0
+        self.record["busy_until"] = 0.0
 
     def _read(self) -> bool:
         """Reads the newest package into the record; True if it is new. All fields are of one package: its time stamp is
@@ -290,26 +311,33 @@ class Worker:
         self._last = beat
         record["cycles"] = cycle + 1
         if cycle % WINDOW == WINDOW - 1:
-            record["period"] = np.percentile(self._periods, [50.0, 99.0, 100.0])
+            record["period"] = np.sort(self._periods)[[WINDOW // 2, WINDOW * 99 // 100, -1]]
         return deadline + PERIOD
 
     # -- ending --------------------------------------------------------------------------------------------------
 
+    @contextlib.contextmanager
+    def _lost_link(self) -> Iterator[None]:
+        """What the library raises inside is that it has lost its connection and cannot have another."""
+        try:
+            yield
+        except RuntimeError:
+            self._lose_link()
+
+    def _lose_link(self) -> NoReturn:
+        self._publish(ArmStatus.LINK_LOST)
+        self._leave()
+
     def _end_program(self) -> None:
         """Both calls block on the controller; the driver kills a worker that takes too long."""
-        if self.servo.motion is not None:
-            self.control.servoStop(10.0)
-        self.control.stopScript()
+        with TimeLimit(ENDING), self._lost_link():
+            if self.servo.motion is not None:
+                self.control.servoStop(10.0)
+            self.control.stopScript()
 
     def _leave(self) -> NoReturn:
         """Ends the process without the library's destructors, which may wait for an answer that never comes."""
         os._exit(0)
-
-
-def _end_if_stuck(seconds: float) -> None:
-    """The kernel kills this process unless this is called again within `seconds`, even inside a library call."""
-    if sys.platform != "win32":
-        signal.setitimer(signal.ITIMER_REAL, seconds)  # SIGALRM has no handler
 
 
 _CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP)
@@ -317,19 +345,24 @@ _CONTROLLER_STOPS = (ArmStatus.PROGRAM_STOPPED, ArmStatus.PROTECTIVE_STOP, ArmSt
 
 def main() -> NoReturn:
     parent = Parent()  # the library prints
+    allow_time_limits()
     config = WorkerConfig.of(parent.receive())
     if config.realtime:
         ask_for_realtime(WORKER)  # before the library starts its threads
-    _end_if_stuck(CONNECTING)
     try:
         worker = Worker(config)
-        worker.connect()
+        with TimeLimit(CONNECTING):
+            worker.connect()
     except (DeviceError, OSError) as failure:
         kind = type(failure) if isinstance(failure, DeviceError) else DeviceNotConnectedError
         with contextlib.suppress(BrokenPipeError):  # the driver has died
             parent.send({"error": str(failure), "kind": kind.__name__})
         os._exit(FAILED)
-    worker.run(parent)
+    try:
+        worker.run(parent)
+    except BaseException:  # not to the interpreter's end, where the library's destructors wait
+        traceback.print_exc()
+        os._exit(FAILED)
 
 
 if __name__ == "__main__":

@@ -119,10 +119,18 @@ class Child(Closing):
         """False once the process has ended."""
         return self.exit_status is None
 
+    @property
+    def last_words(self) -> str:
+        """How the process ended, and the last line of its standard error: "killed by SIGSEGV: ..."; "" while it runs or
+        when it was closed."""
+        if self._closed or self.running:
+            return ""
+        return ": ".join([self._end(), *self._last_lines(1)])
+
     def check(self) -> None:
         """Raises `error` if the process has ended."""
         if not self.running:
-            raise self._failure(f"has ended, exit status {self.exit_status}")
+            raise self._failure(f"has ended, {self._end()}")
 
     def receive(self, timeout: float) -> Message:
         """The child's next message; its first one says that it is ready. Raises `error`: it says that it cannot, it has
@@ -173,7 +181,7 @@ class Child(Closing):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(PATIENCE)
                 late = time.monotonic() >= deadline
-                told = f"gave no answer within {timeout:g} s" if late else f"has ended, exit status {self.exit_status}"
+                told = f"gave no answer within {timeout:g} s" if late else f"has ended, {self._end()}"
                 raise self._ended(told) from failure
             except ValueError as failure:
                 raise self._ended(f"sent what is no message: {failure}") from failure
@@ -196,11 +204,23 @@ class Child(Closing):
 
     def _failure(self, what: str) -> DeviceError:
         text = f"{self._name} (process {self.pid}) {what}; {self._advice}"
-        if not self._closed:
-            self._errors.seek(0)
-            lines = self._errors.read().decode(errors="replace").strip().splitlines()[-LAST_LINES:]
-            text += "".join(f"\n  {line}" for line in lines)
-        return self._error(text)
+        return self._error(text + "".join(f"\n  {line}" for line in self._last_lines(LAST_LINES)))
+
+    def _end(self) -> str:
+        """How the process ended."""
+        status = self._process.returncode
+        return (
+            f"killed by {signal.Signals(-status).name}"
+            if status is not None and status < 0
+            else f"exit status {status}"
+        )
+
+    def _last_lines(self, number: int) -> list[str]:
+        """Of its standard error, at most `number`."""
+        if self._closed:
+            return []
+        self._errors.seek(0)
+        return self._errors.read().decode(errors="replace").strip().splitlines()[-number:]
 
 
 class Parent:

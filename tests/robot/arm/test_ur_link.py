@@ -33,6 +33,7 @@ from tests.robot.arm.mocked import (
     leftovers,
     moved,
     servo_targets,
+    stands,
     until,
 )
 
@@ -63,18 +64,42 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, me
 
 
 @pytest.mark.promise(4)
-@pytest.mark.parametrize("reset", [False, pytest.param(True, marks=pytest.mark.deep)])
-def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, reset: bool) -> None:
-    with URArm(config(link_timeout=0.5), "left") as arm:
+@pytest.mark.parametrize(
+    ("ports", "reset"), [(None, True), pytest.param([30004], True, marks=pytest.mark.deep), ([30004], False)]
+)
+def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, ports: list[int] | None, reset: bool) -> None:
+    """Left alone, ur_rtde connects anew 0.1 s later, starts its program again, and the arm goes on."""
+    with URArm(config(link_timeout=0.5, watchdog=10.0), "left") as arm:
         start = arm.state().pose
         in_motion(arm, moved(start, x=0.1))
-        mock.faults.cut([30004], reset=reset)
-        until(lambda: arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD), "lost link")
-        time.sleep(0.3)
-        assert arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD)
-        until(lambda: mock.faults.state().rests, "rest")
+        mock.faults.cut(ports, reset=reset)
+        until(lambda: stands(mock.faults.state()), "standstill")
+        first = last = mock.faults.state()
+        farthest, programs, clients = 0.0, [], set()
+        while last.tick < first.tick + 500:
+            last = mock.faults.state()
+            farthest = max(farthest, float(np.linalg.norm(np.subtract(last.pose[:3], first.pose[:3]))))
+            programs.append(last.program)
+            clients |= set(last.clients)
+            time.sleep(1e-3)
+        assert farthest < 50e-6  # it settles to less
+        assert programs == sorted(programs, reverse=True) and not last.program  # it ended, and none began
+        assert clients <= {30020} | (set() if ports is None else {29999, 30003})
+        assert arm.status() == ArmStatus.LINK_LOST
+        with pytest.raises(LinkLost, match="sends no packages any more"):
+            arm.command(start)
         arm.recover()
         go(arm, start)
+
+
+@pytest.mark.parametrize("port", [29999, 30003])
+def test_connections_that_are_not_used_any_more_may_end(mock: MockUR, port: int) -> None:
+    with URArm(config(), "left") as arm:
+        start = arm.state().pose
+        in_motion(arm, moved(start, x=0.05))
+        assert mock.faults.cut([port], reset=True) == 1
+        go(arm, moved(start, x=0.05))
+    until(lambda: not mock.faults.state().program, "end of the program")
 
 
 @pytest.mark.promise(4, 9)

@@ -1,0 +1,63 @@
+"""What a worker may not do once it is connected, tried in processes of their own."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+NO_MORE = """
+import errno, os, select, socket
+from robot.arm.confinement import last_connections
+server = socket.create_server(("127.0.0.1", 0))
+with last_connections():
+    first = socket.create_connection(server.getsockname())
+    second = socket.create_connection(server.getsockname())
+def refused(make):
+    try:
+        make()
+    except OSError as failure:
+        return failure.errno == errno.EMFILE
+makers = [socket.socket, os.pipe, select.epoll, lambda: os.dup(0), lambda: os.open(os.devnull, os.O_RDONLY)]
+print(*map(refused, makers))
+first.close()
+print(*map(refused, makers))
+second.sendall(b"x")  # what is open goes on
+listening = select.poll()
+listening.register(second, select.POLLOUT)
+print(listening.poll(1000) == [(second.fileno(), select.POLLOUT)])
+"""
+
+
+def test_after_the_last_connections_nothing_can_be_opened_in_place_of_a_closed_one_either() -> None:
+    done = subprocess.run([sys.executable, "-c", NO_MORE], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == (f"{' '.join(['True'] * 5)}\n" * 2 + "True\n", "")
+
+
+TOO_LONG = """
+import signal, time
+from robot.arm.confinement import TimeLimit, allow_time_limits
+allow_time_limits()
+limit = TimeLimit(0.2)
+for _ in range(3):
+    with limit:
+        time.sleep(0.01)
+time.sleep(0.4)  # no limit runs on
+print("so far", flush=True)
+with limit:
+    {wait}
+"""
+WAITS = {"sleeping": "time.sleep(60)", "holding the interpreter": "import ctypes; ctypes.PyDLL(None).sleep(60)"}
+
+
+@pytest.mark.parametrize("name", WAITS)
+def test_a_block_that_takes_too_long_ends_the_process_also_where_its_parent_ignores_the_alarm(name: str) -> None:
+    def ignore() -> None:
+        signal.signal(signal.SIGALRM, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+
+    code = TOO_LONG.format(wait=WAITS[name])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, preexec_fn=ignore)
+    assert (done.stdout, done.stderr, done.returncode) == ("so far\n", "", -signal.SIGALRM)

@@ -1,8 +1,7 @@
-"""Where a command writes, how it shows that it is at work, and how it asks a person."""
+"""Where a command writes, and how it shows that it is at work."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -12,6 +11,7 @@ import typer
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
+from rich.status import Status
 
 from tacsim.text import escaped, printable
 
@@ -64,6 +64,30 @@ def writing(folder: Path, *, new: bool = False) -> Iterator[Path]:
         raise
 
 
+_shown: list[Progress | Status] = []  # what is drawn again and again on the terminal
+
+
+@contextmanager
+def _drawn(shown: Progress | Status) -> Iterator[None]:
+    _shown.append(shown)
+    try:
+        yield
+    finally:
+        _shown.remove(shown)
+
+
+@contextmanager
+def paused() -> Iterator[None]:
+    """Nothing is drawn meanwhile: what a person shall read stays on the screen."""
+    for shown in _shown:
+        shown.stop()
+    try:
+        yield
+    finally:
+        for shown in _shown:
+            shown.start()
+
+
 @contextmanager
 def progress() -> Iterator[Progress]:
     """A progress bar on stderr; on no terminal it is silent."""
@@ -74,7 +98,7 @@ def progress() -> Iterator[Progress]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar:
+    with Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar, _drawn(bar):
         yield bar
 
 
@@ -90,7 +114,7 @@ def counted(words: str) -> Iterator[Callable[[int, int], None]]:
 def busy(words: str) -> Iterator[None]:
     """Says what takes long; on a terminal with a spinner, else as one line."""
     if notes.is_terminal:
-        with notes.status(words):
+        with notes.status(words) as status, _drawn(status):
             yield
     else:
         notes.print(words)
@@ -106,11 +130,6 @@ def say_files(*paths: Path) -> None:
 def warn(words: str) -> None:
     """What a person should look at before trusting the result."""
     notes.print(f"look at this: {words}", markup=False)
-
-
-def ask(question: str) -> bool:
-    """A person's word; without a terminal there is nobody to give it."""
-    return sys.stdin.isatty() and typer.confirm(printable(question), default=False, err=True)
 
 
 def show_table(

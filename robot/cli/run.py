@@ -13,7 +13,8 @@ import typer
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides
-from robot.cli.output import ask, busy, new_directory, notes, progress, results, writing
+from robot.cli.output import busy, new_directory, notes, progress, results, writing
+from robot.cli.question import ask, require_person
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
@@ -60,6 +61,8 @@ def run(
 
     loaded = load_rig(rig, task=task, overrides=set_ or [])
     own_task = loaded.config.task
+    if not dry_run:
+        require_person(loaded.config)
     folder = new_directory(out, loaded.config.name if own_task is None else own_task.kind)
     if steps is None:
         endless = NO_END if loaded.config.clock == "replay" else WITHOUT_TASK

@@ -9,7 +9,8 @@ import typer
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.options import Overrides, length
-from robot.cli.output import ask, busy, notes, results
+from robot.cli.output import busy, notes, results
+from robot.cli.question import ask, require_person
 
 
 def latency(
@@ -36,6 +37,7 @@ def latency(
 
     config = load_rig(rig, overrides=set_ or []).config
     opened = without_latency(config, arm, sensor)
+    require_person(config)
     with Interrupt() as interrupt:
         with busy("tapping"), open_rig(opened, confirm=ask) as running:
             record = record_taps(running, opened, arm, sensor, TapPlan(taps, depth, lift), interrupt)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,8 @@ import typer
 
 from robot.cli.errors import complain
 from robot.cli.interrupt import Interrupt
-from robot.cli.output import ask, notes, progress, writing
+from robot.cli.output import notes, progress, writing
+from robot.cli.question import ask, has_person, has_real_arm
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,17 +49,15 @@ def led(what: str, total: int, kept: Path, note: str) -> Iterator[Session[Any]]:
 def confirm_motion(config: RigConfig, question: str) -> None:
     """Asks a person, where an arm is no mock. Raises CannotOpen."""
     from robot.open import CannotOpen
-    from tacsim.models.hardware import UrArmConfig
 
-    real = any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values())
-    if real and not ask(f"Rig '{config.name}': {question}"):
+    if has_real_arm(config) and not ask(f"Rig '{config.name}': {question}"):
         raise CannotOpen("nobody confirmed (at a terminal); nothing was moved")
 
 
 def confirm_free_gel() -> None:
     """Without a terminal nobody is asked: the gel counts as free once its picture rests."""
-    if sys.stdin.isatty():
-        while not typer.confirm("Is nothing touching the gel?", default=True, err=True):
+    if has_person():
+        while not ask("Is nothing touching the gel?", default=True):
             notes.print("Take everything off the gel first.")
 
 

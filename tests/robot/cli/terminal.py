@@ -18,15 +18,15 @@ import pyte
 
 from tests.robot.cli.invoked import environment
 
-# The terminal becomes the one that Ctrl-C of the new process is typed at.
-CODE = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\nfrom robot.cli import main; main()"
+CONTROLLING = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"  # Ctrl-C typed there reaches the process
+COMMAND = "from robot.cli import main; main()"
 PATIENCE = 90.0  # for anything that has to happen [s]
 
 
 class Terminal:
-    """Runs `tacsim WORDS` in `folder`."""
+    """Runs `tacsim WORDS` in `folder`, or another program."""
 
-    def __init__(self, *words: str, folder: Path, columns: int = 100, lines: int = 40) -> None:
+    def __init__(self, *words: str, folder: Path, program: str = COMMAND, columns: int = 100, lines: int = 40) -> None:
         self._screen = pyte.Screen(columns, lines)
         self._stream, self._lock = pyte.ByteStream(self._screen), threading.Lock()
         self._own, inner = os.openpty()
@@ -36,7 +36,7 @@ class Terminal:
             key: value for key, value in surroundings.items() if key not in ("COLUMNS", "LINES", "NO_COLOR")
         }
         self.process = subprocess.Popen(
-            [sys.executable, "-c", CODE, *words],
+            [sys.executable, "-c", CONTROLLING + program, *words],
             stdin=inner, stdout=inner, stderr=inner, cwd=folder, env=surroundings, start_new_session=True,
         )  # fmt: skip
         os.close(inner)

@@ -1,0 +1,105 @@
+"""What a person at a terminal is asked can be read until it is answered, on the screen and whatever else is drawn."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.robot.cli.invoked import environment, tacsim
+from tests.robot.cli.lab import copy_of
+from tests.robot.cli.terminal import Terminal
+
+QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
+ASKING = f"""
+import time
+from robot.cli.output import busy, notes, progress
+from robot.cli.question import ask
+from robot.cli.interrupt import Interrupt
+def asked():
+    notes.print("on the way")
+    time.sleep(0.3)
+    notes.print("SAID " + str(ask({QUESTION!r})))
+with Interrupt() as interrupt:
+    with progress() as bar:
+        row = bar.add_task("starting slowly", total=12)
+        asked()
+        for step in range(12):
+            bar.update(row, description="the episode", completed=step)
+            time.sleep(0.05)
+    with busy("tapping"):
+        asked()
+"""
+
+
+def stays(screen: Terminal, words: str) -> None:
+    """For as long as a bar is drawn ten times."""
+    for _ in range(12):
+        assert screen.shows(words), screen.picture
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("columns", [100, 30])
+def test_a_question_stays_on_the_screen_and_the_bar_goes_on_after_it(tmp_path: Path, columns: int) -> None:
+    with Terminal(program=ASKING, folder=tmp_path, columns=columns) as screen:
+        screen.wait_for("starting")
+        screen.wait_for(f"{QUESTION} [y/N]:")
+        stays(screen, f"{QUESTION} [y/N]:")
+        screen.type("y\n")
+        screen.wait_for("SAID True")
+        screen.wait_for("the episode")
+        screen.until(lambda: screen.text.count("[y/N]:") == 2, "the second question")
+        stays(screen, "[y/N]: ")
+        screen.type("n\n")
+        assert screen.end() == 0
+        assert screen.shows("SAID False")
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [("\x03", "stopped by SIGINT"), ("\x04", "nobody answered"), ("what?\n\n", "SAID False")],
+    ids=["Ctrl-C", "end of input", "nonsense, then Enter"],
+)
+def test_what_is_no_yes_ends_the_question(tmp_path: Path, typed: str, said: str) -> None:
+    with Terminal(program=ASKING, folder=tmp_path) as screen:
+        screen.wait_for(f"{QUESTION} [y/N]:")
+        for part in re.findall(r"[^\n]*\n|[^\n]+", typed):
+            screen.type(part)
+            time.sleep(0.1)
+        screen.wait_for(said)
+
+
+def test_a_yes_typed_before_the_question_is_no_answer(tmp_path: Path) -> None:
+    with Terminal(program=ASKING, folder=tmp_path) as screen:
+        screen.wait_for("on the way")
+        screen.type("y\n")
+        screen.wait_for(f"{QUESTION} [y/N]:")
+        stays(screen, f"{QUESTION} [y/N]:")
+        assert not screen.shows("SAID")
+
+
+@pytest.mark.parametrize(
+    "words", [["run"], ["calibrate", "latency", "--arm", "arm", "--sensor", "finger"]], ids=["run", "latency"]
+)
+def test_without_a_terminal_no_real_arm_moves(tmp_path: Path, words: list[str]) -> None:
+    file = copy_of("ur5e-one", tmp_path, 61)
+    result = tacsim(*words, str(file))
+    assert result.exit_code == 2, result.output
+    assert "run this from a terminal" in " ".join(result.stderr.split())
+
+
+def test_a_question_that_nobody_could_read_is_not_asked(tmp_path: Path) -> None:
+    """The input is a terminal, what is asked would go into a file."""
+    program = "from robot.cli.question import ask\nprint(ask('Yes?'))"
+    outer, inner = os.openpty()
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdin=inner, capture_output=True, text=True, timeout=60, env=environment()
+    )
+    os.close(outer)
+    os.close(inner)
+    assert done.stdout == "False\n", done

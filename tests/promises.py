@@ -37,7 +37,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "promise(n): checks promise n of docs/reliability.md")
     config.addinivalue_line("markers", "often: is repeated four times as often where figures are measured")
-    if config.getoption("reliability") is not None:
+    if config.getoption("reliability") is not None and not hasattr(
+        config, "workerinput"
+    ):  # the first process writes it
         config.pluginmanager.register(_Recorder(config.getoption("reliability"), config.getoption("repeat") or 1))
 
 

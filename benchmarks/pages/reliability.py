@@ -20,6 +20,16 @@ from benchmarks.pages.page import setting, table
 PAGE = "reliability.md"
 ROOT = Path(__file__).resolve().parents[2]
 HEADER = ("promise", "figure", "measured", "worst", "promised", "verdict")
+EVENT = " · "  # between an event and a column, in the name of a figure that belongs into the table of events
+EVENTS = ("event", "still after", "path", "told after", "moved after standstill", "programs left running")
+WATCHED = (
+    "An arm at 0.1 m/s, and what an RTDE client of its own process saw of it: median / worst of {repeat}. The "
+    "driver is a user's program behind a proxy that breaks its lines; they are whole again after 0.1, 1 or 3 s, or at "
+    "once (held ones: never) in turn. *Still after* is the first standstill (below 1 mm/s) after it, *path* what "
+    "was covered until then. The arm is watched for five seconds more: *moved after standstill* is the farthest it "
+    "was from there. *Goes on* is an event that no motion notices. A hung policy is told by nobody: it looks at "
+    "no status."
+)
 COUNT = "count"  # unit of what must not happen even once
 PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
     ("Box", "No target leaves the workspace, whatever is asked; an arm without limits does not connect."),
@@ -131,9 +141,10 @@ def markdown(report: Report) -> str:
         SAFETY,
         setting(report) + _busy(report),
         "## Figures",
-        table(HEADER, lines(measured)),
+        table(HEADER, lines([row for row in measured if EVENT not in row.variant])),
+        *_events(measured),
         "## How to read and rerun",
-        READING.format(repeat=f"{count} repetition{'s' * (count > 1)}"),
+        READING.format(repeat=_times(count)),
         "## What a promise says, and which tests check it",
         "\n".join(_checked(number, tests.get(number, [])) for number in range(1, len(PROMISES) + 1)),
     ]
@@ -151,6 +162,38 @@ def lines(measured: Sequence[Row]) -> list[list[str]]:
         if not mine:
             found.append([f"{number} {promise}", "no figure: see its tests below", "", "", "", ""])
     return found
+
+
+def _events(measured: Sequence[Row]) -> list[str]:
+    """The table of events with its heading; nothing where none was measured."""
+    found: dict[str, dict[str, Row]] = {}
+    for row in measured:
+        event, separator, column = row.variant.partition(EVENT)
+        if separator:
+            found.setdefault(event, {})[column] = row
+    if not found:
+        return []
+    cells = [[event, *(_both(columns.get(name)) for name in EVENTS[1:])] for event, columns in found.items()]
+    for line, columns in zip(cells, found.values(), strict=True):
+        if "goes on" in columns:
+            line[1] = "goes on" + ("" if "still after" not in columns else f"; else {line[1]}")
+    repeat = max(row.repeats for columns in found.values() for row in columns.values())
+    return ["## A stopped arm stays stopped", WATCHED.format(repeat=_times(repeat)), table(EVENTS, cells)]
+
+
+def _both(row: Row | None) -> str:
+    """Median and worst; a count as it is."""
+    if row is None:
+        return ""
+    if row.error_unit == COUNT:
+        return f"{row.error:.0f}"
+    worst = next(value for name, value in row.figures.items() if name.startswith("worst"))
+    digits = 3 if row.error_unit == "mm" and worst < 0.1 else 1 if row.error_unit == "mm" else 0
+    return f"{row.error:.{digits}f} / {worst:.{digits}f} {row.error_unit}"
+
+
+def _times(count: int) -> str:
+    return f"{count} repetition{'s' * (count > 1)}"
 
 
 def _cells(row: Row) -> list[str]:

@@ -1,7 +1,8 @@
 """The camera of a tactile sensor: real, mock, or a folder or video in its place.
 
 A thread reads every frame as it comes and keeps the newest, so a consumer that pauses gets no old ones. A source that
-fails is closed and opened again, with back-off. A frame beyond its age limit is never delivered.
+fails is closed and opened again, with back-off. A frame beyond its age limit is never delivered. One that shows the
+picture of the last again is no new one: a frozen camera grows old like a silent one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robot.camera.capture import Capture, open_capture, source_kind
 from robot.camera.picture import DamagedFrame, Picture, WrongSource
@@ -25,6 +29,10 @@ BACK_OFF = (0.05, 0.8)  # first and longest wait before a source is opened again
 CLOSE_TIMEOUT = 5.0  # only a name server that does not answer takes longer than a read or a connection [s]
 MAX_STAMP_AGE = 60.0  # a stamp beyond it is of another machine's clock [s]
 FPS_WINDOW = 60  # frames over which the rate is measured
+# Of the values of a picture. What differs in fewer is the same picture, but for a clock in its corner or hot pixels. In
+# two films of a real gel at least 42 % differ from one frame to the next; a noise of 0.3 grey levels in a JPEG of
+# quality 50 still changes 2.8 %.
+SAME_BELOW = 0.01
 
 ClockSource = Literal["stamp", "device", "arrival"]
 
@@ -41,7 +49,8 @@ class CameraStatus:
     fps: float | None  # measured over the last frames; None before the second since opening [Hz]
     age: float | None  # of the newest frame, since exposure; None before the first [s]
     clock: ClockSource | None  # source of its exposure time; `arrival`: that minus the calibrated latency
-    frames: int  # complete frames received
+    frames: int  # new pictures received
+    repeated: int  # frames that showed the same picture again
     dropped: int  # lost before arrival, as far as known (see Camera); each is a gap in `index`
     damaged: int  # received, but not readable
     reopened: int  # how often the source was opened again
@@ -54,7 +63,7 @@ class Camera(Closing):
     `read` gives the newest frame, at once if it is within the age limit. Between two exposures that is the same frame
     with the same `index`.
 
-    `index` grows by one for each frame and by one more for each lost frame: counted by the numbers of the stamps;
+    `index` grows by one for each new picture and by one more for each lost frame: counted by the numbers of the stamps;
     without stamps by the device's clock; without that, only damaged frames count as lost. An interruption counts with
     all three, at the configured rate. Thread-safe.
     """
@@ -65,7 +74,8 @@ class Camera(Closing):
         Raises WrongSource (a DeviceError) when the source is not as configured, DeviceNotConnectedError when no frame
         came.
         """
-        source_kind(config, name)
+        played = source_kind(config, name) in ("folder", "video")
+        self._may_repeat = config.repeats or played
         self._config, self._name = config, name
         self.spec = SensorSpec(image_shape=(config.height, config.width), height=False, flow=False, arm=config.arm)
         self._stop = threading.Event()
@@ -75,7 +85,8 @@ class Camera(Closing):
         self._stamp: strip.Stamp | None = None  # of _frame
         self._clock: ClockSource | None = None
         self._arrivals: deque[float] = deque(maxlen=FPS_WINDOW)
-        self._received = self._dropped = self._damaged = self._openings = 0
+        self._received = self._dropped = self._damaged = self._repeated = self._openings = 0
+        self._repeats = 0  # since the last new picture
         self._unread = 0  # damaged since the last whole frame
         self._refusal: str | None = None  # why the source is wrong now
         self._error: str | None = None
@@ -130,6 +141,7 @@ class Camera(Closing):
                 age=None if self._frame is None else time.monotonic() - self._frame.time,
                 clock=self._clock,
                 frames=self._received,
+                repeated=self._repeated,
                 dropped=self._dropped,
                 damaged=self._damaged,
                 reopened=max(0, self._openings - 1),
@@ -258,18 +270,37 @@ class Camera(Closing):
         else:
             exposure, clock = picture.arrival - self._config.latency, "arrival"
         image.flags.writeable = False  # the same frame may be given to several readers
+        if self._frame is not None and self._is_same(image, mark, self._frame):
+            self._count_repeat(picture.arrival - self._frame.time)
+            return
         with self._changed:
-            if mark is not None and self._stamp is not None and mark.clock <= self._stamp.clock:
-                return  # an old frame that was sent again to a new client
             lost = self._count_lost(mark, exposure, clock)
             index = 0 if self._frame is None else self._frame.index + 1 + lost
             self._frame, self._stamp, self._clock = TactileFrame(image=image, time=exposure, index=index), mark, clock
             self._received += 1
             self._dropped += lost
-            self._unread = 0
+            self._unread = self._repeats = 0
             self._arrivals.append(picture.arrival)
             self._refusal = self._error = None
             self._changed.notify_all()
+
+    def _is_same(self, image: NDArray[np.uint8], mark: strip.Stamp | None, last: TactileFrame) -> bool:
+        """Whether a frame shows the picture that came last: the camera has frozen, is slower than its frames, or greets
+        a new client with what it has."""
+        if mark is not None and self._stamp is not None:
+            return mark.clock <= self._stamp.clock
+        return not self._may_repeat and bool(np.count_nonzero(image != last.image) < SAME_BELOW * image.size)
+
+    def _count_repeat(self, age: float) -> None:
+        with self._changed:
+            self._repeated += 1
+            self._repeats += 1
+            if age > self._config.max_age:
+                hint = "" if self._config.stamped else " (a source that may repeat itself says so: repeats: true)"
+                self._error = (
+                    f"sensor '{self._name}': {self._config.source} has shown the same picture for {age:.1f} s: it has "
+                    f"frozen, or is covered or dark; look at the sensor and its light, restart the camera{hint}"
+                )
 
     def _count_lost(self, mark: strip.Stamp | None, exposure: float, clock: ClockSource) -> int:
         """How many frames are missing before this one."""
@@ -281,7 +312,7 @@ class Camera(Closing):
         if self._arrivals and clock != "device":
             return max(numbered, 0) if mark is not None else self._unread
         # After an interruption the numbers may have restarted: a restarted camera counts from 1.
-        return max(numbered, self._unread, round((exposure - self._frame.time) * self._config.fps) - 1)
+        return max(numbered, self._unread, round((exposure - self._frame.time) * self._config.fps) - 1 - self._repeats)
 
     def _set_failure(self, failure: Exception, refused: bool) -> None:
         text = str(failure) or type(failure).__name__

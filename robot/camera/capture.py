@@ -9,12 +9,13 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robot.camera.mjpeg import MjpegCapture
-from robot.camera.picture import READ_TIMEOUT, Picture, WrongSource, frame_size, wrong_size
+from robot.camera.picture import READ_TIMEOUT, Picture, WrongSource, decode_jpeg, frame_size, wrong_size
 from robot.errors import DeviceNotConnectedError
 from tacsim.interface import EndOfEpisode
 from tacsim.models.hardware import CameraSensorConfig
@@ -114,6 +115,8 @@ class UvcCapture(Capture):
         if config.white_balance is not None:
             self._keep(cv2.CAP_PROP_AUTO_WB, 0, "automatic white balance", 0.1)
             self._keep(cv2.CAP_PROP_WB_TEMPERATURE, config.white_balance, "white_balance [K]", 0.5)
+        if self._capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*"MJPG"):
+            self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # JPEGs as they come: OpenCV's decoder hides damage
 
     def _keep(self, setting: int, value: float, what: str, tolerance: float) -> None:
         taken = self._capture.set(setting, value)
@@ -134,12 +137,18 @@ class UvcCapture(Capture):
         arrival = time.monotonic()
         if not there or image is None:
             raise ConnectionError(f"{self._what}: no frame; was it unplugged?")
-        if image.shape != (*self._size, 3):
-            raise wrong_size(self._what, image.shape[:2], self._size)
         # The buffer's time stamp by V4L2: the monotonic clock with nearly all drivers, 0 or an epoch with others.
         exposure = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-        picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        return Picture(picture, arrival, exposure if 0.0 <= arrival - exposure < 1.0 else None)
+        return Picture(self._rgb(image), arrival, exposure if 0.0 <= arrival - exposure < 1.0 else None)
+
+    def _rgb(self, image: NDArray[Any]) -> NDArray[np.uint8]:
+        import cv2
+
+        if image.ndim == 1 or 1 in image.shape[:2]:  # the bytes of a JPEG
+            return decode_jpeg(image.tobytes(), self._size, self._what)
+        if image.shape != (*self._size, 3):
+            raise wrong_size(self._what, image.shape[:2], self._size)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def close(self) -> None:
         self._capture.release()

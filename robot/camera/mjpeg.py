@@ -1,4 +1,4 @@
-"""MJPEG over HTTP: one opened stream, read with the standard library and Pillow.
+"""MJPEG over HTTP: one opened stream, read with the standard library.
 
 Not OpenCV's FFmpeg: here sizes are checked before anything is decoded, every wait has a deadline (FFmpeg has none for a
 header that never ends), no proxy is used, and no native thread is left at exit.
@@ -8,24 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import io
 import math
 import socket
 import time
 from typing import Any
 from urllib.parse import urlsplit
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robot.camera.picture import (
     CONNECT_TIMEOUT,
     READ_TIMEOUT,
-    DamagedFrame,
     Picture,
     WrongSource,
+    decode_jpeg,
     frame_size,
-    wrong_size,
 )
 from tacsim.models.hardware import CameraSensorConfig
 
@@ -83,7 +78,7 @@ class MjpegCapture:
             data = self._part()
         except http.client.HTTPException as error:
             raise ConnectionError(f"{self._what}: the stream broke off ({type(error).__name__})") from error
-        return Picture(self._decode(data), time.monotonic(), None)
+        return Picture(decode_jpeg(data, self._size, self._what), time.monotonic(), None)
 
     def _part(self) -> bytes:
         """The bytes of the next picture."""
@@ -145,21 +140,6 @@ class MjpegCapture:
         data = bytes(self._buffer[:count])
         del self._buffer[:count]
         return data
-
-    def _decode(self, data: bytes) -> NDArray[np.uint8]:
-        from PIL import Image
-
-        try:
-            with Image.open(io.BytesIO(data), formats=("JPEG",)) as picture:
-                if picture.size != self._size[::-1]:
-                    raise wrong_size(self._what, (picture.size[1], picture.size[0]), self._size)
-                return np.array(picture.convert("RGB"))
-        except WrongSource:
-            raise
-        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-            raise WrongSource(f"{self._what}: {error}; expected are {self._size[1]} x {self._size[0]} px") from error
-        except Exception as error:  # a decoder may raise anything for damaged bytes
-            raise DamagedFrame(f"{self._what}: no readable JPEG: {error}") from error
 
     def interrupt(self) -> None:
         with contextlib.suppress(OSError):  # it may be closed already

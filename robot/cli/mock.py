@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from robot.cli.interrupt import Interrupt
 from robot.cli.output import results
+
+if TYPE_CHECKING:
+    from robot.mock import FaultClient
+
+Log = list[tuple[float, str]]  # time of the robot [s], and what happened
 
 
 def mock(
@@ -23,6 +28,9 @@ def mock(
         int, typer.Option("--cameras", min=0, max=16, help="How many: at the arms' addresses, then the next ones.")
     ] = 0,
     camera_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of every camera.")] = 8081,
+    version: Annotated[
+        str | None, typer.Option("--version", help="Of PolyScope, which the arms claim.", show_default="5.11")
+    ] = None,
     allow_network: Annotated[
         bool, typer.Option("--allow-network", help="Allow addresses that other machines reach.")
     ] = False,
@@ -31,17 +39,22 @@ def mock(
 
     Arms move, feel and stop like an arm, but know no dynamics. Any UR client can connect. Cameras send 320 x 240 px,
     30 times a second, with a strip below that holds number and clock of the frame; nothing is in front of them. For
-    arms and cameras with simulated gels, open the rig `mock`.
+    arms and cameras with simulated gels, open the rig `mock`. What happens to an arm is printed.
 
     Example: tacsim mock --arms 2 --cameras 2
     """
     from robot.common.kinematics import MODELS
     from robot.mock import MockArms, MockCamera
     from robot.mock.ur.fault_client import FAULT_PORT
+    from robot.mock.ur.machine.version import VERSION, parse_version
     from robot.mock.ur.wire.controller import PORTS
 
     if model not in MODELS:
         raise typer.BadParameter(f"no model '{model}'; allowed: {', '.join(MODELS)}", param_hint="--model")
+    try:
+        claimed = VERSION if version is None else parse_version(version)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--version") from None
     hosts = host or [f"127.0.0.{2 + index}" for index in range(arms)]
     if not hosts and not cameras:
         raise typer.BadParameter("nothing to run: give at least one arm or camera", param_hint="--arms, --cameras")
@@ -49,7 +62,8 @@ def mock(
     with Interrupt() as interrupt, ExitStack() as stack:
         devices: list[MockArms | MockCamera] = []
         if hosts:
-            devices.append(stack.enter_context(MockArms(hosts, model=model, allow_network=allow_network)))
+            controllers = MockArms(hosts, model=model, version=claimed, allow_network=allow_network)
+            devices.append(stack.enter_context(controllers))
         ports = ", ".join(map(str, sorted(PORTS)))
         for each in hosts:
             results.print(f"{model} at {each}: ports {ports}; faults {FAULT_PORT}")
@@ -58,8 +72,28 @@ def mock(
             devices.append(camera)
             results.print(f"camera at {camera.url}", markup=False)
         results.print("Ctrl-C ends them.")
+        logs: dict[str, Log] = {}
         while not interrupt():
             for device in devices:
                 device.check()
+                if isinstance(device, MockArms):
+                    for faults in device.fault_clients:
+                        logs[faults.host] = _print_new(faults, logs.get(faults.host, []))
             time.sleep(0.1)
         raise typer.Exit(interrupt.exit_code)
+
+
+def _print_new(faults: FaultClient, printed: Log) -> Log:
+    """Prints what the log of an arm has more than `printed`, which is its last state; returns the log."""
+    from robot.mock import FaultError
+
+    try:
+        log = faults.log()
+    except FaultError:  # its mock ends: the next check says why
+        return printed
+    last = printed[-1] if printed else None
+    for at, text in log[log.index(last) + 1 if last in log else 0 :]:
+        if last is None or text != last[1]:
+            results.print(f"{faults.host} {at:.3f} s: {text}", markup=False)
+        last = at, text
+    return log

@@ -162,8 +162,11 @@ def _camera(name: str, config: CameraSensorConfig) -> Check:
         return Check(label, "fail", str(failure), "see cable, address, and what else uses the camera")
     fps, age = status.fps or 0.0, status.age or 0.0
     words = (
-        f"{config.width} x {config.height} px, {fps:.1f} frames/s, newest {1e3 * age:.0f} ms old, {status.dropped} lost"
+        f"{config.width} x {config.height} px, {fps:.1f} frames/s, newest {1e3 * age:.0f} ms old, "
+        f"{status.dropped} lost, {status.damaged} damaged, {status.repeated} shown again"
     )
-    if fps < MIN_FRAME_RATE * config.fps or status.damaged:
+    if status.error is not None and age > config.max_age:
+        return Check(label, "fail", words, status.error)
+    if fps < MIN_FRAME_RATE * config.fps or status.damaged > 1:  # the first after opening is often damaged
         return Check(label, "warn", words, f"{config.fps:g} frames/s were asked for: exposure, USB hub, or cable?")
     return Check(label, "ok", words)

@@ -24,7 +24,7 @@ from robot.mock.ur.fault_server import FaultServer
 from robot.mock.ur.handle import check_hosts
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.load import Mass
-from robot.mock.ur.machine.version import VERSION, parse_version
+from robot.mock.ur.machine.version import VERSION, parse_version, version_text
 from robot.mock.ur.wire.controller import Controller, ControllerConfig
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--model", choices=list(MODELS), action="append", help=each)
     parser.add_argument("--joints", action="append", help=f"six angles [rad], with commas; {each}")
     parser.add_argument("--payload", action="append", help=f"kg and centre x,y,z [m] on the flange; {each}")
-    parser.add_argument("--version", default=".".join(map(str, VERSION)))
+    parser.add_argument("--version", action="append", help=f"of PolyScope, such as 5.11; {each}")
     parser.add_argument("--fault-port", "--door-port", type=int, default=FAULT_PORT)
     parser.add_argument("--serial", default=MOCK_SERIAL)
     parser.add_argument("--allow-network", action="store_true")
@@ -128,9 +128,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             Mass.of([float(number) for number in text.split(",")])
             for text in _for_each(given.payload or ["0,0,0,0"], given.hosts, "payloads")
         ]
+        versions = map(parse_version, _for_each(given.version or [version_text(VERSION)], given.hosts, "versions"))
         config = [
-            ControllerConfig(host, cast("Model", model), joints, parse_version(given.version), given.serial, tool)
-            for host, model, joints, tool in zip(given.hosts, models, postures, tools, strict=True)
+            ControllerConfig(host, cast("Model", model), joints, version, given.serial, tool)
+            for host, model, joints, version, tool in zip(given.hosts, models, postures, versions, tools, strict=True)
         ]
         serve(config, given.fault_port, with_parent=given.with_parent)
     except (OSError, ValueError) as error:

@@ -97,6 +97,8 @@ class MockArmConfig(Config):
     """A mock controller on loopback is started for this arm and stopped with the rig."""
 
     joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
+    # Of PolyScope, which the controller claims: "5.11", "5.11.0.108150"; None: a version that can do all this needs.
+    version: Annotated[str, Field(pattern=r"^[0-9]{1,9}(\.[0-9]{1,9}){1,3}$")] | None = None
     # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
     # they share a busy machine with whatever else the mock rig needs.
     realtime: bool = False
@@ -169,6 +171,8 @@ class CameraSensorConfig(Config):
     exposure: float | None = None  # fixed, in the driver's own unit, and read back; None: left as it is
     white_balance: Annotated[float, Field(gt=0)] | None = None  # colour temperature, fixed and read back [K]
     stamped: bool = False  # frames carry the strip with number and clock that tacsim's mock camera burns in
+    # The source may show the very same picture for long, as no real sensor does: whether it has frozen cannot be told.
+    repeats: bool = False
     max_age: Annotated[Time, Field(gt=0, le=60.0)] = 0.2  # an older frame is refused [s]
     latency: Annotated[Time, Field(ge=0, le=2.0)] = 0.0  # from exposure to arrival [s]
     mock: MockCameraConfig | None = None

@@ -57,9 +57,26 @@ def test_every_promise_has_tests_and_the_published_report_their_figures(report: 
     for file in {test.partition("::")[0] for found in tests.values() for test in found}:
         text = (ROOT / file).read_text(encoding="utf-8")
         recorded |= set(re.findall(r"""\bfigure\(\s*f?"(.+?)",""", text))
-    shown = {re.sub(r"(?<=blocked, ).+(?= peer)", "{fault}", row.variant) for row in report.results}
+    names = {row.variant for row in report.results if reliability.EVENT not in row.variant}
+    shown = {re.sub(r"(?<=blocked, ).+(?= peer)", "{fault}", name) for name in names}
     assert shown == recorded, "run: make reliability"
     assert {row.case for row in report.results} == {name for name, _ in PROMISES} - {"One contract"}
+
+
+def test_events_have_a_table_of_their_own(report: Report) -> None:
+    def found(column: str, *values: float, unit: str = "ms") -> Row:
+        at_most = 0.0 if unit == COUNT else None
+        seen = [Figure(7, f"line cut · {column}", value, unit, at_most, "tests/x.py::x", 1.0, 0.1) for value in values]
+        return reliability.rows(seen, 90.0)[0]
+
+    told = [found("still after", 100.0, 104.0, 120.0), found("path", 3.0, 3.1, 8.0, unit="mm")]
+    told += [
+        found("moved after standstill", 0.0, 2e-3, 1e-3, unit="mm"),
+        found("programs left running", 0, 1, unit=COUNT),
+    ]
+    page = reliability.markdown(report.model_copy(update={"results": told}))
+    assert "| line cut | 104 / 120 ms | 3.1 / 8.0 mm |  | 0.001 / 0.002 mm | 1 |" in page
+    assert "of 3 repetitions. The" in page and "| 7 Stops | line cut" not in page
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,10 @@ class Faults:
     stall: bool = False  # connections stay, no frame comes
     drop: float = 0.0  # probability that a frame is lost after it was numbered
     delay: float = 0.0  # from exposure to sending [s]
+    freeze: bool = False  # the same JPEG comes again and again
     corrupt: bool = False  # the second half of each JPEG is noise
+    cut: bool = False  # the second half of each JPEG is lost, all but its end marker
+    flip: int = 0  # so many bytes of each JPEG are others
     size: tuple[int, int] | None = None  # columns, rows of the picture, other than promised [px]
     brightness: float = 1.0  # factor on the picture; the strip stays readable
     refuse: bool = False  # the port is closed
@@ -58,10 +61,13 @@ class MockCamera(Child):
         quality: int = 95,
         stamped: bool = True,
         *,
+        noise: int | None = None,
         allow_network: bool = False,
     ) -> None:
         """`width`, `height` of the picture of the gel [px]; with `stamped` each frame has the strip of
-        `robot.common.stamp` below it. Port 0: any free one. Raises ValueError for a host that is not loopback unless
+        `robot.common.stamp` below it. `noise`: no value of a frame is farther off than that [grey levels]; None: 2
+        without stamps, as a real sensor's, so that the camera is not taken for a frozen one when nothing moves; 0 with
+        stamps. Port 0: any free one. Raises ValueError for a host that is not loopback unless
         `allow_network`, DeviceError when the process does not start (the port is taken, say)."""
         require_loopback(host, "mock camera", allow_network=allow_network)
         _within(port, 0, 65535, "port")
@@ -70,7 +76,9 @@ class MockCamera(Child):
         _within(fps, 0.1, 1000.0, "fps")
         _within(quality, 50, 100, "quality of JPEG")
         self.host, self.width, self.height = host, width, height
-        source = {"width": width, "height": height, "fps": fps, "quality": quality, "stamped": stamped}
+        amount = int(_within((0 if stamped else 2) if noise is None else noise, 0, 20, "noise [grey levels]"))
+        source: dict[str, Any] = {"width": width, "height": height, "fps": fps, "quality": quality}
+        source |= {"stamped": stamped, "noise": amount}
         request = {"host": host, "port": port, "source": source}
         name = f"mock camera at {host}"
         super().__init__("robot.mock.camera", name=name, ready_timeout=ANSWER_TIMEOUT, first_request=request)
@@ -103,6 +111,18 @@ class MockCamera(Child):
     def corrupt(self, on: bool) -> None:
         """The second half of each JPEG is noise."""
         self._ask("corrupt", bool(on))
+
+    def freeze(self, on: bool) -> None:
+        """The same JPEG comes again and again, at the same rate."""
+        self._ask("freeze", bool(on))
+
+    def cut(self, on: bool) -> None:
+        """The second half of each JPEG is lost, all but its end marker: plain decoders repeat grey or the last row."""
+        self._ask("cut", bool(on))
+
+    def flip(self, count: int) -> None:
+        """So many bytes of each JPEG, behind its header, are others than were sent; 0 ends the fault."""
+        self._ask("flip", int(_within(count, 0, 1_000_000, "flip: bytes")))
 
     def resize(self, width: int, height: int) -> None:
         """Pictures have another size than promised [px]; the promised one ends the fault."""

@@ -26,6 +26,7 @@ from robot.mock.camera.camera import Faults
 
 BOUNDARY = "boundarydonotcross"
 MAX_CLIENTS = 16
+SHIFTS = 32  # of the noise, in rows and in columns: it is drawn once
 MAX_DELAYED = 1024  # frames that wait for the delay to pass; beyond it the oldest is lost
 SEND_TIMEOUT = 5.0  # a client that takes nothing for so long is cut [s]
 
@@ -33,7 +34,7 @@ SEND_TIMEOUT = 5.0  # a client that takes nothing for so long is cut [s]
 class FrameSource:
     """Exposes pictures at `fps`, and a pushed one at once; holds the newest JPEG for the clients."""
 
-    def __init__(self, width: int, height: int, fps: float, quality: int, stamped: bool) -> None:
+    def __init__(self, width: int, height: int, fps: float, quality: int, stamped: bool, noise: int) -> None:
         self.width, self.height = width, height
         self._period, self._quality, self._stamped = 1.0 / fps, quality, stamped
         self._changed = threading.Condition()  # guards all that follows
@@ -43,8 +44,13 @@ class FrameSource:
         self._delayed: deque[tuple[float, int, bytes]] = deque(maxlen=MAX_DELAYED)  # when to send, number, JPEG
         self._newest: tuple[int, bytes] = (0, b"")  # how many were sent so far; JPEG
         self._number = 0  # of the newest
+        self._exposed = b""  # the newest JPEG, undamaged
         self._closed = False
         self._random = random.Random(0)
+        self._noise: NDArray[np.int16] | None = None  # larger than a picture; each frame gets another part of it
+        if noise:
+            size = (height + SHIFTS, width + SHIFTS, 3)
+            self._noise = np.random.default_rng(0).integers(-noise, noise + 1, size, dtype=np.int16)
         self.counts = {"frames": 0, "images": 0, "dropped": 0, "sent": 0, "skipped": 0}
 
     def push(self, picture: NDArray[np.uint8]) -> int:
@@ -130,18 +136,36 @@ class FrameSource:
                 self._changed.notify_all()
 
     def _expose(self, picture: NDArray[np.uint8] | None, mark: stamp.Stamp, faults: Faults) -> bytes:
+        if not (faults.freeze and self._exposed):
+            self._exposed = self._encode(picture, mark, faults)
+        return self._damage(self._exposed, faults)
+
+    def _encode(self, picture: NDArray[np.uint8] | None, mark: stamp.Stamp, faults: Faults) -> bytes:
         if picture is None:
             picture = test_picture(self.width, self.height, mark.frame)
+        if self._noise is not None:
+            down, right = self._random.randrange(SHIFTS), self._random.randrange(SHIFTS)
+            noise = self._noise[down : down + self.height, right : right + self.width]
+            picture = np.clip(picture + noise, 0, 255).astype(np.uint8)
         if faults.brightness != 1.0:
             picture = np.clip(np.rint(picture * faults.brightness), 0, 255).astype(np.uint8)
         if faults.size is not None:
             picture = np.asarray(Image.fromarray(picture).resize(faults.size), dtype=np.uint8)
         if self._stamped:
             picture = stamp.draw(picture, mark)
-        jpeg = encode_jpeg(picture, self._quality)
+        return encode_jpeg(picture, self._quality)
+
+    def _damage(self, jpeg: bytes, faults: Faults) -> bytes:
+        half = len(jpeg) // 2
         if faults.corrupt:
-            half = len(jpeg) // 2
             jpeg = jpeg[:half] + self._random.randbytes(len(jpeg) - half)
+        if faults.cut:
+            jpeg = jpeg[:half] + jpeg[-2:]
+        if faults.flip:
+            scan, flipped = jpeg.index(b"\xff\xda"), bytearray(jpeg)
+            for _ in range(faults.flip):
+                flipped[self._random.randrange(scan, len(jpeg) - 2)] ^= self._random.randrange(1, 256)
+            jpeg = bytes(flipped)
         return jpeg
 
 

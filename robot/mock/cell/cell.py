@@ -23,6 +23,7 @@ from robot.mock.camera.camera import MockCamera
 from robot.mock.cell.sim_server import SceneFrame, SimServer
 from robot.mock.ur.fault_client import FaultClient
 from robot.mock.ur.handle import MockArms
+from robot.mock.ur.machine.version import VERSION, Version, parse_version
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose, Truth
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
@@ -79,6 +80,7 @@ class MockCell(Closing):
                     model=[arm.model for arm in self._arms.values()],
                     joints=[self._initial_joints(name, arm) for name, arm in self._arms.items()],
                     payload=[(arm.payload.mass, *arm.payload.centre) for arm in self._arms.values()],
+                    version=[_version(arm) for arm in self._arms.values()],
                     realtime=any(arm.mock is not None and arm.mock.realtime for arm in self._arms.values()),
                 )
                 self._controllers = stack.enter_context(controllers)
@@ -239,6 +241,11 @@ def _models(config: RigConfig) -> dict[str, SensorModel]:
             assert sensor.model is not None  # the loader refuses a mock camera without one
             found[name] = sensor.model
     return found
+
+
+def _version(arm: UrArmConfig) -> Version:
+    text = arm.mock.version if arm.mock is not None else None
+    return VERSION if text is None else parse_version(text)
 
 
 def _camera(name: str, config: CameraSensorConfig) -> MockCamera:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import subprocess
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from robot.common.loopback import require_loopback
 from robot.common.process import PATIENCE, Child
 from robot.errors import DeviceError
 from robot.mock.ur.fault_client import FAULT_PORT, FaultClient
-from robot.mock.ur.machine.version import VERSION, Version, check_version
+from robot.mock.ur.machine.version import VERSION, Version, check_version, version_text
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
@@ -31,8 +31,9 @@ class MockArms(Child):
     """Mock controllers in one process of their own, one for each host; a context manager.
 
     model: one for all, or one each; joints: where they begin [rad], (6,) or (arms, 6); payload: what hangs on their
-    flanges, mass [kg] and centre of gravity in flange axes [m], (4,) or (arms, 4). Raises MockError when they are not
-    ready in time, for example because a port is in use, ValueError for hosts that are not loopback addresses.
+    flanges, mass [kg] and centre of gravity in flange axes [m], (4,) or (arms, 4); version: of PolyScope, which they
+    claim, four numbers or four each. Raises MockError when they are not ready in time, for example because a port is in
+    use, ValueError for hosts that are not loopback addresses and for versions that are none.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class MockArms(Child):
         model: Model | Sequence[Model] = "ur5e",
         joints: Sequence[float] | Sequence[Sequence[float]] | None = None,
         payload: Sequence[float] | Sequence[Sequence[float]] | None = None,
-        version: Version = VERSION,
+        version: Version | Sequence[Version] = VERSION,
         fault_port: int = FAULT_PORT,
         serial: str = MOCK_SERIAL,
         ready_timeout: float = 10.0,
@@ -52,7 +53,9 @@ class MockArms(Child):
         self.hosts = tuple(hosts)
         arguments = [*self.hosts, "--fault-port", str(fault_port), "--serial", serial]
         arguments += [f"--model={each}" for each in ([model] if isinstance(model, str) else model)]
-        arguments += ["--version", ".".join(map(str, check_version(version))), "--with-parent"]
+        versions = [cast("Version", version)] if isinstance(version[0], int) else cast("Sequence[Version]", version)
+        arguments += [f"--version={version_text(check_version(each))}" for each in versions]
+        arguments.append("--with-parent")
         for option, rows in (("--joints", joints), ("--payload", payload)):
             for row in () if rows is None else np.atleast_2d(np.array(rows, dtype=np.float64)):
                 arguments.append(f"{option}=" + ",".join(repr(float(number)) for number in row))

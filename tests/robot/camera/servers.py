@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import socket
 import threading
 from collections.abc import Callable
@@ -23,9 +24,26 @@ def config(source: str, **options: object) -> CameraSensorConfig:
 
 
 def jpeg(value: int = 100, shape: tuple[int, int] = (48, 64)) -> bytes:
+    return encoded(np.full((*shape, 3), value, dtype=np.uint8))
+
+
+def encoded(image: np.ndarray) -> bytes:
     data = io.BytesIO()
-    Image.fromarray(np.full((*shape, 3), value, dtype=np.uint8)).save(data, "JPEG", quality=95)
+    Image.fromarray(image).save(data, "JPEG", quality=95)
     return data.getvalue()
+
+
+def seen(value: int, number: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
+    """What a real camera makes of a grey wall: no two pictures are the same."""
+    return np.random.default_rng(number).integers(value - 2, value + 3, (*shape, 3), dtype=np.uint8)
+
+
+def part(data: bytes, *lines: bytes) -> bytes:
+    return b"--here\r\n" + b"".join(line + b"\r\n" for line in lines) + b"\r\n" + data + b"\r\n"
+
+
+def length(data: bytes) -> bytes:
+    return b"Content-Length: %d" % len(data)
 
 
 Talk = Callable[[socket.socket], None]
@@ -72,6 +90,20 @@ class Server:
         self._listening.close()
         for thread in self._threads:
             thread.join(10.0)
+
+
+def films(server: Server, picture: Callable[[int], bytes], every: float = 0.01) -> Talk:
+    """Sends `picture(0)`, `picture(1)`, ... to each client."""
+
+    def talk(client: socket.socket) -> None:
+        client.settimeout(5.0)
+        client.sendall(STREAM)
+        for number in itertools.count():
+            data = picture(number)
+            client.sendall(part(data, length(data)))
+            server.wait(every)
+
+    return talk
 
 
 def says(*parts: bytes) -> Talk:

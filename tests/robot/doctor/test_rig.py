@@ -168,6 +168,15 @@ def test_a_camera_slower_than_asked_for_is_a_warning(monkeypatch: pytest.MonkeyP
     assert found["finger: camera"].state == "warn" and "500 frames/s were asked for" in found["finger: camera"].advice
 
 
+def test_a_frozen_camera_fails(monkeypatch: pytest.MonkeyPatch, file: Path, camera: MockCamera) -> None:
+    camera.freeze(True)
+    try:
+        found = looked(monkeypatch, file)["finger: camera"]
+    finally:
+        camera.freeze(False)
+    assert found.state == "fail" and "shown the same picture for" in found.advice and "shown again" in found.found
+
+
 def test_addresses_that_are_taken_are_a_failed_check_not_a_crash(file: Path) -> None:
     with MockUR(mock_host(71)):
         (check,) = examine_rig(load_rig(file).config)

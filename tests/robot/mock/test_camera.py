@@ -37,8 +37,9 @@ def shared() -> Iterator[MockCamera]:
 def camera(shared: MockCamera) -> Iterator[MockCamera]:
     """The camera of the module; whole again after each test."""
     yield shared
-    for fault in (shared.stall, shared.corrupt, shared.refuse):
+    for fault in (shared.stall, shared.freeze, shared.corrupt, shared.cut, shared.refuse):
         fault(False)
+    shared.flip(0)
     shared.drop(0.0)
     shared.delay(0.0)
     shared.resize(320, 240)
@@ -165,7 +166,7 @@ def test_keeps_its_rate(camera: MockCamera) -> None:
 
 
 def test_without_stamp() -> None:
-    with MockCamera(host=HOST, width=64, height=48, stamped=False, quality=100) as camera:
+    with MockCamera(host=HOST, width=64, height=48, stamped=False, quality=100, noise=0) as camera:
         camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
         with Client(camera) as client:
             client.jpeg()  # perhaps exposed just before the push
@@ -244,6 +245,39 @@ def test_corrupt(camera: MockCamera) -> None:
         assert sum(broken() for _ in range(30)) >= 20
         camera.corrupt(False)
         until(lambda: not any(broken() for _ in range(5)))
+
+
+def test_freeze_sends_the_same_jpeg(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        camera.freeze(True)
+        until(lambda: client.jpeg() == client.jpeg())
+        last = client.jpeg()
+        assert all(client.jpeg() == last for _ in range(10)) and camera.state().freeze
+        camera.freeze(False)
+        until(lambda: client.jpeg() != last)
+
+
+def test_cut_and_flip(camera: MockCamera) -> None:
+    with Client(camera) as client:
+        whole = client.jpeg()
+        camera.cut(True)
+        until(lambda: len(client.jpeg()) < 0.6 * len(whole))
+        assert client.jpeg().endswith(b"\xff\xd9")
+        camera.cut(False)
+        camera.freeze(True)
+        camera.flip(3)
+        time.sleep(0.1)
+        one, two = client.jpeg(), client.jpeg()
+        assert len(one) == len(two) and 0 < sum(a != b for a, b in zip(one, two, strict=True)) <= 6
+
+
+def test_an_unstamped_camera_has_noise_as_a_real_one() -> None:
+    with MockCamera(host=HOST, width=64, height=48, stamped=False) as camera:
+        camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
+        with Client(camera) as client:
+            client.jpeg()
+            one, two = (np.array(Image.open(io.BytesIO(client.jpeg()))).astype(int) for _ in range(2))
+    assert (one != two).mean() > 0.1 and np.abs(one - 77).max() < 12
 
 
 def test_resize_and_brightness(camera: MockCamera) -> None:
@@ -326,13 +360,23 @@ def test_faults_beyond_reason_are_refused(camera: MockCamera) -> None:
         lambda: camera.delay(-1.0),
         lambda: camera.resize(0, 10),
         lambda: camera.brightness(-1.0),
+        lambda: camera.flip(-1),
     ):
         with pytest.raises(ValueError, match="must lie within"):
             ask()
 
 
 @pytest.mark.parametrize(
-    "options", [{"width": 0}, {"height": 5000}, {"fps": 0.0}, {"fps": float("nan")}, {"quality": 10}, {"port": 70000}]
+    "options",
+    [
+        {"width": 0},
+        {"height": 5000},
+        {"fps": 0.0},
+        {"fps": float("nan")},
+        {"quality": 10},
+        {"port": 70000},
+        {"noise": 50},
+    ],
 )
 def test_options_beyond_reason_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="must lie within"):

@@ -13,7 +13,7 @@ from robot.camera.camera import Camera
 from robot.cli import app
 from robot.mock import FaultClient
 from tacsim.models.hardware import CameraSensorConfig
-from tests.robot.mock.wire_client import TIMEOUT, wire_host
+from tests.robot.mock.wire_client import TIMEOUT, dashboard, wire_host
 
 START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 
@@ -21,7 +21,8 @@ START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 def test_it_serves_until_ctrl_c() -> None:
     hosts = [wire_host(40), wire_host(41)]
     options = [word for host in hosts for word in ("--host", host)]
-    process = subprocess.Popen([*START, *options, "--model", "ur3e"], stdout=subprocess.PIPE, text=True)
+    options += ["--model", "ur3e", "--version", "5.23.1"]
+    process = subprocess.Popen([*START, *options], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process, process.stdout:
         said = [process.stdout.readline() for _ in range(3)]
@@ -30,6 +31,9 @@ def test_it_serves_until_ctrl_c() -> None:
             faults = FaultClient(host)
             assert faults.state().mode == "RUNNING"
             faults.close()
+            assert dashboard(host, "PolyscopeVersion")[0].startswith("URSoftware 5.23.1.0 ")
+        dashboard(hosts[1], "addToLog \x1b[2J hello")
+        assert process.stdout.readline().startswith(f"{hosts[1]} ")
         process.send_signal(signal.SIGINT)
         assert process.wait(TIMEOUT) == 128 + signal.SIGINT
 
@@ -56,6 +60,9 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
         (["--model", "ur7"], "--model", 2),
         (["--host", "192.168.0.9"], "not a loopback", 2),
         (["--arms", "0"], "nothing to run", 2),
+        (["--version", "5"], "like 5.11", 2),
+        (["--version", "5.x"], "like 5.11", 2),
+        (["--version", "5.9999999999"], "4294967295", 2),
         (["--arms", "0", "--cameras", "1", "--camera-port", "70000"], "--camera-port", 2),
     ],
 )

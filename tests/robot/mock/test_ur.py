@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ from collections.abc import Callable
 import pytest
 
 from robot.mock import FaultError, MockArms, MockError, MockUR
-from tests.robot.mock.wire_client import TIMEOUT, ControlClient, wire_host
+from tests.robot.mock.wire_client import TIMEOUT, ControlClient, dashboard, wire_host
 
 
 def until(done: Callable[[], bool], what: str) -> None:
@@ -52,7 +53,10 @@ def test_options_arrive() -> None:
 
 def test_two_arms_in_one_process_do_not_touch() -> None:
     hosts = [wire_host(12), wire_host(13)]
-    with MockArms(hosts, ready_timeout=60) as arms, ControlClient(hosts[0]) as client:
+    versions = [(5, 11, 0, 0), (5, 23, 1, 0)]
+    with MockArms(hosts, version=versions, ready_timeout=60) as arms, ControlClient(hosts[0]) as client:
+        assert [struct.unpack(">4I", client.ask(118))] == versions[:1]
+        assert dashboard(hosts[1], "PolyscopeVersion")[0].startswith("URSoftware 5.23.1.0 ")
         client.call(9, [0, 0, 0, 0, 0, 0.5, 2.0, 0])
         until(lambda: arms.fault_clients[0].state().joint_speeds[5] > 0.4, "the first moves")
         arms.fault_clients[1].protective_stop()
@@ -88,6 +92,9 @@ def test_joints_that_are_refused() -> None:
         MockUR(wire_host(15), joints=[7, 0, 0, 0, 0, 0], ready_timeout=60)
     with pytest.raises(MockError, match="6 finite"):
         MockUR(wire_host(15), joints=[0, 0], ready_timeout=60)
+    for version in ((5, 11), (5, 11, 0, -1), (5, 11, 0, 2**32), (5, 11, 0, 0.5), (5, 11, 0, float("nan"))):
+        with pytest.raises(ValueError, match="four whole numbers"):
+            MockUR(wire_host(15), version=version)
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.deep)])

@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from robot.arm.channel import ArmStatus
 from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import PATIENCE, config, until
@@ -64,13 +65,18 @@ class Trial:
         self.reader = threading.Thread(target=self._read, daemon=True)
         self.reader.start()
 
-    def begin(self) -> None:
-        """Waits until the arm is on its way at full speed."""
-        mock = self.mock
+    def begin(self) -> bool:
+        """Waits until the arm is on its way at full speed; False if the driver has stopped it before that, as it does
+        on a machine that is too busy for its time-outs."""
+        faults = self.mock.faults
         assert _line(self.proxy) == _line(self.observer) == "ready"
         self.worker = int(json.loads(self.lines.get(timeout=PATIENCE))["worker"])
-        start = np.array(mock.faults.state().pose[:3])
-        until(lambda: float(np.linalg.norm(np.array(mock.faults.state().pose[:3]) - start)) > BEFORE, "motion")
+        start = np.array(faults.state().pose[:3])
+        until(lambda: self._faulted() or bool(np.linalg.norm(faults.state().pose[:3] - start) > BEFORE), "motion")
+        return not self._faulted()
+
+    def _faulted(self) -> bool:
+        return any(ArmStatus[json.loads(line)["status"]].is_fault for line in list(self.lines.queue))
 
     def network(self, **wish: Any) -> float:
         """Breaks the network (proxy.py says how); returns when."""

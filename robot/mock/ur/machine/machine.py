@@ -27,6 +27,7 @@ from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.machine.script import Program
 from robot.mock.ur.machine.version import VERSION, Version
 from tacsim.interface import FloatArray
+from tacsim.text import printable
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up
@@ -164,8 +165,7 @@ class Machine:
         return self.arm.rests and self.freedrive is None and self.force_mode is None
 
     def write_log(self, text: str) -> None:
-        shown = "".join(letter if letter.isprintable() else "?" for letter in text[:LINE])
-        self.log.append((self.time, shown))
+        self.log.append((self.time, printable(text[:LINE])))
 
     # -- program -----------------------------------------------------------------------------------------------------
 

@@ -19,6 +19,11 @@ def check_version(numbers: Sequence[float]) -> Version:
     return major, minor, bugfix, build
 
 
+def version_text(version: Version) -> str:
+    """Such as 5.11.0.108150."""
+    return ".".join(map(str, version))
+
+
 def parse_version(text: str) -> Version:
     """From "5.11", "5.11.0" or "5.11.0.108150"; what is left out is 0. Raises ValueError."""
     if re.fullmatch(r"\d{1,10}(\.\d{1,10}){1,3}", text, re.ASCII) is None:

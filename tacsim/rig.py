@@ -28,6 +28,7 @@ from tacsim.limits import check_action
 
 if TYPE_CHECKING:
     from tacsim.control.load_controller import LoadController
+    from tacsim.record.episode import ArmPackages
 
 
 READ_TIMEOUT = 1.0  # longest wait for a frame [s]
@@ -55,6 +56,7 @@ class Rig:
         reset: brings the rig to the start of an episode.
         truth: the body as only a simulation knows it; None on rigs without.
         diagnostics: numbers about the last control step for the record, e.g. the settle residual.
+        packages: what the controllers of the arms sent since the last call, for the record.
         read_all: how the sensors are read: one by one, or in parallel where that is faster (tacsim.compute.threads).
         on_tactile: called with every tactile observation before anybody acts on it; raises what ends the episode.
         on_close: closes what the rig needs besides sensors and arms, after them.
@@ -80,6 +82,7 @@ class Rig:
         reset: Reset,
         truth: Callable[[], Truth | None] | None = None,
         diagnostics: Callable[[], Mapping[str, float]] = dict,
+        packages: Callable[[], Mapping[str, ArmPackages]] = dict,
         read_all: Callable[[Sequence[Callable[[], TactileFrame]]], list[TactileFrame]] = map_serial,
         on_tactile: Callable[[Mapping[str, TactileObservation]], None] | None = None,
         on_close: Callable[[], None] | None = None,
@@ -90,7 +93,7 @@ class Rig:
         self.name = name
         self.sensors, self.arms, self.normalisers = dict(sensors), dict(arms), dict(normalisers)
         self._clock, self._reset, self._truth, self._diagnostics = clock, reset, truth, diagnostics
-        self._read_all, self._load_control = read_all, load_control
+        self._read_all, self._load_control, self._packages = read_all, load_control, packages
         self._on_tactile, self._on_close = on_tactile, on_close
         self._arm_states: Mapping[str, ArmState] = {}
         self.frames = self.references = {}
@@ -147,6 +150,14 @@ class Rig:
             self._load_control.sent(sent)
         self._clock.tick()
         return self.observe(), sent
+
+    def now(self) -> float:
+        """The time on the rig's clock [s]."""
+        return self._clock.now()
+
+    def packages(self) -> Mapping[str, ArmPackages]:
+        """What the controllers of the arms sent since the last call, by arm; of those whose packages are recorded."""
+        return self._packages()
 
     def truth(self) -> Truth | None:
         """The body as only a simulation knows it; for tasks, never for policies."""

@@ -118,7 +118,7 @@ def _run(
     lost = ""
     if recorder is not None and (recorder.error or recorder.dropped):
         why = recorder.error or "the disk was too slow"
-        lost = f"{recorder.path} holds {recorder.written} of {len(episode.steps)} steps: {why}"
+        lost = f"{recorder.path} holds {recorder.written} of {recorder.written + recorder.dropped} steps: {why}"
     for problem in filter(None, (failure, lost)):
         complain(problem)
     if recorder is None or not episode.steps:
@@ -169,7 +169,7 @@ def replay(
 
         episode = read_episode(file)
     if not episode.complete:
-        notes.print(f"The recording ended without its footer; {len(episode.steps)} steps could be read.")
+        notes.print(f"The recording was cut off; {len(episode.steps)} steps could be read.")
     if not episode.steps:
         raise EpisodeError(f"{file}: no step can be read, there is nothing to show")
     folder.mkdir(parents=True)
@@ -178,9 +178,12 @@ def replay(
 
 def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     """Writes the report and ends with the table."""
-    from tacsim.report.report import end_table, summary, write_report
+    import json
+
+    from tacsim.report.report import end_table, write_report
 
     with busy("writing the report"), writing(folder):
         paths = write_report(episode, folder)
+        stats = json.loads(paths["summary.json"].read_text(encoding="utf-8"))
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
-    results.print(end_table(summary(episode), listed))
+    results.print(end_table(stats, listed))

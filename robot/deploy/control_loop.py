@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from importlib import metadata
 from typing import Protocol
 
@@ -33,14 +34,20 @@ class RecordingFailed(RuntimeError):
 
 
 class StepRecorder(Protocol):
-    """What takes the steps of an episode: tacsim.record.writer.Recorder."""
+    """What takes the steps of an episode and keeps them: tacsim.Recorder."""
 
     @property
     def error(self) -> Exception | None:
         """What ended the recording early."""
         ...
 
+    @property
+    def steps(self) -> Sequence[Step]:
+        """Those that it keeps."""
+        ...
+
     def write(self, step: Step) -> bool: ...
+    def flush(self) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +73,9 @@ def run_episode(
     """Resets rig and policy, then runs exactly `steps` control steps; fewer only when a recording is over, `stop` says
     so, or on Ctrl-C. The episode's step 0 is the state after reset. Where the rig knows no truth, nothing is judged.
 
+    With a recorder the steps of the episode are those in its file, read when they are asked for: however long it is,
+    it takes no memory. Without one they are kept in memory, with their pictures.
+
     Args:
         recorder: opens the recording, once the references without contact are there (they are attached).
         on_step: called after each step, e.g. for a progress bar.
@@ -81,13 +91,19 @@ def run_episode(
     started = time.perf_counter()
     observation = rig.reset(setup.seed)
     start = rig.truth()
-    episode = Episode(_meta(rig, task, setup))
-    sink = None if recorder is None else recorder(episode.meta)
+    meta = _meta(rig, task, setup)
+    sink = None if recorder is None else recorder(meta)
+    kept: list[Step] = []
+    episode = Episode(meta, kept if sink is None else sink.steps)
+    count = 0
 
     def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
-        step = _step(len(episode.steps), rig, task, start, observation, action, sent, time.perf_counter() - started)
-        episode.steps.append(step)
-        if sink is not None and not sink.write(step):
+        nonlocal count
+        step = _step(count, rig, task, start, observation, action, sent, time.perf_counter() - started)
+        count += 1
+        if sink is None:
+            kept.append(step)
+        elif not sink.write(step):
             episode.dropped += 1
             if sink.error is not None:
                 raise RecordingFailed(f"the recording ended early: {sink.error}")
@@ -97,7 +113,7 @@ def run_episode(
     try:
         policy.reset()
         keep(observation, None, {})
-        while len(episode.steps) <= steps and not stop():
+        while count <= steps and not stop():
             started = time.perf_counter()
             action = policy(observation)
             observation, sent = rig.step(action)
@@ -105,11 +121,13 @@ def run_episode(
     except (EndOfEpisode, KeyboardInterrupt):
         pass
     except (Exception, SystemExit) as failure:  # a policy may call sys.exit
-        done = max(len(episode.steps) - 1, 0)
+        done = max(count - 1, 0)
         why = f"{type(failure).__name__}: {failure}"
         raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", episode) from failure
     finally:
         rig.stop()
+        if sink is not None:
+            sink.flush()
     return episode
 
 
@@ -134,6 +152,8 @@ def _meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
         versions=versions(),
         attachments={**setup.attachments, **reference_attachments(rig.references)},
         goal=None if task is None else task.config.goal,
+        started=datetime.now().astimezone(),
+        wall_offset=time.time_ns() - round(1e9 * rig.now()),
     )
 
 
@@ -166,4 +186,5 @@ def _step(
         distance=None if outcome is None else outcome.distance,
         info=info,
         seconds=seconds,
+        packages=rig.packages(),
     )

@@ -22,7 +22,7 @@ from tacsim.control.load_controller import load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.report.diagnostics import ALIGNMENT, LIMITS
+from tacsim.report.series import ALIGNMENT, LIMITS
 from tacsim.rig import Rig
 
 Confirm = Callable[[str], bool]

@@ -36,12 +36,18 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def decode_image(data: bytes, what: str, formats: tuple[str, ...] = FORMATS) -> NDArray[np.uint8]:
+def decode_image(
+    data: bytes, what: str, formats: tuple[str, ...] = FORMATS, size: tuple[int, int] | None = None
+) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB picture of an encoded one with 8 bits a channel.
 
-    Raises EpisodeError that names `what`, for unreadable data and for pictures beyond MAX_SIDE (before decoding them).
+    Raises EpisodeError that names `what`, for unreadable data, and, before decoding them, for pictures beyond MAX_SIDE
+    and for those that have not the rows and columns of `size`.
     """
     with _opened(io.BytesIO(data), what, formats) as picture:
+        if size is not None and (picture.height, picture.width) != size:
+            found = f"{picture.width} x {picture.height} pixels"
+            raise EpisodeError(f"{what}: {found}, but others of this sensor have {size[1]} x {size[0]}")
         if picture.mode not in ("RGB", "RGBA", "L", "P"):
             raise EpisodeError(f"{what}: pixel type '{picture.mode}'; 8 bits a channel are read, grey or colour")
         return np.array(picture.convert("RGB"))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -15,17 +16,21 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from tacsim.interface import Action, ArmState, Pose, SurfaceMap, TactileFrame
-from tacsim.record.episode import EpisodeError, Step
+from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
 from tacsim.record.images import decode_image, encode_png
 from tacsim.record.schemas import (
     ARM_SCHEMA,
+    PACKAGE_SCHEMA,
     STEP_SCHEMA,
     STEP_TOPIC,
     ArmMessage,
     FrameMessage,
+    PackageMessage,
     PoseMessage,
     StepMessage,
 )
+
+Messages = Mapping[str, Sequence[bytes]]  # of one step, by topic; only of packages there are several
 
 _FLOAT = np.dtype("<f4")
 _SURFACE_FIELDS = ("height", "gradient_x", "gradient_y")
@@ -38,8 +43,25 @@ class Encoded:
 
     topic: str
     schema: str | type[Message]  # name of a JSON schema, or a protobuf message class
-    time: int  # when its content was true, rig clock [ns]
+    log_time: int  # where viewers put it: at its step, or a package at its own time; wall clock [ns]
+    time: int  # when its content was true, wall clock [ns]
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    """Rig times as the wall clock's."""
+
+    step: int  # rig time of the step [ns]
+    offset: int  # wall clock minus rig clock [ns]
+
+    @property
+    def now(self) -> int:
+        return max(self.step + self.offset, 0)
+
+    def __call__(self, seconds: float) -> int:
+        """Wall clock time [ns] for viewers, never before 1970; /step and /{arm}/arm hold the exact rig time."""
+        return max(nanoseconds(max(seconds, 0.0)) + self.offset, 0)
 
 
 def nanoseconds(seconds: float) -> int:
@@ -49,21 +71,20 @@ def nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
-def _stamp(seconds: float) -> int:
-    """Time for viewers [ns], never before the clock's start; /step and /{arm}/arm hold the exact time."""
-    return nanoseconds(max(seconds, 0.0))
-
-
-def encode_step(step: Step, pitch: float) -> list[Encoded]:
-    """All messages of a step, the one that makes it complete last. `pitch` of the surface grid is for viewers [m].
+def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]:
+    """All messages of a step, the one that makes it complete last. `pitch` of the surface grid is for viewers [m];
+    `wall_offset`: wall clock minus rig clock [ns].
 
     Raises ValueError for arrays of the wrong type or shape and for a step at a negative time.
     """
     messages: list[Encoded] = []
+    clock = _Clock(nanoseconds(step.time), wall_offset)
     for name, frame in step.frames.items():
-        messages += _encode_frame(name, frame, pitch)
+        messages += _encode_frame(name, frame, pitch, clock)
     for name, arm in step.arms.items():
-        messages += _encode_arm(name, arm)
+        messages += _encode_arm(name, arm, clock)
+    for name, packages in step.packages.items():
+        messages += _encode_packages(name, packages, clock)
     record = StepMessage(
         index=int(step.index),
         time=step.time,
@@ -75,24 +96,36 @@ def encode_step(step: Step, pitch: float) -> list[Encoded]:
         sent=_pose_messages(step.sent),
         frames={name: _frame_message(frame) for name, frame in step.frames.items()},
         arms=tuple(step.arms),
+        packages={name: len(packages.stamp) for name, packages in step.packages.items()},
     )
-    messages.append(Encoded(STEP_TOPIC, STEP_SCHEMA, nanoseconds(step.time), record.model_dump_json().encode()))
+    left_out = set() if record.packages else {"packages"}  # readers of before know no packages
+    data = record.model_dump_json(exclude=left_out).encode()
+    messages.append(Encoded(STEP_TOPIC, STEP_SCHEMA, clock.now, clock.now, data))
     return messages
 
 
-def decode_step(data: bytes, messages: Mapping[str, bytes], sensors: Container[str] | None = None) -> Step:
-    """The step of a /step message and the other messages of that step by topic. Raises EpisodeError.
+def decode_step(
+    data: bytes, messages: Messages, what: str = "a recording", sizes: dict[str, tuple[int, int]] | None = None
+) -> Step:
+    """The step of a /step message and the other messages of that step by topic. Its frames are decoded when they are
+    asked for. Raises EpisodeError.
 
     Args:
-        sensors: only their frames are decoded and returned; None: all.
+        what: is named by the errors of its frames.
+        sizes: rows and columns of the pictures by sensor, those of the first that is decoded: others are refused.
     """
     try:
         record = StepMessage.model_validate_json(data)
-        names = [name for name in record.frames if sensors is None or name in sensors]
+        for name, frame in record.frames.items():
+            for topic in _frame_topics(name, frame):
+                _last(messages, topic)
         return Step(
             index=record.index,
             time=record.time,
-            frames={name: _decode_frame(name, record.frames[name], messages) for name in names},
+            frames=Recorded(
+                {name: frame.time for name, frame in record.frames.items()},
+                partial(_decode_frame, record.frames, messages, what, {} if sizes is None else sizes),
+            ),
             arms={name: _decode_arm(name, messages) for name in record.arms},
             action=None if record.action is None else Action(_poses(record.action)),
             sent=_poses(record.sent),
@@ -100,39 +133,62 @@ def decode_step(data: bytes, messages: Mapping[str, bytes], sensors: Container[s
             distance=record.distance,
             info=record.info,
             seconds=record.seconds,
+            packages=Recorded(record.packages, partial(_decode_packages, record.packages, messages, what)),
         )
     except EpisodeError:
         raise
-    except KeyError as missing:
-        raise EpisodeError(f"a step names the message {missing}, which is not there") from missing
     except (DecodeError, ValueError) as failure:
         raise EpisodeError(f"a step cannot be decoded: {failure}") from failure
 
 
-def _encode_frame(name: str, frame: TactileFrame, pitch: float) -> Iterator[Encoded]:
-    time = _stamp(frame.time)
+def _last(messages: Messages, topic: str) -> bytes:
+    found = messages.get(topic)
+    if not found:
+        raise EpisodeError(f"a step names the message '{topic}', which is not there")
+    return found[-1]
+
+
+def _encode_frame(name: str, frame: TactileFrame, pitch: float, clock: _Clock) -> Iterator[Encoded]:
+    time = clock(frame.time)
     stamp = _timestamp(time)
     image = CompressedImage(timestamp=stamp, frame_id=name, data=encode_png(frame.image), format="png")
-    yield Encoded(f"/{name}/image", CompressedImage, time, image.SerializeToString())
+    yield Encoded(f"/{name}/image", CompressedImage, clock.now, time, image.SerializeToString())
     if frame.surface is None:
         return
     surface = frame.surface
     width = pitch * surface.height.shape[-1]  # [m] of the whole map
     cells = _join(name, _SURFACE_FIELDS, surface.height[..., None], surface.gradient)
-    yield Encoded(f"/{name}/surface", Grid, time, _encode_grid(name, stamp, cells, _SURFACE_FIELDS, width))
+    yield Encoded(f"/{name}/surface", Grid, clock.now, time, _encode_grid(name, stamp, cells, _SURFACE_FIELDS, width))
     if surface.flow is not None:
         cells = _join(name, _FLOW_FIELDS, surface.flow)
-        yield Encoded(f"/{name}/flow", Grid, time, _encode_grid(name, stamp, cells, _FLOW_FIELDS, width))
+        yield Encoded(f"/{name}/flow", Grid, clock.now, time, _encode_grid(name, stamp, cells, _FLOW_FIELDS, width))
 
 
-def _decode_frame(name: str, record: FrameMessage, messages: Mapping[str, bytes]) -> TactileFrame:
-    image = CompressedImage.FromString(messages[f"/{name}/image"])
-    surface = None
-    if record.surface:
-        cells = _decode_grid(messages[f"/{name}/surface"], _SURFACE_FIELDS)
-        flow = _decode_grid(messages[f"/{name}/flow"], _FLOW_FIELDS) if record.flow else None
-        surface = SurfaceMap(height=cells[..., 0].copy(), gradient=cells[..., 1:].copy(), flow=flow)
-    pixels = decode_image(image.data, f"/{name}/image", formats=("PNG",))
+def _frame_topics(name: str, record: FrameMessage) -> list[str]:
+    """The topics of the messages that a frame is made of."""
+    there = {"image": True, "surface": record.surface, "flow": record.surface and record.flow}
+    return [f"/{name}/{part}" for part, is_there in there.items() if is_there]
+
+
+def _decode_frame(
+    records: Mapping[str, FrameMessage],
+    messages: Messages,
+    what: str,
+    sizes: dict[str, tuple[int, int]],
+    name: str,
+) -> TactileFrame:
+    record = records[name]
+    try:
+        image = CompressedImage.FromString(_last(messages, f"/{name}/image"))
+        surface = None
+        if record.surface:
+            cells = _decode_grid(_last(messages, f"/{name}/surface"), _SURFACE_FIELDS)
+            flow = _decode_grid(_last(messages, f"/{name}/flow"), _FLOW_FIELDS) if record.flow else None
+            surface = SurfaceMap(height=cells[..., 0].copy(), gradient=cells[..., 1:].copy(), flow=flow)
+        pixels = decode_image(image.data, f"/{name}/image", formats=("PNG",), size=sizes.get(name))
+    except (EpisodeError, DecodeError, ValueError) as failure:
+        raise EpisodeError(f"{what}: {failure}") from failure
+    sizes.setdefault(name, pixels.shape[:2])
     return TactileFrame(image=pixels, time=record.time, index=record.index, surface=surface)
 
 
@@ -183,23 +239,23 @@ def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
     return cells.astype(np.float32)
 
 
-def _encode_arm(name: str, arm: ArmState) -> Iterator[Encoded]:
-    time = _stamp(arm.time)
+def _encode_arm(name: str, arm: ArmState, clock: _Clock) -> Iterator[Encoded]:
+    time = clock(arm.time)
     pose = PoseInFrame(timestamp=_timestamp(time), frame_id="world")
     place, turn = pose.pose.position, pose.pose.orientation
     place.x, place.y, place.z = arm.pose.position.tolist()
     turn.x, turn.y, turn.z, turn.w = arm.pose.quaternion.tolist()
-    yield Encoded(f"/{name}/pose", PoseInFrame, time, pose.SerializeToString())
+    yield Encoded(f"/{name}/pose", PoseInFrame, clock.now, time, pose.SerializeToString())
     joints = None if arm.joints is None else tuple(arm.joints.tolist())
     record = ArmMessage(
         twist=tuple(arm.twist.tolist()), wrench=tuple(arm.wrench.tolist()), joints=joints, time=arm.time
     )
-    yield Encoded(f"/{name}/arm", ARM_SCHEMA, time, record.model_dump_json().encode())
+    yield Encoded(f"/{name}/arm", ARM_SCHEMA, clock.now, time, record.model_dump_json().encode())
 
 
-def _decode_arm(name: str, messages: Mapping[str, bytes]) -> ArmState:
-    pose = PoseInFrame.FromString(messages[f"/{name}/pose"]).pose
-    record = ArmMessage.model_validate_json(messages[f"/{name}/arm"])
+def _decode_arm(name: str, messages: Messages) -> ArmState:
+    pose = PoseInFrame.FromString(_last(messages, f"/{name}/pose")).pose
+    record = ArmMessage.model_validate_json(_last(messages, f"/{name}/arm"))
     place, turn = pose.position, pose.orientation
     return ArmState(
         pose=Pose(np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])),
@@ -208,6 +264,26 @@ def _decode_arm(name: str, messages: Mapping[str, bytes]) -> ArmState:
         joints=None if record.joints is None else np.array(record.joints, dtype=np.float64),
         time=record.time,
     )
+
+
+def _encode_packages(name: str, packages: ArmPackages, clock: _Clock) -> Iterator[Encoded]:
+    columns = [getattr(packages, field).tolist() for field in PackageMessage.model_fields]
+    for row in zip(*columns, strict=True):
+        record = PackageMessage(**dict(zip(PackageMessage.model_fields, row, strict=True)))
+        time = clock(record.time)
+        yield Encoded(f"/{name}/packages", PACKAGE_SCHEMA, time, time, record.model_dump_json().encode())
+
+
+def _decode_packages(numbers: Mapping[str, int], messages: Messages, what: str, name: str) -> ArmPackages:
+    there = messages.get(f"/{name}/packages", ())
+    if len(there) != numbers[name]:
+        raise EpisodeError(f"{what}: it names {numbers[name]} packages of arm '{name}', but {len(there)} are there")
+    try:
+        rows = [PackageMessage.model_validate_json(data) for data in there]
+    except ValueError as failure:
+        raise EpisodeError(f"{what}: a package of arm '{name}' cannot be decoded: {failure}") from failure
+    columns = {field: [getattr(row, field) for row in rows] for field in PackageMessage.model_fields}
+    return ArmPackages.of(columns)
 
 
 def _pose_messages(poses: Mapping[str, Pose | None]) -> dict[str, PoseMessage | None]:

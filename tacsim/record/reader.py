@@ -1,60 +1,40 @@
-"""Reads episodes, finished or cut off: as a whole, or step by step.
-
-The readers of the `mcap` package need a finished file and trust the lengths in it. Here each length is checked
-against the size of the file before anything is read; `mcap` parses the records themselves.
-Format: https://mcap.dev/spec
-"""
+"""Reads episodes, finished or cut off. Their steps are read from the file when they are asked for."""
 
 from __future__ import annotations
 
-import io
-import struct
-import zlib
-from collections.abc import Callable, Container, Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import BinaryIO, NamedTuple, Self, overload
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, Header, McapRecord, Message, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata
 
-from tacsim.interface import TactileFrame
 from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
-from tacsim.record.messages import decode_step
+from tacsim.record.messages import Messages, decode_step
+from tacsim.record.records import check_magic, read_records
 from tacsim.record.schemas import CLOSE, META, STEP_TOPIC, decode_meta, unsealed
 
-MAX_MEMORY = 4 << 30  # [bytes] of arrays in one episode in memory
-MAX_RECORD = 256 << 20  # [bytes]
-_HEAD = struct.Struct("<BQ")  # opcode, length
-_PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
-    Opcode.HEADER: Header.read,
-    Opcode.FOOTER: Footer.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.CHUNK: Chunk.read,
-    Opcode.ATTACHMENT: Attachment.read,
-    Opcode.METADATA: Metadata.read,
-}
+
+class Place(NamedTuple):
+    """Where a step begins in a file."""
+
+    offset: int  # of the outermost record that holds its beginning [bytes]
+    skip: int = 0  # records in there that belong to earlier steps
 
 
-def read_episode(path: Path | str, *, max_memory: int = MAX_MEMORY) -> Episode:
-    """The whole episode. A file that is cut off or damaged gives the steps before that, and `complete` is False.
+def read_episode(path: Path | str) -> Episode:
+    """An episode from its file, which has to stay there: each step is read, and each picture decoded, when it is asked
+    for. A file that is cut off or damaged gives the steps before that, and `complete` is False.
 
-    Raises EpisodeError when there is no such file, it is no episode, or it exceeds `max_memory` [bytes] when decoded.
+    Raises EpisodeError when there is no such file, or it is no episode; a picture may raise it when it is asked for.
     """
     with EpisodeFile(path) as file:
-        episode = Episode(meta=file.meta)
-        memory = 0
-        for step in file.steps():
-            memory += sum(_memory(frame) for frame in step.frames.values())
-            if memory > max_memory:
-                raise EpisodeError(f"{path}: more than {max_memory} bytes decoded at step {step.index}; use iter_steps")
-            episode.steps.append(step)
-        episode.complete, episode.dropped = file.complete, file.dropped
-        return episode
+        for _ in file.steps():
+            pass
+        steps = RecordedSteps(file.path, file.places, file.topics)
+        return Episode(meta=file.meta, steps=steps, complete=file.complete, dropped=file.dropped)
 
 
 def iter_steps(path: Path | str) -> Iterator[Step]:
@@ -63,29 +43,55 @@ def iter_steps(path: Path | str) -> Iterator[Step]:
         yield from file.steps()
 
 
-class EpisodeFile:
-    """An open episode file: the metadata at once, the steps one by one.
+class RecordedSteps(Sequence[Step]):
+    """The steps in an episode's file. One that is asked for is read, and not kept.
 
     Args:
         path: of the file.
-        sensors: whose frames are decoded; None: all.
+        places: where its steps begin; may grow while the file does.
+        topics: of its channels, by their numbers in the file.
 
-    Raises EpisodeError.
+    Raises EpisodeError, when a step is asked for, if the file is gone or has changed.
     """
 
-    def __init__(self, path: Path | str, sensors: Container[str] | None = None) -> None:
+    def __init__(self, path: Path, places: Sequence[Place], topics: Mapping[int, str]) -> None:
+        self._path, self._places, self._topics = path, places, topics
+        self._sizes: dict[str, tuple[int, int]] = {}
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, index: int) -> Step: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Step]: ...
+    def __getitem__(self, index: int | slice) -> Step | list[Step]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        number = range(len(self))[index]  # IndexError, and counting from the end
+        place, gathered = self._places[number], _Gathered(dict(self._topics))
+        with _open(self._path) as file:
+            file.seek(place.offset)
+            records = read_records(file, self._path.stat().st_size, str(self._path))
+            for _, record in islice(records, place.skip, None):
+                if (message := gathered.add(record)) is not None:
+                    return _decode(message.data, gathered.messages, self._sizes, self._path, number)
+        raise EpisodeError(f"{self._path}: step number {number} is not there any more; the file has changed")
+
+
+class EpisodeFile:
+    """An open episode file: the metadata at once, the steps one by one. Raises EpisodeError."""
+
+    def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.complete = False  # after the last step: the file has its footer and all steps it claims
         self.dropped = 0  # after the last step
-        self._sensors = sensors
+        self.places: list[Place] = []  # of the steps so far
+        self.topics: dict[int, str] = {}
+        self._file = _open(self.path)
         try:
-            if not self.path.is_file():
-                raise EpisodeError(f"{self.path}: {'is no file' if self.path.exists() else 'no such file'}")
-            self._file = self.path.open("rb")
-        except OSError as failure:
-            raise EpisodeError(f"{self.path}: cannot be opened: {failure.strerror}") from failure
-        try:
-            self._records = _read_records(self._file, self.path.stat().st_size, str(self.path))
+            check_magic(self._file, str(self.path))
+            self._records = read_records(self._file, self.path.stat().st_size, str(self.path))
             self.meta = self._read_meta()
         except BaseException:
             self._file.close()
@@ -95,7 +101,7 @@ class EpisodeFile:
         """Metadata and attachments, which precede the first step."""
         found: tuple[EpisodeMeta, tuple[str, ...]] | None = None
         attachments: dict[str, bytes] = {}
-        for record in self._records:
+        for _, record in self._records:
             if isinstance(record, Metadata) and record.name == META:
                 found = decode_meta(record.metadata, str(self.path))
             elif isinstance(record, Attachment):
@@ -111,32 +117,27 @@ class EpisodeFile:
 
     def steps(self) -> Iterator[Step]:
         """The steps in order, up to the end of the file or the first damage."""
-        topics: dict[int, str] = {}
-        pending: dict[str, bytes] = {}
+        sizes: dict[str, tuple[int, int]] = {}
         closing: dict[str, int] | None = None
-        count = 0
-        for record in self._records:
-            if isinstance(record, Channel):
-                topics[record.id] = record.topic
-            elif isinstance(record, Metadata) and record.name == CLOSE:
+        gathered, begin, last, inside = _Gathered(self.topics), None, -1, 0
+        for offset, record in self._records:
+            last, inside = offset, inside + 1 if offset == last else 0
+            begin = begin or Place(offset, inside)
+            if isinstance(record, Metadata) and record.name == CLOSE:
                 closing = _closing(record)
             elif isinstance(record, Footer) and closing is not None:
-                self.complete, self.dropped = closing["steps"] == count, closing["dropped"]
-            elif isinstance(record, Message):
-                if record.channel_id not in topics:
+                self.complete = closing["steps"] == len(self.places) and not closing["cut"]
+                self.dropped = closing["dropped"]
+            elif isinstance(record, Message) and record.channel_id not in self.topics:
+                return
+            elif (message := gathered.add(record)) is not None:
+                number = len(self.places)
+                if message.sequence != number % 2**32:  # a damaged record hid a step
                     return
-                topic = topics[record.channel_id]
-                if topic != STEP_TOPIC:
-                    pending[topic] = record.data
-                    continue
-                if record.sequence != count % 2**32:  # a damaged record hid a step
-                    return
-                try:
-                    yield decode_step(record.data, pending, self._sensors)
-                except EpisodeError as failure:
-                    raise EpisodeError(f"{self.path}: step number {count}: {failure}") from failure
-                pending.clear()
-                count += 1
+                step = _decode(message.data, gathered.messages, sizes, self.path, number)
+                self.places.append(begin)
+                yield step
+                gathered, begin = _Gathered(self.topics), None
 
     def close(self) -> None:
         self._file.close()
@@ -148,88 +149,45 @@ class EpisodeFile:
         self.close()
 
 
+class _Gathered:
+    """The messages of one step."""
+
+    def __init__(self, topics: dict[int, str]) -> None:
+        self.topics = topics
+        self.messages: dict[str, list[bytes]] = defaultdict(list)
+
+    def add(self, record: object) -> Message | None:
+        """Takes a record; returns the message that makes the step complete."""
+        if isinstance(record, Channel):
+            self.topics.setdefault(record.id, record.topic)  # a repetition, in the summary, may be damaged
+        elif isinstance(record, Message):
+            topic = self.topics.get(record.channel_id, "")
+            if topic == STEP_TOPIC:
+                return record
+            self.messages[topic].append(record.data)
+        return None
+
+
+def _decode(data: bytes, messages: Messages, sizes: dict[str, tuple[int, int]], path: Path, number: int) -> Step:
+    try:
+        return decode_step(data, messages, f"{path}: step number {number}", sizes)
+    except EpisodeError as failure:
+        raise EpisodeError(f"{path}: step number {number}: {failure}") from failure
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        if not path.is_file():
+            raise EpisodeError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+        return path.open("rb")
+    except OSError as failure:
+        raise EpisodeError(f"{path}: cannot be opened: {failure.strerror}") from failure
+
+
 def _closing(record: Metadata) -> dict[str, int] | None:
     """Numbers of the closing record; None when it is damaged."""
     try:
         values = unsealed(record.metadata, CLOSE)
-        return {key: int(values[key]) for key in ("steps", "dropped")}
+        return {key: int(values.get(key, "0") if key == "cut" else values[key]) for key in ("steps", "dropped", "cut")}
     except (EpisodeError, KeyError, ValueError):
         return None
-
-
-def _memory(frame: TactileFrame) -> int:
-    """Bytes of the arrays of a frame."""
-    if frame.surface is None:
-        return frame.image.nbytes
-    flow = 0 if frame.surface.flow is None else frame.surface.flow.nbytes
-    return frame.image.nbytes + frame.surface.height.nbytes + frame.surface.gradient.nbytes + flow
-
-
-class _BadRecord(Exception):
-    """The readable part of the file ends here."""
-
-
-def _read_records(file: BinaryIO, size: int, what: str) -> Iterator[McapRecord]:
-    """Records in file order, chunks unpacked, without indexes and statistics.
-
-    Ends without an exception at the first record that is cut off or damaged. The last record is a Footer only if the
-    file was finished. Raises EpisodeError for a file that is not MCAP or has compressed chunks.
-    """
-    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
-    try:
-        for record in _records(file, size - len(MCAP0_MAGIC)):
-            if isinstance(record, Chunk):
-                yield from _open_chunk(record, what)
-            elif isinstance(record, Footer):
-                if file.read(len(MCAP0_MAGIC) + 1) == MCAP0_MAGIC:
-                    yield record
-                return
-            else:
-                yield record
-    except _BadRecord:
-        return
-
-
-def _records(stream: BinaryIO, size: int) -> Iterator[McapRecord]:
-    """Parsed records of the next `size` bytes."""
-    left = size
-    while left >= _HEAD.size:
-        head = stream.read(_HEAD.size)
-        if len(head) < _HEAD.size:
-            raise _BadRecord
-        opcode, length = _HEAD.unpack(head)
-        left -= _HEAD.size + length
-        if left < 0 or length > MAX_RECORD or opcode not in Opcode.__members__.values():
-            raise _BadRecord
-        body = stream.read(length)
-        if len(body) < length:
-            raise _BadRecord
-        record = _parse(opcode, body)
-        if record is not None:
-            yield record
-    if left:
-        raise _BadRecord
-
-
-def _parse(opcode: int, body: bytes) -> McapRecord | None:
-    """The record; None for kinds that episodes do not need. No read reaches beyond `body`."""
-    stream = ReadDataStream(io.BytesIO(body))
-    try:
-        if opcode == Opcode.MESSAGE:
-            message: McapRecord = Message.read(stream, len(body))
-            return message
-        if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]).to_bytes(4, "little") != body[-4:]:
-            raise _BadRecord
-        parse = _PARSERS.get(opcode)
-        return None if parse is None else parse(stream)
-    except (McapError, struct.error, UnicodeDecodeError, OverflowError, ValueError) as failure:
-        raise _BadRecord from failure
-
-
-def _open_chunk(chunk: Chunk, what: str) -> Iterator[McapRecord]:
-    if chunk.compression in ("zstd", "lz4"):
-        raise EpisodeError(f"{what}: compressed chunks ({chunk.compression}); run 'mcap decompress' on it first")
-    if chunk.compression or zlib.crc32(chunk.data) != chunk.uncompressed_crc:
-        raise _BadRecord
-    yield from _records(io.BytesIO(chunk.data), len(chunk.data))

@@ -1,8 +1,14 @@
 """What an episode file holds: topics, and the JSON messages as pydantic models (their JSON schemas are in the file).
 
 Topics: /{sensor}/image foxglove.CompressedImage (PNG), /{sensor}/surface and /{sensor}/flow foxglove.Grid (float32),
-/{arm}/pose foxglove.PoseInFrame, /{arm}/arm tacsim.Arm, and last in a step /step tacsim.Step, which names the others.
+/{arm}/pose foxglove.PoseInFrame, /{arm}/arm tacsim.Arm, if asked for /{arm}/packages tacsim.ArmPackage (each package of
+the controller), and last in a step /step tacsim.Step, which names the others.
 Numbers that JSON cannot write are the texts "NaN", "Infinity", "-Infinity".
+
+Clocks: every `time` in the JSON messages is the rig's own clock [s], exact; a rig of hardware counts its computer's
+monotonic clock. Times of MCAP and of Foxglove's messages are the wall clock [ns since 1970, UTC]: the rig's clock plus
+`wall_offset` of the metadata, which is measured once at the start; setting the wall clock meanwhile changes nothing.
+log_time: of the step (of a package its own); publish_time and `timestamp`: of exposure or measurement.
 """
 
 from __future__ import annotations
@@ -10,6 +16,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
+from datetime import datetime
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
@@ -19,9 +26,10 @@ from tacsim.text import printable
 
 FORMAT = "1"  # of the file; raised when an old reader would misread a new file
 MAX_ATTACHMENT = 64 << 20  # [bytes]
+MAX_PARTS = 64  # sensors, and arms, of an episode
 META, CLOSE = "tacsim.episode", "tacsim.close"  # metadata records at the start and at the end
 STEP_TOPIC = "/step"
-STEP_SCHEMA, ARM_SCHEMA = "tacsim.Step", "tacsim.Arm"
+STEP_SCHEMA, ARM_SCHEMA, PACKAGE_SCHEMA = "tacsim.Step", "tacsim.Arm", "tacsim.ArmPackage"
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
@@ -43,6 +51,21 @@ class ArmMessage(_Message):
     time: float  # [s]
 
 
+class PackageMessage(_Message):
+    """One package of an arm's controller, as it came: base axes, not those of the sensor."""
+
+    time: float  # when it was read, rig clock [s]
+    stamp: float  # time on the controller's own clock [s]
+    joints: Vector6  # [rad]
+    joint_speeds: Vector6  # [rad/s]
+    tcp_pose: Vector6  # position and rotation vector [m, rad]
+    tcp_speed: Vector6  # [m/s, rad/s]
+    tcp_force: Vector6  # [N, N m]
+    runtime_state: int  # of the controller's program: 1 stopped, 2 playing, 4 paused
+    safety_bits: int  # safety_status_bits of the controller
+    status: int  # what the driver made of it: robot.ArmStatus
+
+
 class FrameMessage(_Message):
     time: float  # of exposure, rig clock [s]
     index: int
@@ -61,9 +84,14 @@ class StepMessage(_Message):
     sent: dict[str, PoseMessage | None]  # executed
     frames: dict[str, FrameMessage]  # by sensor
     arms: tuple[str, ...]
+    packages: dict[str, int] = {}  # how many messages /{arm}/packages belong to this step, by arm
 
 
-JSON_SCHEMAS: Mapping[str, type[BaseModel]] = {STEP_SCHEMA: StepMessage, ARM_SCHEMA: ArmMessage}
+JSON_SCHEMAS: Mapping[str, type[BaseModel]] = {
+    STEP_SCHEMA: StepMessage,
+    ARM_SCHEMA: ArmMessage,
+    PACKAGE_SCHEMA: PackageMessage,
+}
 
 _SPEC = TypeAdapter(RigSpec)
 _NAMES = TypeAdapter(dict[str, str])
@@ -97,8 +125,13 @@ def encode_meta(meta: EpisodeMeta) -> dict[str, str]:
         "spec": _SPEC.dump_json(meta.spec).decode(),
         "versions": json.dumps(dict(meta.versions)),
         "attachments": json.dumps(list(meta.attachments)),
+        "wall_offset": str(meta.wall_offset),
     }
-    return sealed(values if meta.task is None else {**values, "task": meta.task})
+    if meta.task is not None:
+        values["task"] = meta.task
+    if meta.started is not None:
+        values |= {"started": meta.started.isoformat(), "time_zone": meta.started.tzname() or ""}
+    return sealed(values)
 
 
 def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tuple[str, ...]]:
@@ -116,7 +149,11 @@ def decode_meta(record: Mapping[str, str], what: str) -> tuple[EpisodeMeta, tupl
             spec=_SPEC.validate_json(values["spec"]),
             versions={printable(k): printable(v) for k, v in _NAMES.validate_json(values["versions"]).items()},
             goal=_GOAL.validate_json(values["goal"]),
+            started=datetime.fromisoformat(values["started"]) if "started" in values else None,
+            wall_offset=int(values.get("wall_offset", "0")),
         )
+        if max(len(meta.spec.sensors), len(meta.spec.arms)) > MAX_PARTS:
+            raise ValueError(f"more than {MAX_PARTS} sensors or arms")
         for name in (*meta.spec.sensors, *meta.spec.arms):
             if not name.isprintable():
                 raise ValueError(f"the name {printable(name)} holds control characters")

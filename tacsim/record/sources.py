@@ -65,13 +65,13 @@ class Cursor(Generic[T]):
 
 def episode_meta(path: Path) -> EpisodeMeta:
     """The metadata of an episode. Raises EpisodeError."""
-    with EpisodeFile(path, sensors=()) as file:
+    with EpisodeFile(path) as file:
         return file.meta
 
 
 def episode_frames(path: Path, sensor: str) -> Iterator[tuple[TactileFrame, float]]:
     """Frames of one sensor and the time of their steps [s, clock of the recording]."""
-    with EpisodeFile(path, sensors=(sensor,)) as file:
+    with EpisodeFile(path) as file:
         for step in file.steps():
             if sensor not in step.frames:
                 raise EpisodeError(f"{path}: step {step.index} has no frame of sensor '{sensor}'")
@@ -80,7 +80,7 @@ def episode_frames(path: Path, sensor: str) -> Iterator[tuple[TactileFrame, floa
 
 def episode_states(path: Path, arm: str) -> Iterator[tuple[ArmState, float]]:
     """States of one arm and the time of their steps [s, clock of the recording]."""
-    with EpisodeFile(path, sensors=()) as file:
+    with EpisodeFile(path) as file:
         for step in file.steps():
             if arm not in step.arms:
                 raise EpisodeError(f"{path}: step {step.index} has no state of arm '{arm}'")

@@ -7,6 +7,7 @@ import json
 import mimetypes
 import queue
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -16,7 +17,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from tacsim.record.episode import EpisodeMeta, Step
-from tacsim.record.messages import encode_step, nanoseconds
+from tacsim.record.messages import encode_step
+from tacsim.record.reader import Place, RecordedSteps
 from tacsim.record.schemas import CLOSE, FORMAT, JSON_SCHEMAS, MAX_ATTACHMENT, META, encode_meta, sealed
 
 _ONE_CHUNK = 1 << 40  # [bytes] a chunk ends with its step, never by size
@@ -58,6 +60,9 @@ class Recorder:
         self._closed = False
         self._schemas: dict[str | type[Message], int] = {}
         self._channels: dict[str, int] = {}
+        self._offset = meta.wall_offset
+        self._places: list[Place] = []
+        self._topics: dict[int, str] = {}
         self._file = open_new(self.path)
         try:
             self._writer = _start(self._file, meta)
@@ -74,6 +79,11 @@ class Recorder:
         """Steps that are in the file, flushed."""
         with self._change:
             return self._written
+
+    @property
+    def steps(self) -> Sequence[Step]:
+        """The steps in the file, read from there when they are asked for."""
+        return RecordedSteps(self.path, self._places, self._topics)
 
     @property
     def dropped(self) -> int:
@@ -145,18 +155,20 @@ class Recorder:
                 self._change.notify_all()
 
     def _append(self, step: Step) -> None:
-        messages = encode_step(step, self._pitch)  # all of it, before any of it is in the file
-        time = nanoseconds(step.time)
+        messages = encode_step(step, self._pitch, self._offset)  # all of it, before any of it is in the file
+        place = Place(self._file.tell())
         for message in messages:
             channel = self._channel(message.topic, message.schema)
-            # All at the step's time: readers that sort by time keep their order. `written` shows a missing step.
-            self._writer.add_message(channel, time, message.data, message.time, sequence=self._written)
+            # `written` shows a missing step.
+            self._writer.add_message(channel, message.log_time, message.data, message.time, sequence=self._written)
         _flush(self._writer)
+        self._places.append(place)
 
     def _channel(self, topic: str, schema: str | type[Message]) -> int:
         if topic not in self._channels:
             encoding = MessageEncoding.JSON if isinstance(schema, str) else MessageEncoding.Protobuf
             self._channels[topic] = self._writer.register_channel(topic, encoding, self._schema(schema))
+            self._topics[self._channels[topic]] = topic
         return self._channels[topic]
 
     def _schema(self, schema: str | type[Message]) -> int:
@@ -186,9 +198,10 @@ def _start(file: BinaryIO, meta: EpisodeMeta) -> Writer:
     writer = Writer(file, chunk_size=_ONE_CHUNK, compression=CompressionType.NONE)
     writer.start(library=f"tacsim episode {FORMAT}")
     writer.add_metadata(META, encode_meta(meta))
+    start = 0 if meta.started is None else max(round(meta.started.timestamp() * 1e9), 0)
     for name, content in meta.attachments.items():
         media = mimetypes.guess_type(name)[0] or "application/octet-stream"
-        writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media, data=content)
+        writer.add_attachment(create_time=start, log_time=start, name=name, media_type=media, data=content)
     _flush(writer)
     return writer
 

@@ -3,46 +3,55 @@ were hit), and by its normalisers how trustworthy the observations are."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from tacsim.record.episode import Episode
+from tacsim.interface import FloatArray
+from tacsim.report.series import ALIGNMENT, BACKGROUND, BEYOND, DRIFT, KEPT, LIMITS, LOST, STALE, Series
 
-ALIGNMENT, LIMITS = "alignment_", "limits_hit_"  # keys of Step.info, before an arm's name
-# Keys of Step.info, before a sensor's name
-STALE = "stale_"  # 1: the reference does not fit any more
-DRIFT = "drift_"  # change of the untouched gel's colour since the reference [-]
-BACKGROUND = "background_"  # mean slope that a drift of the light would look like [degrees]
-BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrated slopes
-KEPT = "kept_"  # share of the markers that were seen
 MUCH_BEYOND, FEW_KEPT = 0.01, 0.8  # a warning is given above, and below
 
 
-def timing(episode: Episode) -> dict[str, Any] | None:
+def timing(series: Series) -> dict[str, Any] | None:
     """Median, 99th percentile and largest of the period and each picture's age [s]; time from each arm's state to the
-    nearest package [s]; how often limits shortened or refused a target of each arm; simulated time over wall time.
+    nearest package [s]; how often limits shortened or refused a target of each arm; packages of each arm that are
+    missing where they are recorded; simulated time over wall time.
 
     None for an episode that was not live.
     """
-    done = [step for step in episode.steps if step.index > 0]
-    arms = [name.removeprefix(ALIGNMENT) for name in (done[0].info if done else {}) if name.startswith(ALIGNMENT)]
+    done = series.after_reset()
+    arms = _named(done, ALIGNMENT)
     if len(done) < 2 or not arms:
         return None
-    periods = np.diff([step.time for step in done])
-    ages = {name: [step.time - step.frames[name].time for step in done] for name in done[0].frames}
+    periods = np.diff(done.time)
     return {
         "period": _spread(periods),
-        "asked_period": episode.meta.spec.period,
-        "age": {name: _spread(values) for name, values in ages.items()},
-        "alignment": {name: _spread([step.info[ALIGNMENT + name] for step in done]) for name in arms},
-        "limits_hit": {name: int(done[-1].info.get(LIMITS + name, 0)) for name in arms},
-        "real_time_factor": float(episode.meta.spec.period / np.median(periods)),
+        "asked_period": done.meta.spec.period,
+        "age": {name: _spread(done.time - exposed) for name, exposed in done.exposed.items()},
+        "alignment": {name: _spread(values) for name, values in arms.items()},
+        "limits_hit": {name: _newest(done.info.get(LIMITS + name)) for name in arms},
+        "packages_lost": {name: _newest(values) for name, values in _named(done, LOST).items()},
+        "real_time_factor": float(done.meta.spec.period / np.median(periods)),
     }
 
 
-def _spread(values: Any) -> dict[str, float]:
-    median, p99, largest = (float(value) for value in np.percentile(values, [50, 99, 100]))
+def _named(series: Series, prefix: str) -> dict[str, FloatArray]:
+    """Columns of `info` whose keys begin so, by the rest of the key."""
+    return {key.removeprefix(prefix): each for key, each in series.info.items() if key.startswith(prefix)}
+
+
+def _newest(counted: FloatArray | None) -> int:
+    """The last of numbers that are counted on."""
+    if counted is None or not np.isfinite(counted).any():
+        return 0
+    return int(counted[np.isfinite(counted)][-1])
+
+
+def _spread(values: FloatArray) -> dict[str, float]:
+    known = values[np.isfinite(values)]
+    median, p99, largest = (float(value) for value in np.percentile(known if len(known) else [0.0], [50, 99, 100]))
     return {"median": median, "p99": p99, "max": largest}
 
 
@@ -53,39 +62,43 @@ def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
         f"{name} {1e3 * age['median']:.0f} (at most {1e3 * age['max']:.0f}) ms" for name, age in stats["age"].items()
     )
     off = max((spread["max"] for spread in stats["alignment"].values()), default=0.0)
-    hits = ", ".join(f"{name} {count}" for name, count in stats["limits_hit"].items())
-    return [
+    hits, lost = (
+        ", ".join(f"{name} {count}" for name, count in stats[key].items()) for key in ("limits_hit", "packages_lost")
+    )
+    rows = [
         ("period", f"median {period['median']:.3f}, p99 {period['p99']:.3f}, longest {period['max']:.3f} s"),
         ("real-time factor", f"{stats['real_time_factor']:.2f} (periods of {stats['asked_period']:g} s asked)"),
         ("age of pictures", ages or "–"),
         ("arm to picture", f"states at most {1e3 * off:.1f} ms from a package"),
         ("limits hit", hits or "–"),
     ]
+    return [*rows, ("arm packages lost", lost)] if lost else rows
 
 
-def trust(episode: Episode) -> dict[str, dict[str, Any]] | None:
+def trust(series: Series) -> dict[str, dict[str, Any]] | None:
     """By sensor: the number of steps with a stale reference, and the worst of the other values (None where unknown).
 
     None for an episode whose sensors know their surface by themselves.
     """
-    first = episode.steps[0].info if episode.steps else {}
-    sensors = [key.removeprefix(STALE) for key in first if key.startswith(STALE)]
-    if not sensors:
+    stale = _named(series, STALE)
+    if not stale:
         return None
 
-    def all_of(key: str) -> list[float]:
-        return [step.info[key] for step in episode.steps if key in step.info]
+    def worst(key: str, of: Callable[[FloatArray], float]) -> float | None:
+        values = series.info.get(key, np.array([]))
+        known = values[np.isfinite(values)]
+        return float(of(known)) if len(known) else None
 
     return {
         name: {
-            "stale": sum(bool(value) for value in all_of(STALE + name)),
-            "steps": len(all_of(STALE + name)),
-            "drift": max(all_of(DRIFT + name), default=None),
-            "background": max(all_of(BACKGROUND + name), default=None),
-            "beyond": max(all_of(BEYOND + name), default=None),
-            "kept": min(all_of(KEPT + name), default=None),
+            "stale": int(np.count_nonzero(np.nan_to_num(told))),
+            "steps": int(np.count_nonzero(~np.isnan(told))),
+            "drift": worst(DRIFT + name, np.max),
+            "background": worst(BACKGROUND + name, np.max),
+            "beyond": worst(BEYOND + name, np.max),
+            "kept": worst(KEPT + name, np.min),
         }
-        for name in sensors
+        for name, told in stale.items()
     }
 
 

@@ -5,73 +5,85 @@ from __future__ import annotations
 import base64
 import json
 import math
-import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from tacsim.interface import FloatArray
 from tacsim.record.episode import Episode
 from tacsim.report.diagnostics import timing, timing_rows, trust, trust_rows
+from tacsim.report.series import SETTLED, Series
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from tacsim.report.figure import Picture
+
 FILMSTRIP = 12  # frames a sensor in report.html
-THUMBNAIL = 320  # [px]
 
 
-def summary(episode: Episode) -> dict[str, Any]:
+def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[str, Any]:
     """An episode in numbers, as JSON; lists have one entry for each control step (none for the state after reset).
 
     `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
     `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.report.diagnostics; null unless the
-    rig is live), `trust` (the same; null if sensors know their surface). Unknown and infinite values are null.
+    rig is live), `trust` (the same; null if sensors know their surface), `started` (ISO date and time with its zone).
+    Unknown and infinite values are null.
     """
-    from tacsim.report.figure import contact_signals, normal_force, signal_against_force
+    from tacsim.report.figure import signal_against_force
 
-    meta, done = episode.meta, [step for step in episode.steps if step.index > 0]
-    signals = contact_signals(Episode(meta, done))
-    settled = [bool(step.info["settled"]) for step in done if "settled" in step.info]
+    meta, done = series.meta, series.after_reset()
+    settled = done.info.get(SETTLED)
+    force = {name: _numbers(values) for name, values in done.force.items()}
+    present = {name: ~np.isnan(values) for name, values in done.force.items()}
     return {
         "rig": meta.rig,
         "task": meta.task,
         "policy": meta.policy,
         "seed": meta.seed,
         "goal": list(meta.goal) if isinstance(meta.goal, tuple) else meta.goal,
+        "started": None if meta.started is None else meta.started.isoformat(timespec="milliseconds"),
         "steps": len(done),
-        "step": [step.index for step in done],
-        "reward": [_number(step.reward) for step in done],
-        "distance": [_number(step.distance) for step in done],
-        "force": [{name: _number(value) for name, value in normal_force(step).items()} for step in done],
-        "contact_signal": {name: [_number(value) for value in values] for name, values in signals.items()},
-        "correlation": {name: _number(pair[2]) for name, pair in signal_against_force(episode).items()},
-        "seconds_per_step": _number(statistics.median(step.seconds for step in done)) if done else None,
-        "seconds": [_number(step.seconds) for step in done],
-        "settled": sum(settled) if settled else None,
-        "timing": timing(episode),
-        "trust": trust(episode),
-        "complete": episode.complete,
-        "dropped": episode.dropped,
+        "step": done.index.tolist(),
+        "reward": _numbers(done.reward),
+        "distance": _numbers(done.distance),
+        "force": [{name: force[name][at] for name in force if present[name][at]} for at in range(len(done))],
+        "contact_signal": {name: _numbers(values) for name, values in done.signals.items()},
+        "correlation": {name: pair[2] for name, pair in signal_against_force(series).items()},
+        "seconds_per_step": _number(np.median(done.seconds)) if len(done) else None,
+        "seconds": _numbers(done.seconds),
+        "settled": None if settled is None else int(np.count_nonzero(np.nan_to_num(settled))),
+        "timing": timing(series),
+        "trust": trust(series),
+        "complete": complete,
+        "dropped": dropped,
         "versions": dict(meta.versions),
     }
 
 
 def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
-    """Writes `summary.json`, `report.png` and `report.html` into `directory`; returns their paths by name.
+    """Writes `summary.json`, `report.png` and `report.html` into `directory`; returns their paths by name. The steps of
+    a recording are read one by one, so that an episode of any length takes little memory.
 
-    Raises OSError when the directory can't be written, ValueError for an episode without steps.
+    Raises OSError when the directory can't be written, ValueError for an episode without steps, EpisodeError for a
+    recording that cannot be read.
     """
     from tacsim.report import figure
 
-    if not episode.steps:
+    if not len(episode.steps):
         raise ValueError("the episode has no steps, there is nothing to report; record at least the state after reset")
-    stats = summary(episode)
+    series = Series.of(episode)
+    stats = summary(series, complete=episode.complete, dropped=episode.dropped)
+    strips = {name: figure.pictures(episode, series, name, FILMSTRIP) for name in series.sensors}
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
     paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats, episode))
-    figure.save(figure.overview(episode, _title(stats), subtitle), paths["report.png"])
-    paths["report.html"].write_text(_html(episode, stats), encoding="utf-8")
+    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats))
+    few = {name: [each[k] for k in figure.moments(len(each), figure.COLUMNS)] for name, each in strips.items()}
+    figure.save(figure.overview(few, series, _title(stats), subtitle), paths["report.png"])
+    paths["report.html"].write_text(_html(series, stats, strips), encoding="utf-8")
     return paths
 
 
@@ -131,44 +143,52 @@ def _title(stats: Mapping[str, Any]) -> str:
     return f"{stats['task'] or 'episode'} on rig {stats['rig']}"
 
 
-def _headline(stats: Mapping[str, Any], episode: Episode) -> list[tuple[str, str]]:
+def _headline(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     from tacsim.report.figure import goal_text
 
-    return [
+    goal = stats["goal"]
+    lines = [
         ("policy", str(stats["policy"])),
         ("seed", str(stats["seed"])),
         ("steps", str(stats["steps"])),
-        ("goal", goal_text(episode.meta.goal)),
+        ("goal", goal_text(tuple(goal) if isinstance(goal, list) else goal)),
     ]
+    started = stats["started"]
+    return lines if started is None else [*lines, ("started", f"{started[:10]} {started[11:19]} {started[23:]}")]
 
 
 def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
+def _numbers(values: FloatArray) -> list[float | None]:
+    return [_number(value) for value in values.tolist()]
+
+
 def _inline(content: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
 
 
-def _html(episode: Episode, stats: Mapping[str, Any]) -> str:
+def _html(series: Series, stats: Mapping[str, Any], strips: Mapping[str, Sequence[Picture]]) -> str:
     from jinja2 import Environment, StrictUndefined
 
     from tacsim.report import figure
 
-    strips = []
-    for name in figure.sensors_of(episode):
-        seen = [step for step in episode.steps if name in step.frames]
-        shown = [seen[k] for k in figure.moments(len(seen), FILMSTRIP)]
-        images = [(step.index, _inline(figure.png(step.frames[name].image, THUMBNAIL))) for step in shown]
-        strips.append({"name": name, "frames": images, "total": len(seen)})
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8"))
     return template.render(
         title=_title(stats),
-        about=[("rig", stats["rig"]), ("task", stats["task"] or "–"), *_headline(stats, episode)],
+        about=[("rig", stats["rig"]), ("task", stats["task"] or "–"), *_headline(stats)],
         results=_results(stats),
         versions=sorted(stats["versions"].items()),
-        strips=strips,
-        plots=_inline(figure.png_of(figure.plots(episode))),
+        strips=[
+            {
+                "name": name,
+                "frames": [(picture.index, _inline(figure.png(picture.image))) for picture in pictures],
+                "total": len(series.seen(name)),
+            }
+            for name, pictures in strips.items()
+        ],
+        plots=_inline(figure.png_of(figure.plots(series))),
     )

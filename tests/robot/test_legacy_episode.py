@@ -10,6 +10,7 @@ import pytest
 from robot import open_rig
 from tacsim import Action, EndOfEpisode, read_episode, write_report
 from tacsim.report.report import summary
+from tacsim.report.series import Series
 
 EPISODE = Path(__file__).resolve().parent.parent / "fixtures/episode_0_1_0.mcap"
 
@@ -23,7 +24,7 @@ def test_an_earlier_episode_is_read_and_reported(tmp_path: Path) -> None:
     assert [step.distance for step in episode.steps] == pytest.approx(
         [0.979e-3, 0.904e-3, 0.829e-3, 0.711e-3], abs=1e-6
     )
-    stats = summary(episode)
+    stats = summary(Series.of(episode))
     assert stats["contact_signal"]["upper"] == pytest.approx([0.0407, 0.0741, 0.0933], abs=1e-4)
     assert stats["versions"]["tacsim"] == "0.1.0"
     assert all(path.stat().st_size for path in write_report(episode, tmp_path).values())

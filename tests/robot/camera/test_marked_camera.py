@@ -25,6 +25,7 @@ from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
 from tacsim.report.diagnostics import trust
 from tacsim.report.report import end_table, summary
+from tacsim.report.series import Series
 from tacsim.rig import Rig
 from tacsim.tasks.grip import Grip
 from tests.tacsim.optics.surfaces import dent, flat
@@ -123,11 +124,11 @@ def test_light_that_fades_is_recorded_and_reported(gel: Gel, rig: Rig, tmp_path:
         recorder=lambda meta: recorders.append(Recorder(tmp_path / "e.mcap", meta)) or recorders[0],  # type: ignore[func-returns-value]
     )  # fmt: skip
     recorders[0].close()
-    told = trust(read_episode(tmp_path / "e.mcap"))
-    assert told is not None and told == trust(episode)
+    told = trust(Series.of(read_episode(tmp_path / "e.mcap")))
+    assert told is not None and told == trust(Series.of(episode))
     assert 1 <= told["finger"]["stale"] < told["finger"]["steps"] == 7
     assert told["finger"]["drift"] == pytest.approx(0.2, abs=0.03)
-    shown = [str(cell) for cell in end_table(summary(episode), []).columns[1].cells]
+    shown = [str(cell) for cell in end_table(summary(Series.of(episode)), []).columns[1].cells]
     assert any(cell.startswith("finger: stale reference in") for cell in shown)
 
 

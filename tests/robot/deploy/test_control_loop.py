@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import gc
+import json
 import sys
+import time
+import weakref
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode, versions
 from robot.deploy.policy import FunctionPolicy, PolicyNotFound, load_policy
@@ -28,6 +34,8 @@ from tacsim.interface import (
 from tacsim.models.rig import SqueezeConfig
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_image
+from tacsim.record.reader import read_episode
+from tacsim.record.writer import Recorder as FileRecorder
 from tacsim.rig import Rig
 from tacsim.tasks import make_task
 from tacsim.tasks.grip import Grip
@@ -119,6 +127,9 @@ class Recorder:
         self.steps.append(step)
         return len(self.steps) != 2  # the second one is dropped
 
+    def flush(self) -> bool:
+        return True
+
 
 def test_exactly_so_many_steps_after_the_reset() -> None:
     hand = Hand()
@@ -154,7 +165,7 @@ def test_a_recording_that_can_go_on_no_more_ends_the_episode_with_the_arms_stopp
     hand = Hand()
     with pytest.raises(EpisodeFailed, match=r"after 2 of 40 steps: RecordingFailed: .* No space") as failed:
         run_episode(make_rig(hand), FunctionPolicy(lift), TASK, 40, recorder=FullDisk)
-    assert len(failed.value.episode.steps) == 3
+    assert len(failed.value.episode.steps) == 2  # what is recorded
     assert hand.stops > 0
 
 
@@ -187,6 +198,58 @@ def test_every_step_goes_to_the_recorder_with_meta_and_references() -> None:
     assert reference.max() == reference.min() == 207
     assert meta.versions == versions()
     assert {"python", "numpy"} <= set(meta.versions)
+
+
+def test_a_recorded_episode_keeps_no_picture_in_memory(tmp_path: Path) -> None:
+    """Of 200 steps only those that still wait for the disk may be there; each is read again when it is asked for."""
+    pictures: list[weakref.ref[Any]] = []
+    most = 0
+
+    def look(step: Step) -> None:
+        nonlocal most
+        pictures.append(weakref.ref(step.frames["lower"].image))
+        most = max(most, sum(picture() is not None for picture in pictures))
+
+    with ExitStack() as stack:
+        episode = run_episode(
+            make_rig(Hand()),
+            FunctionPolicy(lift),
+            TASK,
+            200,
+            recorder=lambda meta: stack.enter_context(FileRecorder(tmp_path / "e.mcap", meta, capacity=8)),
+            on_step=look,
+        )
+        assert episode.dropped == 0 or len(episode.steps) + episode.dropped == 201
+    assert most <= 8 + 4  # in the queue, in work, in the rig, at hand
+    gc.collect()
+    assert sum(picture() is not None for picture in pictures) <= 1  # the rig's last one
+    assert episode.steps[-1].index == 200 or episode.dropped
+    assert episode.steps[-1].frames["lower"].image.max() == episode.steps[-1].index
+
+
+def test_a_recording_tells_the_date_and_keeps_exact_times(tmp_path: Path) -> None:
+    before = time.time_ns()
+    with ExitStack() as stack:
+        run_episode(
+            make_rig(Hand()),
+            FunctionPolicy(lift),
+            TASK,
+            3,
+            recorder=lambda meta: stack.enter_context(FileRecorder(tmp_path / "e.mcap", meta)),
+        )
+    after = time.time_ns()
+    read = read_episode(tmp_path / "e.mcap")
+    assert [step.time for step in read.steps] == [k * Hand.period for k in range(4)]  # exact, on the rig's clock
+    assert read.meta.started is not None and read.meta.started.utcoffset() is not None
+    assert before / 1e9 - 1e-3 <= read.meta.started.timestamp() <= after / 1e9 + 1e-3
+    assert before <= read.meta.wall_offset <= after  # the rig's clock stood at 0
+    with (tmp_path / "e.mcap").open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(topics=["/step", "/lower/image"]):
+            k = json.loads(message.data)["index"] if channel.topic == "/step" else None
+            if k is not None:
+                assert message.log_time == message.publish_time == read.meta.wall_offset + k * 10**8
+            assert before <= message.log_time <= after + 3 * 10**8
+            assert before <= message.publish_time <= after + 3 * 10**8
 
 
 def test_a_rig_without_truth_is_not_judged() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
 
 import numpy as np
 import pytest
@@ -73,4 +74,6 @@ def meta() -> EpisodeMeta:
         versions={"tacsim": "0.1.0", "numpy": "2.4"},
         attachments={"rig.yaml": b"name: sim\n", "calibration/lower.npz": bytes(range(256)), "empty": b""},
         goal=(2e-3, 1 / 3),
+        started=datetime(2026, 3, 4, 5, 6, 7, 891234, timezone(timedelta(hours=-3, minutes=-30))),
+        wall_offset=1_772_610_000_123_456_789,
     )

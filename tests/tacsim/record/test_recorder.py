@@ -71,10 +71,10 @@ def test_a_full_queue_drops_whole_steps_and_counts_them(
     gate, busy = threading.Event(), threading.Event()
     encode = writer.encode_step
 
-    def slow(step: Step, pitch: float):  # type: ignore[no-untyped-def]
+    def slow(step: Step, pitch: float, offset: int):  # type: ignore[no-untyped-def]
         busy.set()
         assert gate.wait(10)
-        return encode(step, pitch)
+        return encode(step, pitch, offset)
 
     monkeypatch.setattr(writer, "encode_step", slow)
     with Recorder(tmp_path / "e.mcap", meta, capacity=2) as recorder:

@@ -141,14 +141,14 @@ def test_a_changed_digit_of_a_message_is_seen(small: Path, tmp_path: Path) -> No
 def test_a_step_is_not_completed_with_messages_of_another(
     tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def forgetful(step: Step, pitch: float) -> list[Encoded]:
-        return [m for m in encode_step(step, pitch) if step.index == 0 or m.topic != "/lower/image"]
+    def forgetful(step: Step, pitch: float, offset: int) -> list[Encoded]:
+        return [m for m in encode_step(step, pitch, offset) if step.index == 0 or m.topic != "/lower/image"]
 
     monkeypatch.setattr(writer, "encode_step", forgetful)
     with Recorder(tmp_path / "e.mcap", meta) as recorder:
         recorder.write(make_step(0))
         recorder.write(make_step(1))
-    with pytest.raises(EpisodeError, match=r"step number 1: a step names the message '/lower/image'"):
+    with pytest.raises(EpisodeError, match=r"step number 1: a step names the message '/lower/image', which is not"):
         read_episode(tmp_path / "e.mcap")
 
 
@@ -205,6 +205,13 @@ def hostile(make_step: Callable[..., Step]) -> tuple[bytes, dict[str, bytes]]:
     return messages.pop("/step"), messages
 
 
+def decoded(step: bytes, messages: dict[str, bytes]) -> Step:
+    """With all its frames."""
+    found = decode_step(step, {topic: [data] for topic, data in messages.items()})
+    dict(found.frames)
+    return found
+
+
 def test_a_huge_picture_is_refused_before_it_is_decoded(make_step: Callable[..., Step]) -> None:
     step, messages = hostile(make_step)
     image = CompressedImage.FromString(messages["/lower/image"])
@@ -213,7 +220,7 @@ def test_a_huge_picture_is_refused_before_it_is_decoded(make_step: Callable[...,
     header[29:33] = struct.pack(">I", zlib.crc32(bytes(header[12:29])))
     messages["/lower/image"] = CompressedImage(data=bytes(header), format="png").SerializeToString()
     with pytest.raises(EpisodeError, match=r"/lower/image: 5000 x 5000 pixels; .* at most 4096"):
-        decode_step(step, messages)
+        decoded(step, messages)
 
 
 @pytest.mark.parametrize(
@@ -230,9 +237,9 @@ def test_a_huge_picture_is_refused_before_it_is_decoded(make_step: Callable[...,
 )
 def test_hostile_content_is_refused(make_step: Callable[..., Step], topic: str, content: bytes) -> None:
     step, messages = hostile(make_step)
-    decode_step(step, messages)
+    decoded(step, messages)
     with pytest.raises(EpisodeError):
-        decode_step(step, {**messages, topic: content})
+        decoded(step, {**messages, topic: content})
 
 
 def test_a_step_without_its_messages_is_refused(make_step: Callable[..., Step]) -> None:
@@ -240,7 +247,7 @@ def test_a_step_without_its_messages_is_refused(make_step: Callable[..., Step]) 
     for topic in messages:
         rest = {name: data for name, data in messages.items() if name != topic}
         with pytest.raises(EpisodeError, match=topic):
-            decode_step(step, rest)
+            decoded(step, rest)
     for content in (b"", b"null", b"{}", b"\xff", step.replace(b'"index"', b'"inbex"'), b"1" * 10_000):
         with pytest.raises(EpisodeError):
-            decode_step(content, messages)
+            decoded(content, messages)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.report import figure
 from tacsim.report.figure4 import Moment, Trial, figure4
 from tacsim.report.report import end_table, summary, write_report
+from tacsim.report.series import Series
 
 STEPS = 8
 
@@ -38,6 +40,10 @@ def made_up(
     spec = RigSpec(carried, sensors if arms else (), truth=reward, period=0.1)
     meta = EpisodeMeta(rig, "squeeze", "scripted", 3, spec, {"tacsim": "0.1.0"}, goal=7e-3)
     return Episode(meta, [_step(k, sensors, arms, reward, width) for k in range(steps + 1)])
+
+
+def numbers(episode: Episode) -> dict[str, Any]:
+    return summary(Series.of(episode), complete=episode.complete, dropped=episode.dropped)
 
 
 def _step(k: int, sensors: tuple[str, ...], arms: bool, reward: bool, width: int) -> Step:
@@ -76,7 +82,7 @@ class Page(HTMLParser):
 
 
 def test_summary_has_an_entry_for_each_control_step_and_none_for_the_reset() -> None:
-    config = summary(made_up())
+    config = numbers(made_up())
     assert config["steps"] == STEPS
     for name in ("step", "reward", "distance", "force", "seconds"):
         assert len(config[name]) == STEPS, name
@@ -92,8 +98,10 @@ def test_summary_has_an_entry_for_each_control_step_and_none_for_the_reset() -> 
 
 def test_summary_is_valid_json_even_with_numbers_that_are_not() -> None:
     episode = made_up()
-    episode.steps[3] = replace(episode.steps[3], reward=float("nan"), distance=float("inf"))
-    config = json.loads(json.dumps(summary(episode), allow_nan=False))
+    steps = list(episode.steps)
+    steps[3] = replace(steps[3], reward=float("nan"), distance=float("inf"))
+    episode.steps = steps
+    config = json.loads(json.dumps(numbers(episode), allow_nan=False))
     assert config["reward"][2] is None
     assert config["distance"][2] is None
     assert config["reward"][1] is not None
@@ -101,17 +109,17 @@ def test_summary_is_valid_json_even_with_numbers_that_are_not() -> None:
 
 def test_step_numbers_survive_dropped_steps() -> None:
     episode = made_up()
-    del episode.steps[3]
+    episode.steps = [step for step in episode.steps if step.index != 3]
     text = shown(episode)
-    assert summary(episode)["step"] == [1, 2, 4, 5, 6, 7, 8]
+    assert numbers(episode)["step"] == [1, 2, 4, 5, 6, 7, 8]
     assert "0.100 mm at step 5" in text
 
 
 def test_correlation_is_undefined_when_nothing_changes() -> None:
     episode = made_up()
     episode.steps = [replace(step, info={"contact_signal_upper": 0.5}) for step in episode.steps]
-    assert summary(episode)["correlation"] == {"upper": None}
-    assert figure.signal_against_force(episode)["upper"][2] is None
+    assert numbers(episode)["correlation"] == {"upper": None}
+    assert figure.signal_against_force(Series.of(episode))["upper"][2] is None
 
 
 def test_report_of_two_sensors(tmp_path: Path) -> None:
@@ -164,7 +172,7 @@ def test_names_from_a_file_stay_text(tmp_path: Path) -> None:
 
 
 def test_a_reset_alone_can_be_reported_and_nothing_cannot(tmp_path: Path) -> None:
-    assert summary(made_up(steps=0))["seconds_per_step"] is None
+    assert numbers(made_up(steps=0))["seconds_per_step"] is None
     assert write_report(made_up(steps=0), tmp_path)["report.png"].exists()
     with pytest.raises(ValueError, match="no steps"):
         write_report(Episode(made_up().meta), tmp_path / "none")
@@ -183,11 +191,11 @@ def test_of_equal_steps_the_first_is_named() -> None:
     """A policy that holds at the goal repeats its best step; the table and both plots name the same one."""
     episode = made_up()
     held = [replace(episode.steps[5], index=k) for k in (6, 7, 8)]
-    episode.steps[6:] = held
+    episode.steps = [*episode.steps[:6], *held]
     text = shown(episode)
     assert "0.100 mm at step 5" in text
     assert "2.50 N (upper, step 5)" in text or "2.50 N (lower, step 5)" in text
-    dots = [line for axes in figure.plots(episode).axes for line in axes.lines if line.get_marker() == "o"]
+    dots = [line for axes in figure.plots(Series.of(episode)).axes for line in axes.lines if line.get_marker() == "o"]
     assert [list(line.get_xdata()) for line in dots] == [[5], [5]]  # of reward and of distance
 
 
@@ -202,8 +210,8 @@ def test_a_nearly_constant_force_is_not_cut_off() -> None:
     episode = made_up()
     wrench = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
     arms = {"upper": ArmState(Pose(), np.zeros(6), wrench, None, 0.0)}
-    episode.steps[:] = [replace(step, arms=arms) for step in episode.steps]
-    (force,) = (axes for axes in figure.plots(episode).axes if axes.get_ylabel() == "N")
+    episode.steps = [replace(step, arms=arms) for step in episode.steps]
+    (force,) = (axes for axes in figure.plots(Series.of(episode)).axes if axes.get_ylabel() == "N")
     assert force.get_ylim()[0] == 0.0
     assert force.get_ylim()[1] > 1.1
 
@@ -211,7 +219,7 @@ def test_a_nearly_constant_force_is_not_cut_off() -> None:
 def shown(episode: Episode) -> str:
     """The table at the end of a run as text."""
     console = Console(file=StringIO(), width=140)
-    console.print(end_table(summary(episode), [Path("report.html")]))
+    console.print(end_table(numbers(episode), [Path("report.html")]))
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -219,7 +227,7 @@ def test_thumbnails_are_averaged_not_cropped(tmp_path: Path) -> None:
     image = np.zeros((100, 700, 3), np.uint8)
     image[:, ::2] = 200
     path = tmp_path / "thumbnail.png"
-    path.write_bytes(figure.png(image, 320))
+    path.write_bytes(figure.png(figure.shrunk(image, 320)))
     small = imread(path)
     assert small.shape[:2] == (33, 233)
     assert abs(float(small[..., 0].mean()) * 255 - 100) < 2

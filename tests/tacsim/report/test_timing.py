@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.report.diagnostics import timing, timing_rows
+from tacsim.report.series import Series
 
 IMAGE = np.zeros((4, 4, 3), np.uint8)
 
@@ -29,8 +31,12 @@ def episode(times: list[float], age: float = 0.03, live: bool = True) -> Episode
     return Episode(EpisodeMeta("bench", None, "none", 0, spec, {}), steps)
 
 
+def told(given: Episode) -> dict[str, Any] | None:
+    return timing(Series.of(given))
+
+
 def test_period_age_alignment_and_limits() -> None:
-    config = timing(episode([50.0, 50.1, 50.2, 50.3, 50.7]))
+    config = told(episode([50.0, 50.1, 50.2, 50.3, 50.7]))
     assert config is not None
     assert config["period"]["median"] == pytest.approx(0.1)
     assert config["period"]["max"] == pytest.approx(0.4)
@@ -44,13 +50,13 @@ def test_period_age_alignment_and_limits() -> None:
 
 
 def test_a_slow_twin_shows_in_the_real_time_factor() -> None:
-    config = timing(episode([0.0, 0.4, 0.8, 1.2]))
+    config = told(episode([0.0, 0.4, 0.8, 1.2]))
     assert config is not None and config["real_time_factor"] == pytest.approx(0.25)
 
 
 def test_what_is_not_live_has_no_timing() -> None:
-    assert timing(episode([0.0, 0.1, 0.2], live=False)) is None
-    assert timing(replace_steps(episode([0.0, 0.1, 0.2]), 1)) is None
+    assert told(episode([0.0, 0.1, 0.2], live=False)) is None
+    assert told(replace_steps(episode([0.0, 0.1, 0.2]), 1)) is None
 
 
 def replace_steps(given: Episode, number: int) -> Episode:

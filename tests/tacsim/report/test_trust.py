@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder
 from tacsim.report.diagnostics import trust, trust_rows
 from tacsim.report.report import end_table, summary, write_report
+from tacsim.report.series import Series
 
 IMAGE = np.zeros((40, 40, 3), np.uint8)
 
@@ -33,12 +35,16 @@ def episode(*infos: dict[str, float]) -> Episode:
     return Episode(EpisodeMeta("bench", None, "none", 0, spec, {}), steps)
 
 
+def told(given: Episode) -> dict[str, dict[str, Any]] | None:
+    return trust(Series.of(given))
+
+
 FINE = {"stale_left_2": 0.0, "drift_left_2": 0.01, "background_left_2": 0.4, "beyond_left_2": 0.0, "kept_left_2": 1.0}
 BAD = {"stale_left_2": 1.0, "drift_left_2": 0.12, "background_left_2": 4.25, "beyond_left_2": 0.06, "kept_left_2": 0.5}
 
 
 def test_the_worst_of_an_episode_is_said() -> None:
-    config = trust(episode(FINE, BAD, FINE))
+    config = told(episode(FINE, BAD, FINE))
     assert config == {
         "left_2": {"stale": 1, "steps": 3, "drift": 0.12, "background": 4.25, "beyond": 0.06, "kept": 0.5}
     }
@@ -50,10 +56,10 @@ def test_the_worst_of_an_episode_is_said() -> None:
 
 
 def test_nothing_is_said_where_all_is_well_or_nothing_is_told() -> None:
-    config = trust(episode(FINE, FINE))
+    config = told(episode(FINE, FINE))
     assert config is not None and trust_rows(config) == []
-    assert trust(episode({}, {})) is None and trust(episode()) is None
-    blind = trust(episode({"stale_left_2": 1.0}))  # a sensor without slopes and markers
+    assert told(episode({}, {})) is None and told(episode()) is None
+    blind = told(episode({"stale_left_2": 1.0}))  # a sensor without slopes and markers
     assert blind is not None and blind["left_2"]["background"] is None
     assert [value.startswith("left_2: stale reference in 1 of 1") for _, value in trust_rows(blind)] == [True]
 
@@ -65,9 +71,9 @@ def test_it_survives_the_record_and_stands_in_the_report(infos, tmp_path: Path) 
         for step in made.steps:
             assert recorder.write(step)
     read = read_episode(tmp_path / "episode.mcap")
-    assert trust(read) == trust(made)
+    assert told(read) == told(made)
     paths = write_report(read, tmp_path / "report")
-    assert json.loads(paths["summary.json"].read_text())["trust"] == trust(made)
-    shown = [str(cell) for cell in end_table(summary(read), []).columns[1].cells]
+    assert json.loads(paths["summary.json"].read_text())["trust"] == told(made)
+    shown = [str(cell) for cell in end_table(summary(Series.of(read)), []).columns[1].cells]
     assert any("stale reference in 1 of 2" in cell for cell in shown) == (BAD in infos)
     assert ("stale reference in 1 of 2" in paths["report.html"].read_text()) == (BAD in infos)

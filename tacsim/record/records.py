@@ -1,0 +1,112 @@
+"""The records of an MCAP file in file order, finished or cut off.
+
+The readers of the `mcap` package need a finished file and trust the lengths in it. Here each length is checked
+against the size of the file before anything is read; `mcap` parses the records themselves.
+Format: https://mcap.dev/spec
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+
+from tacsim.record.episode import EpisodeError
+
+MAX_RECORD = 256 << 20  # [bytes]
+_HEAD = struct.Struct("<BQ")  # opcode, length
+_PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.METADATA: Metadata.read,
+}
+
+
+class _BadRecord(Exception):
+    """The readable part of the file ends here."""
+
+
+def check_magic(file: BinaryIO, what: str) -> None:
+    """Raises EpisodeError for a file that does not begin as MCAP files do."""
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise EpisodeError(f"{what}: not an MCAP file (it does not begin with the MCAP magic bytes)")
+
+
+def read_records(file: BinaryIO, size: int, what: str) -> Iterator[tuple[int, McapRecord]]:
+    """Records from where `file` stands to its end at `size` [bytes], chunks unpacked, without indexes and statistics;
+    each with the place of the outermost record that holds it.
+
+    Ends without an exception at the first record that is cut off or damaged. The last record is a Footer only if the
+    file was finished. Raises EpisodeError for compressed chunks.
+    """
+    try:
+        for place, record in _records(file, size - file.tell()):
+            if isinstance(record, Chunk):
+                for _, inner in open_chunk(record, what):
+                    yield place, inner
+            elif isinstance(record, Footer):
+                if file.read(len(MCAP0_MAGIC) + 1) == MCAP0_MAGIC:
+                    yield place, record
+                return
+            else:
+                yield place, record
+    except _BadRecord:
+        return
+
+
+def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+    """Parsed records of the next `size` bytes, each with its place."""
+    left = size
+    while left >= _HEAD.size:
+        place = stream.tell()
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            raise _BadRecord
+        opcode, length = _HEAD.unpack(head)
+        left -= _HEAD.size + length
+        if left < 0 or length > MAX_RECORD or opcode not in Opcode.__members__.values():
+            raise _BadRecord
+        body = stream.read(length)
+        if len(body) < length:
+            raise _BadRecord
+        record = _parse(opcode, body)
+        if record is not None:
+            yield place, record
+    if left:
+        raise _BadRecord
+
+
+def _parse(opcode: int, body: bytes) -> McapRecord | None:
+    """The record; None for kinds that episodes do not need. No read reaches beyond `body`."""
+    stream = ReadDataStream(io.BytesIO(body))
+    try:
+        if opcode == Opcode.MESSAGE:
+            message: McapRecord = Message.read(stream, len(body))
+            return message
+        if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]).to_bytes(4, "little") != body[-4:]:
+            raise _BadRecord
+        parse = _PARSERS.get(opcode)
+        return None if parse is None else parse(stream)
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError, ValueError) as failure:
+        raise _BadRecord from failure
+
+
+def open_chunk(chunk: Chunk, what: str) -> Iterator[tuple[int, McapRecord]]:
+    """The records in a chunk. Raises EpisodeError for a compressed one; ends the readable part where it is damaged."""
+    if chunk.compression in ("zstd", "lz4"):
+        raise EpisodeError(f"{what}: compressed chunks ({chunk.compression}); run 'mcap decompress' on it first")
+    if chunk.compression or zlib.crc32(chunk.data) != chunk.uncompressed_crc:
+        raise _BadRecord
+    yield from _records(io.BytesIO(chunk.data), len(chunk.data))

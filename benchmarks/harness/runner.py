@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.harness.machine import Run
 from benchmarks.harness.measure import Measurement, forget_peak_memory, peak_memory
 from benchmarks.harness.schema import Failure, Group, Missing, Report, Row
+from robot.common.process import end_with_parent, outside_working_folder
 
 EXIT = 10.0  # [s] a process may take to end after its last word
 
@@ -111,7 +112,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
         self._here, there = context.Pipe(duplex=False)
         self._process = context.Process(target=_work, args=(list(cases), repeat, there), daemon=True)
-        self._process.start()
+        with outside_working_folder():
+            self._process.start()
         there.close()
 
     def next(self, stop: Callable[[], bool]) -> list[Row] | str | None:
@@ -124,6 +126,8 @@ class _Worker:
             return found
         except EOFError:
             self._process.join(EXIT)
+            if stop():  # the signal was for all processes
+                raise Stopped("stopped before all cases were over") from None
             return None
 
     @property
@@ -159,6 +163,9 @@ def _run(
 
 def _work(cases: Sequence[Case], repeat: int, report: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    parent = multiprocessing.parent_process()
+    assert parent is not None and parent.pid is not None
+    end_with_parent(parent.pid)
     for case in cases:
         gc.collect()
         forget_peak_memory()

@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,7 +245,7 @@ class Parent:
 
         When the parent is gone, the process ends also in the middle of an answer, or where a copy of the parent (a fork
         of it) still holds the other end of standard input."""
-        threading.Thread(target=_end_without_parent, args=(os.getppid(),), daemon=True).start()
+        end_with_parent(os.getppid())
         while True:
             try:
                 request = read_message(sys.stdin.buffer)
@@ -256,10 +256,30 @@ class Parent:
                 self.send({"error": f"{type(failure).__name__}: {failure}"})
 
 
-def _end_without_parent(parent: int) -> NoReturn:
-    while os.getppid() == parent:
-        time.sleep(PARENT_CHECK)
-    os._exit(1)
+def end_with_parent(parent: int) -> None:
+    """From now on this process ends soon after its parent (process id), whatever it does."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_CHECK)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+@contextlib.contextmanager
+def outside_working_folder() -> Iterator[None]:
+    """Python processes that are started meanwhile do not execute a random.py or socket.py of the working folder: those
+    of multiprocessing have it before everything else on their path until they have that of their parent."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 def write_message(pipe: IO[bytes], message: dict[str, Any], arrays: Arrays | None = None) -> None:

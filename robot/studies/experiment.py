@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import queue
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from robot.common.process import end_with_parent, outside_working_folder, shielded
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth
 from tacsim.models.rig import RigConfig
@@ -64,22 +67,30 @@ def run_trials(
     Raises TrialFailed with the cause, Stopped.
     """
     context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
-    steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
     workers = min(len(wanted), os.cpu_count() or 1)
+    with outside_working_folder(), shielded():  # starts the process that removes its semaphores in the end
+        steps: multiprocessing.Queue[tuple[str, str]] = context.Queue()
     with ProcessPoolExecutor(workers, context, _start_worker, (steps,)) as pool:
-        running = {trial: pool.submit(_work, *trial) for trial in wanted}
-        while not all(future.done() for future in running.values()):
-            if stop():
-                for worker in multiprocessing.active_children():
-                    worker.terminate()
-                raise TrialsStopped("stopped before all trials were done")
-            try:
-                on_step(*steps.get(timeout=0.1))
-            except queue.Empty:
-                continue
+        try:
+            with outside_working_folder():
+                running = {trial: pool.submit(_work, *trial) for trial in wanted}
+            while not all(future.done() for future in running.values()):
+                if stop():
+                    raise TrialsStopped("stopped before all trials were done")
+                with contextlib.suppress(queue.Empty):
+                    on_step(*steps.get(timeout=0.1))
+        except BaseException:
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
     found: dict[tuple[str, str], Trial] = {}
     for trial, future in running.items():
-        result = future.result()
+        try:
+            result = future.result()
+        except BrokenProcessPool as failure:
+            if stop():  # the signal was for all processes
+                raise TrialsStopped("stopped before all trials were done") from failure
+            raise TrialFailed("a process of the trials was killed; is there memory enough for all?") from failure
         if isinstance(result, str):
             raise TrialFailed(f"{trial[0]} by physics '{trial[1]}' failed: {result}")
         found[trial] = result
@@ -93,6 +104,9 @@ def _start_worker(steps: multiprocessing.Queue[tuple[str, str]]) -> None:
     global _steps
     _steps = steps
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    parent = multiprocessing.parent_process()
+    assert parent is not None and parent.pid is not None
+    end_with_parent(parent.pid)
 
 
 def _work(task: str, physics: str) -> Trial | str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from robot.deploy.policy import PolicyNotFound, load_policy
 from robot.mock import MockCamera, MockUR
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.open import open_rig
+from robot.studies.experiment import TrialFailed, run_trials
 from tacsim.interface import RigSpec
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,9 +41,23 @@ def python(*words: str, path: str = str(ROOT)) -> subprocess.CompletedProcess[st
     return subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, timeout=120)
 
 
-def test_mocks_start_there() -> None:
+def test_mocks_start_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep)  # what `$PYTHONPATH:...` leaves: empty entries are the working folder
     with MockUR(mock_host(91)) as arm, MockCamera(mock_host(91)) as camera:
         assert arm.running and camera.running
+
+
+def test_the_processes_of_trials_start_there() -> None:
+    with pytest.raises(TrialFailed, match="failed: KeyError"):
+        run_trials([("no such task", "hybrid")])
+
+
+@pytest.mark.skipif(find_spec("benchmarks") is None, reason="only in the checkout")
+def test_the_processes_of_benchmarks_start_there() -> None:
+    from benchmarks.harness.runner import Case, run_cases
+
+    report = run_cases([Case("press", "raises", "tacsim", "none", json.loads)], 1, baselines=False, long=False)
+    assert "TypeError" in report.failures[0].cause
 
 
 @pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python and machine")

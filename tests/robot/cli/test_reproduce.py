@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -70,17 +71,22 @@ def test_a_trial_that_fails_in_its_own_process_says_why() -> None:
 
 @pytest.mark.deep
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for the processes in /proc")
-def test_a_signal_ends_the_reproduction_and_its_processes(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*START, "reproduce", "--out", "f"], env=environment(), stderr=subprocess.PIPE, text=True
-    )
+@pytest.mark.parametrize(
+    ("number", "to_group", "code"),
+    [(signal.SIGTERM, False, 143), (signal.SIGHUP, True, 129), (signal.SIGKILL, False, -signal.SIGKILL)],
+)
+def test_a_signal_ends_the_reproduction_and_its_processes(
+    tmp_path: Path, number: signal.Signals, to_group: bool, code: int
+) -> None:
+    words = [*START, "reproduce", "--out", "f"]
+    process = subprocess.Popen(words, env=environment(), stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
         children = _wait_for_children(process)
-        process.send_signal(signal.SIGTERM)
+        (os.killpg if to_group else os.kill)(process.pid, number)
         _, errors = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert process.returncode == 143, errors
+    assert process.returncode == code, errors
     assert "Traceback" not in errors
     assert not (tmp_path / "f").exists()
     end = time.monotonic() + 10

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from operator import attrgetter
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from tacsim import pose as se3
 from tacsim.interface import Pose
@@ -19,6 +20,7 @@ Vector = tuple[Length, Length, Length]
 Corner = tuple[float, float]
 
 SLOWEST_WATCHDOG = 10.0  # of a real arm [Hz]
+POLYSCOPE = r"[0-9]{1,9}(\.[0-9]{1,9}){1,3}"  # a version of it
 
 Model = Literal["ur3e", "ur5e", "ur10e"]
 
@@ -97,11 +99,18 @@ class MockArmConfig(Config):
     """A mock controller on loopback is started for this arm and stopped with the rig."""
 
     joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
-    # Of PolyScope, which the controller claims: "5.11", "5.11.0.108150"; None: a version that can do all this needs.
-    version: Annotated[str, Field(pattern=r"^[0-9]{1,9}(\.[0-9]{1,9}){1,3}$")] | None = None
+    # Of PolyScope, which the controller claims: "5.11", "5.11.0.108150". A text: YAML reads 5.10 without quotes as 5.1.
+    version: str | None = None
     # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
     # they share a busy machine with whatever else the mock rig needs.
     realtime: bool = False
+
+    @field_validator("version")
+    @classmethod
+    def _is_a_version(cls, version: str | None) -> str | None:
+        if version is not None and not re.fullmatch(POLYSCOPE, version):
+            raise ValueError(f"a version of PolyScope is a text such as '5.11' or '5.11.0.108150', got {version!r:.40}")
+        return version
 
 
 class UrArmConfig(Config):

@@ -14,6 +14,8 @@ from collections.abc import Callable
 import pytest
 
 from robot.mock import FaultError, MockArms, MockError, MockUR
+from robot.mock.cell.cell import MockCell
+from tacsim.config import ConfigError, load_rig
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, dashboard, wire_host
 
 
@@ -62,6 +64,21 @@ def test_two_arms_in_one_process_do_not_touch() -> None:
         arms.fault_clients[1].protective_stop()
         assert arms.fault_clients[0].state().safety == "NORMAL" and arms.fault_clients[0].state().program
         assert arms.fault_clients[1].state().rests and arms.fault_clients[1].state().safety == "PROTECTIVE_STOP"
+
+
+def test_a_rig_file_says_the_version() -> None:
+    place = [f"arms.{name}.host={wire_host(21 + number)}" for number, name in enumerate(("lower", "upper"))]
+    place += [
+        "arms.lower.start.position=[0, 0, 0]",
+        "arms.upper.start={position: [0, 0, 30 mm], rotation: [180 deg, 0, 0]}",
+    ]
+    config = load_rig("mock", overrides=[*place, "arms.upper.mock.version='5.23'"]).config
+    with MockCell(config.model_copy(update={"sensors": {}})) as cell:
+        versions = [dashboard(faults.host, "PolyscopeVersion")[0] for faults in cell.faults.values()]
+    assert [version.split()[1] for version in versions] == ["5.11.0.108150", "5.23.0.0"]
+    for wrong, words in (("5.10", "a text"), ("banana", "such as '5.11'"), ("'5'", "such as '5.11'")):
+        with pytest.raises(ConfigError, match=rf"arms.lower.mock.version: .*{words}"):
+            load_rig("mock", overrides=[f"arms.lower.mock.version={wrong}"])
 
 
 def test_a_port_in_use_is_named() -> None:

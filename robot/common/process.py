@@ -36,6 +36,7 @@ Message = tuple[dict[str, Any], Arrays]  # what is said, and the arrays with it
 LARGEST = 256 * 2**20  # of an array [bytes]
 LONGEST = 2**20  # of a line [bytes]
 PATIENCE = 1.0  # for a child that is asked to end; then it is killed [s]
+PARENT = "TACSIM_PARENT"  # variable of a child: the process id of its parent, which may be gone before it looks
 PARENT_CHECK = 0.2  # a child looks so often whether its parent is there [s]
 ENDING = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
 LAST_LINES = 5  # of a dead child's standard error, in errors
@@ -97,7 +98,7 @@ class Child(Closing):
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 start_new_session=True,
-                env={**os.environ, **(environment or {}), "PYTHONPATH": path},
+                env={**os.environ, **(environment or {}), "PYTHONPATH": path, PARENT: str(os.getpid())},
                 pass_fds=descriptors,
             )
         self.pid = self._process.pid
@@ -245,7 +246,7 @@ class Parent:
 
         When the parent is gone, the process ends also in the middle of an answer, or where a copy of the parent (a fork
         of it) still holds the other end of standard input."""
-        end_with_parent(os.getppid())
+        end_with_parent(int(os.environ[PARENT]))
         while True:
             try:
                 request = read_message(sys.stdin.buffer)

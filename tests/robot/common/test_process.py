@@ -236,7 +236,8 @@ time.sleep(600)
     [(signal.SIGKILL, "waits"), (signal.SIGTERM, "waits"), (signal.SIGHUP, "busy"), (signal.SIGKILL, "forked")],
 )
 def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state: str) -> None:
-    (tmp_path / "stand_in.py").write_text(STAND_IN.replace("act()", "time.sleep(600)"))
+    late = STAND_IN.replace("parent.serve", "time.sleep(0.2)\nparent.serve")  # by then its parent is gone
+    (tmp_path / "stand_in.py").write_text(late.replace("act()", "time.sleep(600)"))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
     words = [sys.executable, "-c", WAITING, state]
     with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment) as parent:

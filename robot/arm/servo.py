@@ -49,6 +49,7 @@ MAX_SINGULAR_VALUE_RATE = math.sqrt(12.0)
 RESTING, RESTING_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, rad/s]
 PUSHED_AWAY, PUSHED_AWAY_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
 LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
+ZERO_PATIENCE = 0.5  # a wish to zero the wrench that is older is dropped [s]
 
 
 class Servo:
@@ -60,8 +61,9 @@ class Servo:
         self.region = region(config.lower, config.upper, [(point, normal) for point, normal in config.planes])
         self.status = ArmStatus.CONNECTING  # until the first `check_faults`
         self.motion: MotionState | None = None  # of the servo target; None: nothing is sent and the controller holds
-        self.commands_read, self.rejected, self.shortened, self.zero_requested = commands_read, 0, 0, False
+        self.commands_read, self.rejected, self.shortened = commands_read, 0, 0
         self.close_requested = False
+        self._zero_asked = -math.inf  # when the wrench was to be zeroed [s]
         self._sent: FloatArray | None = None  # joints
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position (3,), rotation (3, 3)
         self._goal_time = -math.inf
@@ -91,6 +93,8 @@ class Servo:
                 measured.sensor[:3, 3], measured.sensor[:3, :3], measured.twist[:3], measured.twist[3:]
             )
             self._sent = measured.joints
+        if not self.status.is_fault:
+            self._zero_asked = -math.inf
         if not self.status.is_fault or status >= ArmStatus.PROGRAM_STOPPED:
             self.status = max(self.status, status)
         self._goal = None
@@ -135,6 +139,7 @@ class Servo:
         if command is None or number == self.commands_read:
             return
         self.commands_read, kind = number, int(command["kind"])
+        self._zero_asked = float(command["time"]) if kind == CommandKind.ZERO_WRENCH else -math.inf
         if kind == CommandKind.TARGET and not bool(finite_targets(command["pose"])):
             self.rejected += 1
             self._goal = None
@@ -149,7 +154,13 @@ class Servo:
         elif kind in (CommandKind.HOLD, CommandKind.CLOSE, CommandKind.ZERO_WRENCH):
             self._goal = None
             self.close_requested |= kind == CommandKind.CLOSE
-            self.zero_requested |= kind == CommandKind.ZERO_WRENCH
+
+    def zero_due(self, time: float) -> bool:
+        """True, once, if the wrench is to be zeroed: the newest command says so, a moment ago, and the target rests."""
+        due = self.resting and time - self._zero_asked <= ZERO_PATIENCE
+        if due:
+            self._zero_asked = -math.inf
+        return due
 
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""

@@ -212,7 +212,11 @@ class URArm(Closing):
             if not self.at_rest():
                 raise DeviceError(f"arm '{self.name}' moves; stop it before its wrench is zeroed")
             self._send(CommandKind.ZERO_WRENCH)
-            self._await(lambda: int(self._record()["zeroed"]) > before, 5.0, "its wrench was not zeroed")
+            try:
+                self._await(lambda: int(self._record()["zeroed"]) > before, 5.0, "its wrench was not zeroed")
+            except BaseException:
+                self._send(CommandKind.HOLD)  # nor later
+                raise
 
     def recover(self) -> None:
         """After a stop, a fault or a lost link: unlocks a protective stop and starts a new worker, which begins at the

@@ -230,11 +230,10 @@ class Worker:
                 alive = control.servoJ(joints.tolist(), 0.0, 0.0, PERIOD, config.lookahead, config.gain)
         if not alive:
             self._refused = 1
-        elif self.servo.zero_requested and self.servo.resting:
+        elif self.servo.zero_due(now):
             self._zero_wrench()
 
     def _zero_wrench(self) -> None:
-        self.servo.zero_requested = False
         self.record["busy_until"] = time.monotonic() + ZEROING
         self._publish(self.servo.status)
         with TimeLimit(ZEROING), self._lost_link():

@@ -26,7 +26,7 @@ from tacsim.models.hardware import ArmLimits, MockArmConfig, Payload, Placement,
 HOST, OTHER = (f"127.{net}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" for net in (23, 123))
 PATIENCE = 20.0  # for anything that has to happen [s]
 CARRIED = (0.4, 0.0, 0.0, 0.04)  # what a mock has on its flange: mass [kg], centre [m]
-SERVO = 11  # number of the servoJ command in the registers
+SERVO, ZERO = 11, 8  # numbers of the commands servoJ and zeroFtSensor in the registers
 STILL = 1e-3  # slower than this an arm stands [m/s]
 KINEMATICS = Kinematics("ur5e")
 TOOL_FROM_SENSOR = Placement(position=(0.01, 0.0, 0.05), rotation=(0.0, 0.0, 0.3))

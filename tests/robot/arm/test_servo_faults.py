@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, ArmStatus, Partner, tactile_record
-from robot.arm.servo import FAULT_DECELERATION, Servo
+from robot.arm.channel import STATE, ArmStatus, CommandKind, Partner, tactile_record
+from robot.arm.servo import FAULT_DECELERATION, ZERO_PATIENCE, Servo
 from robot.arm.shared_ring import Record
+from robot.arm.trajectory import PERIOD
 from tests.robot.arm.servo_bench import Bench, shifted, worker_config
 
 
@@ -205,3 +207,31 @@ def test_the_first_cause_is_kept_when_the_other_arm_stops_over_it(moving: bool) 
     bench.partners = [other(away, status=ArmStatus.PARTNER_STOPPED)]
     bench.run(50, force=(0.0, 0.0, 31.0, 0.0, 0.0, 0.0))
     assert bench.servo.status == ArmStatus.FORCE_LIMIT
+
+
+DROPS: dict[str, Callable[[Bench], None]] = {
+    "a newer target": lambda bench: bench.ask(shifted(bench.at, 0.01)),
+    "a stop": lambda bench: bench.ask(bench.at, CommandKind.HOLD),
+    "a fault": lambda bench: bench.servo.trip(ArmStatus.GEL_LIMIT, bench.now),
+    "a controller's stop": lambda bench: bench.servo.trip(ArmStatus.PROTECTIVE_STOP, None),
+    "time": lambda bench: bench.run(round(ZERO_PATIENCE / PERIOD) + 1),
+}
+
+
+@pytest.mark.parametrize("name", DROPS)
+def test_a_wish_to_zero_the_wrench_is_dropped_by_whatever_comes_between(name: str) -> None:
+    bench = Bench()
+    bench.ask(bench.at, CommandKind.ZERO_WRENCH)
+    DROPS[name](bench)
+    for _ in range(500):
+        bench.run(1)
+        assert not bench.servo.zero_due(bench.time)
+
+
+def test_the_wrench_is_zeroed_once_also_after_too_much_force() -> None:
+    bench = Bench()
+    bench.run(2, force=(0.0, 0.0, 40.0, 0.0, 0.0, 0.0))
+    assert bench.servo.status == ArmStatus.FORCE_LIMIT
+    bench.ask(bench.at, CommandKind.ZERO_WRENCH)
+    bench.run(1, force=(0.0, 0.0, 40.0, 0.0, 0.0, 0.0))
+    assert [bench.servo.zero_due(bench.time) for _ in range(3)] == [True, False, False]

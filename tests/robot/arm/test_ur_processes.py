@@ -24,12 +24,14 @@ from robot.common.process import Child
 from robot.errors import (
     DeviceAlreadyConnectedError,
     DeviceBusyError,
+    DeviceError,
     DeviceNotConnectedError,
 )
 from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import (
     PATIENCE,
+    ZERO,
     at_full_speed,
     check_path,
     config,
@@ -181,6 +183,20 @@ def test_a_signal_to_every_process_ends_with_a_ramp(mock: MockUR, program: str, 
         check_path(arm, sent)
     steps = np.linalg.norm(np.diff(sensor_path(arm, sent)[:, :3, 3], axis=0), axis=1) / PERIOD
     assert steps[-1] < 0.05 * given.limits.speed
+
+
+def test_a_zeroing_that_failed_does_not_happen_later(mock: MockUR) -> None:
+    with URArm(config(watchdog=0.2, link_timeout=0.5), "left") as arm:
+        assert arm._worker is not None
+        os.kill(arm._worker.pid, signal.SIGSTOP)
+        with pytest.raises(DeviceError, match=r"link_timeout|sends no packages"):
+            arm.zero_wrench()
+        mark = mock.faults.received().last
+        os.kill(arm._worker.pid, signal.SIGCONT)
+        until(lambda: arm.status() in (ArmStatus.HOLD, ArmStatus.WORKER_DEAD), "end of the stop")
+        time.sleep(0.2)
+        asked = [entry.values.get("input_int_register_0") for entry in mock.faults.received(mark).entries]
+        assert ZERO not in asked
 
 
 # -- one commander ---------------------------------------------------------------------------------------------------

@@ -8,12 +8,10 @@ import os
 import signal
 import socket
 import struct
-import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from robot.mock import FaultClient, FaultError, MockArms
@@ -22,49 +20,16 @@ from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.controller import Controller
 from robot.mock.ur.wire.inputs import Inputs
 from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, package
+from tests.robot.mock.innocent import Innocent, until
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, wire_host
 
 SET_TCP, MOVE_J, MOVE_L, SOLVE, MOVE_PATH = 29, 1, 3, 46, 45
-
-
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not done():
-        assert time.monotonic() < deadline, f"never: {what}"
-        time.sleep(0.005)
 
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[MockArms]:
     with MockArms([wire_host(90), wire_host(91)], ready_timeout=60) as arms:
         yield arms
-
-
-class Innocent:
-    """A client at 500 Hz, in a thread. Every package must reach it."""
-
-    def __init__(self, host: str) -> None:
-        self.times: list[float] = []
-        self._client = RtdeClient(host)
-        assert self._client.protocol() and self._client.outputs("timestamp")[0] == 1 and self._client.start()
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                self.times.append(self._client.receive()["timestamp"][0])
-
-    def check(self, faults: FaultClient) -> None:
-        """It still receives, and nothing was left out."""
-        end = faults.state().time
-        until(lambda: bool(self.times) and self.times[-1] >= end, "packages still arrive")
-        np.testing.assert_allclose(np.diff(self.times), 0.002, atol=1e-9)
-
-    def close(self) -> None:
-        self._client.socket.shutdown(socket.SHUT_RDWR)
-        self._thread.join(TIMEOUT)
-        self._client.socket.close()
 
 
 @pytest.fixture
@@ -221,5 +186,5 @@ def test_the_fault_client_tells_why_its_mock_has_ended() -> None:
     with MockArms([wire_host(92)], ready_timeout=60) as mock:
         mock.fault_clients[0].state()
         os.kill(mock.pid, signal.SIGKILL)
-        with pytest.raises(FaultError, match="has ended, exit status -9"):
+        with pytest.raises(FaultError, match="has ended, killed by SIGKILL"):
             mock.fault_clients[0].state()

@@ -22,7 +22,7 @@ from tacsim.control.load_controller import load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.report.series import ALIGNMENT, LIMITS
+from tacsim.report.series import ALIGNMENT, LIMITS, PICTURES_DAMAGED, PICTURES_LOST, PICTURES_REPEATED
 from tacsim.rig import Rig
 
 Confirm = Callable[[str], bool]
@@ -117,6 +117,8 @@ def open_hardware(
             values = {**cell.diagnostics(), **clock.diagnostics()}
             for name, arm in arms.items():
                 values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
+            for name, camera in cameras.items():
+                values |= camera_counts(name, camera)
             return values
 
         rig = Rig(
@@ -225,6 +227,13 @@ def _normaliser(name: str, config: object, rig: RigConfig) -> FrameNormaliser:
         return camera_normaliser(name, config, rig)
     assert isinstance(config, SimSensorConfig) and rig.scene is not None
     return normaliser_for_simulation(config.model, rig.scene.gel.size[:2], rig.canonical)
+
+
+def camera_counts(name: str, camera: Camera) -> dict[str, float]:
+    """The frames of a camera that gave no picture, by their keys in a record."""
+    status = camera.status
+    counts = {PICTURES_LOST: status.dropped, PICTURES_DAMAGED: status.damaged, PICTURES_REPEATED: status.repeated}
+    return {key + name: float(count) for key, count in counts.items()}
 
 
 def camera_normaliser(name: str, config: CameraSensorConfig, rig: RigConfig) -> FrameNormaliser:

@@ -9,15 +9,30 @@ from typing import Any
 import numpy as np
 
 from tacsim.interface import FloatArray
-from tacsim.report.series import ALIGNMENT, BACKGROUND, BEYOND, DRIFT, KEPT, LIMITS, LOST, STALE, Series
+from tacsim.report.series import (
+    ALIGNMENT,
+    BACKGROUND,
+    BEYOND,
+    DRIFT,
+    KEPT,
+    LIMITS,
+    LOST,
+    PICTURES_DAMAGED,
+    PICTURES_LOST,
+    PICTURES_REPEATED,
+    STALE,
+    Series,
+)
 
+PICTURES = {"lost": PICTURES_LOST, "damaged": PICTURES_DAMAGED, "shown again": PICTURES_REPEATED}
 MUCH_BEYOND, FEW_KEPT = 0.01, 0.8  # a warning is given above, and below
 
 
 def timing(series: Series) -> dict[str, Any] | None:
     """Median, 99th percentile and largest of the period and each picture's age [s]; time from each arm's state to the
     nearest package [s]; how often limits shortened or refused a target of each arm; packages of each arm that are
-    missing where they are recorded; simulated time over wall time.
+    missing where they are recorded; frames of each camera that were lost, damaged, or showed a picture again; simulated
+    time over wall time.
 
     None for an episode that was not live.
     """
@@ -33,6 +48,10 @@ def timing(series: Series) -> dict[str, Any] | None:
         "alignment": {name: _spread(values) for name, values in arms.items()},
         "limits_hit": {name: _newest(done.info.get(LIMITS + name)) for name in arms},
         "packages_lost": {name: _newest(values) for name, values in _named(done, LOST).items()},
+        "pictures": {
+            word: {name: _newest(values) for name, values in _named(done, key).items()}
+            for word, key in PICTURES.items()
+        },
         "real_time_factor": float(done.meta.spec.period / np.median(periods)),
     }
 
@@ -72,7 +91,12 @@ def timing_rows(stats: dict[str, Any]) -> list[tuple[str, str]]:
         ("arm to picture", f"states at most {1e3 * off:.1f} ms from a package"),
         ("limits hit", hits or "–"),
     ]
-    return [*rows, ("arm packages lost", lost)] if lost else rows
+    if lost:
+        rows.append(("arm packages lost", lost))
+    for word, counts in stats["pictures"].items():
+        if any(counts.values()):
+            rows.append((f"pictures {word}", ", ".join(f"{name} {count}" for name, count in counts.items())))
+    return rows
 
 
 def trust(series: Series) -> dict[str, dict[str, Any]] | None:

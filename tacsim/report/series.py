@@ -17,6 +17,9 @@ ALIGNMENT = "alignment_"  # time from its state to the nearest package [s]
 LIMITS = "limits_hit_"  # targets that were shortened or refused so far
 LOST = "packages_lost_"  # packages of its controller that are missing in the recording so far
 # Keys of Step.info, before a sensor's name
+PICTURES_LOST = "pictures_lost_"  # frames of its camera that never arrived, so far
+PICTURES_DAMAGED = "pictures_damaged_"  # frames that could not be read, so far
+PICTURES_REPEATED = "pictures_repeated_"  # frames that showed the picture of the one before again, so far
 SIGNAL = "contact_signal_"
 STALE = "stale_"  # 1: the reference does not fit any more
 DRIFT = "drift_"  # change of the untouched gel's colour since the reference [-]
@@ -25,7 +28,7 @@ BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrat
 KEPT = "kept_"  # share of the markers that were seen
 SETTLED = "settled"
 _OF_ARMS = (ALIGNMENT, LIMITS, LOST)
-_OF_SENSORS = (SIGNAL, STALE, DRIFT, BACKGROUND, BEYOND, KEPT)
+_OF_SENSORS = (SIGNAL, STALE, DRIFT, BACKGROUND, BEYOND, KEPT, PICTURES_LOST, PICTURES_DAMAGED, PICTURES_REPEATED)
 _OWN = ("time", "seconds", "reward", "distance")
 
 

@@ -160,15 +160,22 @@ def _refuses(arm: object, error: type[DeviceError]) -> bool:
     return False
 
 
-def test_a_camera_that_stalls_ends_the_episode(shared: Opened) -> None:
+@pytest.mark.parametrize(
+    ("fault", "why"), [("stall", ""), ("freeze", "has shown the same picture for"), ("cut", "a damaged picture")]
+)
+def test_a_camera_that_shows_nothing_new_ends_the_episode(shared: Opened, fault: str, why: str) -> None:
     camera = shared.cameras["right"]
+    set_fault = getattr(camera, fault)
     try:
-        failed = failing(shared.rig, lambda: camera.stall(True))
+        failed = failing(shared.rig, lambda: set_fault(True))
     finally:
-        camera.stall(False)
+        set_fault(False)
     assert isinstance(failed.__cause__, StaleFrame)
-    assert "sensor 'right'" in str(failed) and "ms old, limit 1000 ms" in str(failed)
+    assert "sensor 'right'" in str(failed) and "ms old, limit 1000 ms" in str(failed) and why in str(failed)
     assert len(failed.episode.steps) >= 3
+    if why:
+        told = shared.rig.diagnostics()
+        assert told["pictures_repeated_right" if fault == "freeze" else "pictures_damaged_right"] > 0
     shared.rig.reset()
 
 

@@ -13,6 +13,7 @@ from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.report.diagnostics import timing, timing_rows
 from tacsim.report.series import Series
 
+FRAMES = {"pictures_lost_lower": 0.0, "pictures_damaged_lower": 3.0}
 IMAGE = np.zeros((4, 4, 3), np.uint8)
 
 
@@ -24,7 +25,7 @@ def episode(times: list[float], age: float = 0.03, live: bool = True) -> Episode
             time=time,
             frames={"lower": TactileFrame(IMAGE, time - age, k)},
             arms={},
-            info={"alignment_left": 1e-3 * k, "limits_hit_left": float(2 * k)} if live else {},
+            info={"alignment_left": 1e-3 * k, "limits_hit_left": float(2 * k), **FRAMES} if live else {},
         )
         for k, time in enumerate(times)
     ]
@@ -47,6 +48,7 @@ def test_period_age_alignment_and_limits() -> None:
     words = dict(timing_rows(config))
     assert words["age of pictures"] == "lower 30 (at most 30) ms"
     assert "4.0 ms" in words["arm to picture"] and words["limits hit"] == "left 8"
+    assert words["pictures damaged"] == "lower 3" and "pictures lost" not in words
 
 
 def test_a_slow_twin_shows_in_the_real_time_factor() -> None:

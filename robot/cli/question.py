@@ -24,7 +24,7 @@ class NoAnswer(RuntimeError):
 
 def has_person() -> bool:
     """Whether questions can be read and answered: both go by the terminal."""
-    return sys.stdin.isatty() and sys.stderr.isatty()
+    return all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr))  # None: it was closed
 
 
 def ask(question: str, *, default: bool = False) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from robot.cli.question import ask
 from tests.robot.cli.invoked import environment, tacsim
 from tests.robot.cli.lab import copy_of
 from tests.robot.cli.terminal import Terminal
@@ -103,3 +104,8 @@ def test_a_question_that_nobody_could_read_is_not_asked(tmp_path: Path) -> None:
     os.close(outer)
     os.close(inner)
     assert done.stdout == "False\n", done
+
+
+def test_a_program_without_standard_input_has_nobody_to_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)  # started by `<&-`, or by a service
+    assert not ask("Is anybody there?")

@@ -114,6 +114,8 @@ STATE = np.dtype(
         ("stopping_point", np.float64, 3),  # where the sensor would come to rest if it braked now [m]
         ("target", np.float64, 3),  # position of the servo target [m]
         ("top_speed", np.float64),  # limits.speed [m/s]
+        ("runtime_state", np.int64),  # of the controller's program
+        ("safety_bits", np.int64),  # safety_status_bits of the controller
         ("status", np.int64),
         ("resting", np.int64),  # the servo target is at rest
         ("commands_read", np.int64),  # commands read so far

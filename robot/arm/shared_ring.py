@@ -69,12 +69,21 @@ class Ring:
 
     def recent(self, number: int) -> Record:
         """Copies of the newest records (n,), at most `number`, oldest first."""
+        count = self.count
+        return self._copies(count - number, count)
+
+    def since(self, number: int) -> tuple[int, Record]:
+        """The number of the newest record, and copies of those after `number` (counted from 1) that are still kept,
+        oldest first."""
+        count = self.count
+        return count, self._copies(number, count)
+
+    def _copies(self, after: int, last: int) -> Record:
+        """Copies of the records after number `after` up to number `last`, as far as they are kept."""
         slots = len(self._slots)
-        count = int(self._count[0])
-        first = max(0, count - min(number, slots - 1))
-        index = np.arange(first, count)
+        index = np.arange(max(0, after, last - (slots - 1)), last)
         copies = self._slots[index % slots]
-        whole = index > int(self._count[0]) - slots
+        whole = index > self.count - slots
         kept: Record = copies[whole].view(self._record)
         return kept
 

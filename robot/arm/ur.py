@@ -26,6 +26,7 @@ from robot.arm.channel import (
     tactile_record,
 )
 from robot.arm.dashboard import Dashboard
+from robot.arm.package_log import PackageLog
 from robot.arm.shared_ring import Record
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
@@ -136,6 +137,12 @@ class URArm(Closing):
     def history(self, number: int = HISTORY - 1) -> list[ArmState]:
         """The last packages, oldest first, at most `number` (two seconds are kept); also after a lost link."""
         return [self._state(record) for record in self._packages(number)]
+
+    def package_log(self) -> PackageLog:
+        """Every package from now on."""
+        if self._closed:
+            raise self._error(ArmStatus.CLOSED)
+        return PackageLog(self._channel.states)
 
     def at_rest(self) -> bool:
         """True if neither the servo target nor the arm itself moves."""

@@ -79,7 +79,6 @@ class Worker:
         self._last = 0.0  # when the last period ended
         self._rereads = 0  # of the same package
         self._refused = 0  # periods since the controller refused a command; 0: it did not
-        self._controller_bits = (0, 0)  # runtime_state, safety_status_bits
         self.state = self.frames.measure(self.record)
         self._publish(ArmStatus.CONNECTING)
 
@@ -263,11 +262,11 @@ class Worker:
         record["stamp"], record["time"] = stamp, time.monotonic()
         self.state = self.frames.measure(record)
         record["position"] = self.state.sensor[:3, 3]
-        self._controller_bits = bits
+        record["runtime_state"], record["safety_bits"] = bits
         return True
 
     def _controller_stop(self) -> ArmStatus | None:
-        runtime, bits = self._controller_bits
+        runtime, bits = int(self.record["runtime_state"]), int(self.record["safety_bits"])
         if bits & STOP_BITS:
             return ArmStatus.EMERGENCY_STOP
         if bits & PROTECTIVE_BIT:

@@ -15,6 +15,7 @@ from robot.deploy.policy import require_fit
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.record.episode import Episode, EpisodeMeta, Step
+from tacsim.report.series import LOST
 from tacsim.rig import Rig
 from tacsim.tasks import Task, judge
 
@@ -91,6 +92,7 @@ def run_episode(
     started = time.perf_counter()
     observation = rig.reset(setup.seed)
     start = rig.truth()
+    rig.packages()  # those of before are not of this episode
     meta = _meta(rig, task, setup)
     sink = None if recorder is None else recorder(meta)
     kept: list[Step] = []
@@ -170,6 +172,8 @@ def _step(
     """The record of what the rig delivered, with what the task says of it."""
     info = {f"contact_signal_{name}": contact_signal(touch) for name, touch in observation.tactile.items()}
     info |= rig.diagnostics()
+    packages = rig.packages()
+    info |= {f"{LOST}{name}": float(each.lost) for name, each in packages.items()}
     truth, outcome = rig.truth(), None
     if truth is not None and start is not None:
         moved = truth.position - start.position
@@ -186,5 +190,5 @@ def _step(
         distance=None if outcome is None else outcome.distance,
         info=info,
         seconds=seconds,
-        packages=rig.packages(),
+        packages=packages,
     )

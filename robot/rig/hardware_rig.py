@@ -121,6 +121,7 @@ def open_hardware(
                 values |= camera_counts(name, camera)
             return values
 
+        logs = {name: arm.driver.package_log() for name, arm in arms.items() if config.record.arm_packages}
         rig = Rig(
             name=config.name,
             sensors=sensors,
@@ -130,6 +131,7 @@ def open_hardware(
             reset=reset,
             truth=cell.truth if cell.knows_truth else None,
             diagnostics=diagnostics,
+            packages=lambda: {name: log.take() for name, log in logs.items()},
             on_close=cell.close,
             on_tactile=_gel_monitor(config, spec.sensors, arms),
             load_control=load_controller(config.task),

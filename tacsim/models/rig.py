@@ -94,6 +94,12 @@ TaskConfig = Annotated[SqueezeConfig | RepositionConfig, Field(discriminator="ki
 SimMotion = Literal["settled", "flowing", "dynamic"]
 
 
+class RecordConfig(Config):
+    """What a recording holds beyond pictures, states and actions."""
+
+    arm_packages: bool = False  # every package of the controllers of UR arms, as it came (500 Hz)
+
+
 class RigConfig(Config):
     """One rig file."""
 
@@ -113,6 +119,7 @@ class RigConfig(Config):
     contact: Literal["simulated", "hertz"] = "simulated"
     keep_out: tuple[KeepOut, ...] = Field(default=(), max_length=16)
     start: ResetConfig = ResetConfig()  # reset of rigs of hardware, real or mock
+    record: RecordConfig = RecordConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -122,6 +129,12 @@ class RigConfig(Config):
         for index, apart in enumerate(self.keep_out):
             for name in apart.arms:
                 self._require_arm(name, "keep_out", index, "arms")
+        if self.record.arm_packages and not any(isinstance(arm, UrArmConfig) for arm in self.arms.values()):
+            raise PydanticCustomError(
+                "no_packages",
+                "this rig has no UR arm, whose packages could be recorded; leave it out",
+                {"at": ("record", "arm_packages")},
+            )
         if isinstance(self.task, RepositionConfig):
             for name, load in self.task.loads.items():
                 self._check_load(name, load)

@@ -35,20 +35,21 @@ class ArmPackages:
     runtime_state: NDArray[np.int64]  # (n,) of the controller's program: 1 stopped, 2 playing, 4 paused
     safety_bits: NDArray[np.int64]  # (n,) safety_status_bits of the controller
     status: NDArray[np.int64]  # (n,) what the driver made of it: robot.ArmStatus
+    lost: int = 0  # packages missing among these, or between these and those of the step before
 
     @classmethod
-    def of(cls, columns: Mapping[str, Any] | NDArray[np.void]) -> Self:
+    def of(cls, columns: Mapping[str, Any] | NDArray[np.void], lost: int = 0) -> Self:
         """From sequences with the names of the fields, or a structured array."""
-        single = [np.array(columns[name], np.float64) for name in ("time", "stamp")]
-        vectors = [np.array(columns[name], np.float64).reshape(-1, 6) for name in _VECTORS]
-        whole = [np.array(columns[name], np.int64) for name in ("runtime_state", "safety_bits", "status")]
-        return cls(*single, *vectors, *whole)  # type: ignore[arg-type]  # mypy loses count of stars
+        arrays: dict[str, Any] = {name: np.array(columns[name], np.float64) for name in ("time", "stamp")}
+        arrays |= {name: np.array(columns[name], np.float64).reshape(-1, 6) for name in _VECTORS}
+        arrays |= {name: np.array(columns[name], np.int64) for name in ("runtime_state", "safety_bits", "status")}
+        return cls(**arrays, lost=lost)
 
 
 class Recorded(Mapping[str, T], Generic[T]):
     """Parts of a recorded step by name: each is decoded when it is asked for, and not kept.
 
-    known: by name, what the record says without decoding: exposure of a frame [s], number of an arm's packages.
+    known: by name, what the record says without decoding: exposure of a frame [s], number of an arm's packages lost.
     Raises EpisodeError, when a part is asked for, if it cannot be decoded.
     """
 

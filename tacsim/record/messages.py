@@ -26,6 +26,7 @@ from tacsim.record.schemas import (
     ArmMessage,
     FrameMessage,
     PackageMessage,
+    PackagesMessage,
     PoseMessage,
     StepMessage,
 )
@@ -96,7 +97,10 @@ def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]
         sent=_pose_messages(step.sent),
         frames={name: _frame_message(frame) for name, frame in step.frames.items()},
         arms=tuple(step.arms),
-        packages={name: len(packages.stamp) for name, packages in step.packages.items()},
+        packages={
+            name: PackagesMessage(count=len(packages.stamp), lost=packages.lost)
+            for name, packages in step.packages.items()
+        },
     )
     left_out = set() if record.packages else {"packages"}  # readers of before know no packages
     data = record.model_dump_json(exclude=left_out).encode()
@@ -133,7 +137,10 @@ def decode_step(
             distance=record.distance,
             info=record.info,
             seconds=record.seconds,
-            packages=Recorded(record.packages, partial(_decode_packages, record.packages, messages, what)),
+            packages=Recorded(
+                {name: each.lost for name, each in record.packages.items()},
+                partial(_decode_packages, record.packages, messages, what),
+            ),
         )
     except EpisodeError:
         raise
@@ -274,16 +281,16 @@ def _encode_packages(name: str, packages: ArmPackages, clock: _Clock) -> Iterato
         yield Encoded(f"/{name}/packages", PACKAGE_SCHEMA, time, time, record.model_dump_json().encode())
 
 
-def _decode_packages(numbers: Mapping[str, int], messages: Messages, what: str, name: str) -> ArmPackages:
-    there = messages.get(f"/{name}/packages", ())
-    if len(there) != numbers[name]:
-        raise EpisodeError(f"{what}: it names {numbers[name]} packages of arm '{name}', but {len(there)} are there")
+def _decode_packages(records: Mapping[str, PackagesMessage], messages: Messages, what: str, name: str) -> ArmPackages:
+    there, told = messages.get(f"/{name}/packages", ()), records[name]
+    if len(there) != told.count:
+        raise EpisodeError(f"{what}: it names {told.count} packages of arm '{name}', but {len(there)} are there")
     try:
         rows = [PackageMessage.model_validate_json(data) for data in there]
     except ValueError as failure:
         raise EpisodeError(f"{what}: a package of arm '{name}' cannot be decoded: {failure}") from failure
     columns = {field: [getattr(row, field) for row in rows] for field in PackageMessage.model_fields}
-    return ArmPackages.of(columns)
+    return ArmPackages.of(columns, told.lost)
 
 
 def _pose_messages(poses: Mapping[str, Pose | None]) -> dict[str, PoseMessage | None]:

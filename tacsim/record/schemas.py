@@ -66,6 +66,11 @@ class PackageMessage(_Message):
     status: int  # what the driver made of it: robot.ArmStatus
 
 
+class PackagesMessage(_Message):
+    count: int  # messages /{arm}/packages that belong to this step
+    lost: int  # packages of the controller that are missing among and before them
+
+
 class FrameMessage(_Message):
     time: float  # of exposure, rig clock [s]
     index: int
@@ -84,7 +89,7 @@ class StepMessage(_Message):
     sent: dict[str, PoseMessage | None]  # executed
     frames: dict[str, FrameMessage]  # by sensor
     arms: tuple[str, ...]
-    packages: dict[str, int] = {}  # how many messages /{arm}/packages belong to this step, by arm
+    packages: dict[str, PackagesMessage] = {}  # by arm
 
 
 JSON_SCHEMAS: Mapping[str, type[BaseModel]] = {

@@ -47,7 +47,7 @@ def timing(series: Series) -> dict[str, Any] | None:
         "age": {name: _spread(done.time - exposed) for name, exposed in done.exposed.items()},
         "alignment": {name: _spread(values) for name, values in arms.items()},
         "limits_hit": {name: _newest(done.info.get(LIMITS + name)) for name in arms},
-        "packages_lost": {name: _newest(values) for name, values in _named(done, LOST).items()},
+        "packages_lost": {name: int(np.nansum(values)) for name, values in _named(done, LOST).items()},
         "pictures": {
             word: {name: _newest(values) for name, values in _named(done, key).items()}
             for word, key in PICTURES.items()

@@ -15,7 +15,7 @@ from tacsim.record.episode import Episode, EpisodeMeta
 # Keys of Step.info, before an arm's name
 ALIGNMENT = "alignment_"  # time from its state to the nearest package [s]
 LIMITS = "limits_hit_"  # targets that were shortened or refused so far
-LOST = "packages_lost_"  # packages of its controller that are missing in the recording so far
+LOST = "packages_lost_"  # packages of its controller that are missing in this step
 # Keys of Step.info, before a sensor's name
 PICTURES_LOST = "pictures_lost_"  # frames of its camera that never arrived, so far
 PICTURES_DAMAGED = "pictures_damaged_"  # frames that could not be read, so far

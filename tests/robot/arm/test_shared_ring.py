@@ -52,6 +52,9 @@ def test_records_in_order_and_the_past_that_fits(segment: shared_ring.Segment) -
         assert newest is not None and newest["b"] == value
     assert ring.recent(100)["b"].tolist() == [14, 15, 16, 17, 18, 19, 20]  # the slot in danger is left out
     assert ring.recent(3)["b"].tolist() == [18, 19, 20]
+    assert ring.since(17)[0] == 20 and ring.since(17)[1]["b"].tolist() == [18, 19, 20]
+    assert ring.since(2)[1]["b"].tolist() == [14, 15, 16, 17, 18, 19, 20]
+    assert len(ring.since(20)[1]) == 0
 
 
 @pytest.mark.promise(10)

@@ -167,11 +167,12 @@ def test_an_arm_that_is_not_there_is_reported_at_the_sensor(folder: Path) -> Non
 
 OVERRIDES = {
     "scene.presett=draft": f"scene.presett: unknown key; allowed: {SCENE_KEYS}; did you mean 'preset'?",
-    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, sensors, canonical, motion, lock_step, contact, keep_out, start; did you mean 'scene'?",
+    "scne.preset=draft": "scne: unknown key; allowed: name, clock, period, task, scene, arms, sensors, canonical, motion, lock_step, contact, keep_out, start, record; did you mean 'scene'?",
     "scene.body.material=doh": "scene.body.material: no material 'doh'; allowed: cold-plasticine, dough, modelling-clay, seed, silicone, "
     "soft-clay; did you mean 'dough'?",
     "scene=missing.yaml": "scene: there is no file 'missing.yaml'",
     "period=3 mm": "period: '3 mm' is a length, not a time; allowed: a number [s], or a text with its unit (s, ms, us, min) such as '1.5 ms'",
+    "record.arm_packages=true": "record.arm_packages: this rig has no UR arm, whose packages could be recorded; leave it out",
     "name.x=1": "name.x: 'name' is 'sim', which has no keys",
     "sensors.upper.model.lighting.lights.3.colour=[1, 1, 1]": "sensors.upper.model.lighting.lights.3: no such entry; "
     "allowed: an index from 0 to 2",

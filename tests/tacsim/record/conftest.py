@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Action, ArmState, Pose, RigSpec, SensorSpec, SurfaceMap, TactileFrame
-from tacsim.record.episode import EpisodeMeta, Step
+from tacsim.record.episode import ArmPackages, EpisodeMeta, Step
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -25,7 +25,16 @@ def random_surface(rng: np.random.Generator, size: tuple[int, int], flow: bool) 
     )
 
 
-def random_step(index: int, image: tuple[int, int] = (24, 32), grid: tuple[int, int] = (6, 5)) -> Step:
+def random_packages(rng: np.random.Generator, count: int, time: float) -> ArmPackages:
+    times = {name: time - 2e-3 * rng.random(count) for name in ("time", "stamp")}
+    vectors = ("joints", "joint_speeds", "tcp_pose", "tcp_speed", "tcp_force")
+    whole = {name: rng.integers(0, 99, count) for name in ("runtime_state", "safety_bits", "status")}
+    return ArmPackages.of(times | {name: rng.normal(size=(count, 6)) for name in vectors} | whole, lost=count)
+
+
+def random_step(
+    index: int, image: tuple[int, int] = (24, 32), grid: tuple[int, int] = (6, 5), packages: bool = False
+) -> Step:
     """Sensor "lower" with everything, "upper" without flow, "side" without a surface; arms with and without joints."""
     rng = np.random.default_rng(index)
     time = 0.1 * index + 1 / 3
@@ -50,6 +59,7 @@ def random_step(index: int, image: tuple[int, int] = (24, 32), grid: tuple[int, 
         distance=None if index == 0 else float(rng.normal()),
         info={"residual": float(rng.normal()), "worst": float("nan"), "most": float("inf"), "hits": 1.0},
         seconds=float(rng.uniform()),
+        packages={"upper": random_packages(rng, 3 * index, time)} if packages else {},
     )
 
 

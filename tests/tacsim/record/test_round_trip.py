@@ -164,6 +164,21 @@ def test_a_picture_is_decoded_when_it_is_asked_for_and_not_kept(
     assert frame() is None
 
 
+def test_packages_of_an_arm_come_back_and_stand_at_their_own_times(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
+) -> None:
+    steps = [make_step(k, packages=True) for k in range(4)]  # 0, 3, 6, 9 packages
+    record(tmp_path / "e.mcap", meta, steps)
+    episode = read_episode(tmp_path / "e.mcap")
+    assert all(same(a, b) for a, b in zip(episode.steps, steps, strict=True))
+    assert [step.packages["upper"].lost for step in episode.steps] == [0, 3, 6, 9]
+    with (tmp_path / "e.mcap").open("rb") as file:
+        found = list(make_reader(file).iter_messages(topics=["/upper/packages"]))
+    times = np.sort(np.concatenate([step.packages["upper"].time for step in steps]))
+    assert [message.log_time for _, _, message in found] == [meta.wall_offset + round(1e9 * each) for each in times]
+    assert {schema.name for schema, _, _ in found if schema} == {"tacsim.ArmPackage"}
+
+
 def test_a_step_is_read_by_its_number(tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]) -> None:
     written = [make_step(k) for k in range(5)]
     record(tmp_path / "e.mcap", meta, written)

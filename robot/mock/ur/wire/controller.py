@@ -8,6 +8,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -34,6 +35,7 @@ PORTS = (RTDE, DASHBOARD, *SCRIPTS)
 MAX_CLIENTS = 256  # of one controller; more are closed at once
 MAX_PROGRAM, MAX_LINE = 1 << 20, 1 << 16  # a longer program or dashboard line cuts its client [bytes]
 BURST = 16  # packages or lines of one client that are served in one go; the others wait, and nothing more is read
+BOOT_AGAIN = 500  # control periods after which a restarted controller tries again to open its ports
 _PROGRAM_END = re.compile(rb"^end[ \t\r]*$", re.M)
 
 
@@ -85,18 +87,22 @@ class Controller:
     # -- life --------------------------------------------------------------------------------------------------------
 
     def listen(self) -> None:
-        """Opens the ports. Raises OSError that names host and port."""
+        """Opens the ports, all or none. Raises OSError that names host and port."""
         if self._listeners:
             return
-        for port in PORTS:
-            self._listeners.append(open_port(self.config.host, port))
-            self._register(self._listeners[-1], partial(self._accept, self._listeners[-1], port))
+        try:
+            for port in PORTS:
+                self._listeners.append(open_port(self.config.host, port))
+        except OSError:
+            self.refuse()
+            raise
+        for listener, port in zip(self._listeners, PORTS, strict=True):
+            self._watch(listener, partial(self._accept, listener, port))
 
     def refuse(self) -> None:
         """Closes the ports; who is connected stays."""
         for listener in self._listeners:
-            if not self.faults.black_hole:  # else it is not registered
-                self._selector.unregister(listener)
+            self._ignore(listener)
             listener.close()
         self._listeners.clear()
 
@@ -132,19 +138,11 @@ class Controller:
 
     def black_hole(self, on: bool) -> None:
         """Stops reading all sockets, which stay open, or begins again."""
-        if on == self.faults.black_hole:
-            return
         self.faults.black_hole = on
         for client in self.clients:
-            if on:
-                self._selector.unregister(client.socket)
-            else:
-                self._register(client.socket, partial(self._serve, client))
+            self._watch(client.socket, partial(self._serve, client))
         for listener in self._listeners:
-            if on:
-                self._selector.unregister(listener)
-            else:
-                self._register(listener, partial(self._accept, listener, listener.getsockname()[1]))
+            self._watch(listener, partial(self._accept, listener, listener.getsockname()[1]))
 
     # -- one control period ------------------------------------------------------------------------------------------
 
@@ -155,7 +153,12 @@ class Controller:
             if self.ticks < self._boot_at:
                 return
             self._boot_at = None
-            self.listen()
+            try:
+                self.listen()
+            except OSError as error:  # somebody else has taken a port meanwhile
+                self.machine.write_log(f"{error.strerror}; tried again in {BOOT_AGAIN * PERIOD:g} s")
+                self._boot_at = self.ticks + BOOT_AGAIN
+                return
         self.machine.tick()
         if not self.faults.black_hole:
             for client in list(self._behind):
@@ -204,8 +207,15 @@ class Controller:
 
     # -- sockets -----------------------------------------------------------------------------------------------------
 
-    def _register(self, sock: socket.socket, work: Callable[[], None]) -> None:
-        self._selector.register(sock, selectors.EVENT_READ, work)
+    def _watch(self, sock: socket.socket, work: Callable[[], None]) -> None:
+        """What arrives at the socket is worked on from now on, unless it falls into a black hole."""
+        self._ignore(sock)
+        if not self.faults.black_hole:
+            self._selector.register(sock, selectors.EVENT_READ, work)
+
+    def _ignore(self, sock: socket.socket) -> None:
+        with suppress(KeyError):  # it is ignored already
+            self._selector.unregister(sock)
 
     def _accept(self, listener: socket.socket, port: int) -> None:
         client = accept(listener, port)
@@ -219,7 +229,7 @@ class Controller:
         if port == RTDE:
             session = Session(lambda: self.machine, self._names_in_use, self._write)
         self.clients[client] = session
-        self._register(client.socket, partial(self._serve, client))
+        self._watch(client.socket, partial(self._serve, client))
         if port == DASHBOARD and not self.faults.dashboard_mute:
             client.send(dashboard.GREETING.encode() + b"\n", due=self._due())
 
@@ -227,8 +237,7 @@ class Controller:
         if client in self.clients:
             del self.clients[client]
             self._behind.discard(client)
-            if not self.faults.black_hole:
-                self._selector.unregister(client.socket)
+            self._ignore(client.socket)
             client.close(reset=reset)
 
     def _cut(self, client: Connection, error: Exception) -> None:

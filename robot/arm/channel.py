@@ -185,6 +185,7 @@ class WorkerConfig:
     lookahead: float
     gain: float
     partners: list[Partner]
+    serial: str | None = None  # of the robot; None: any
 
     @property
     def frames(self) -> ArmFrames:

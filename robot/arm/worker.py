@@ -117,10 +117,20 @@ class Worker:
                 ) from failure
             raise DeviceNotConnectedError(f"arm '{config.name}' at {config.host}: {failure}") from failure
         try:
-            self._check_model(lambda: matrix(self.control.getTCPOffset()), "model")
-            self._set("the watchdog", self.control.setWatchdog, config.watchdog)
-            self._set("the TCP", self.control.setTcp, config.tcp)
-            self._set("the payload", self.control.setPayload, config.mass, config.mass_centre)
+            self._set_up()
+        except BaseException:
+            with TimeLimit(ENDING), contextlib.suppress(RuntimeError):
+                self.control.stopScript()
+            raise
+
+    def _set_up(self) -> None:
+        """Changes what the controller keeps (TCP, payload) only when the model is known to be the right one."""
+        config, control = self.config, self.control
+        try:
+            self._check_model(lambda: matrix(control.getTCPOffset()), "model")
+            self._set("the watchdog", control.setWatchdog, config.watchdog)
+            self._set("the TCP", control.setTcp, config.tcp)
+            self._set("the payload", control.setPayload, config.mass, config.mass_centre)
             self._check_model(lambda: self.frames.flange_from_tool, "model and flange_from_tool")
         except RuntimeError as failure:
             if isinstance(failure, DeviceError):
@@ -131,9 +141,15 @@ class Worker:
 
     def _check_identity(self, dashboard: Dashboard) -> None:
         config = self.config
-        if dashboard.serial() == config.refused_serial:
+        serial = dashboard.serial()
+        if serial == config.refused_serial:
             raise DeviceNotConnectedError(
                 f"{config.host} is a mock controller, but arm '{config.name}' has no `mock:` block"
+            )
+        if config.serial not in (None, serial):
+            raise DeviceNotConnectedError(
+                f"the robot at {config.host} has the serial number {serial}, but the file of arm '{config.name}' says "
+                f"serial: {config.serial}; is it the right robot?"
             )
         model = dashboard.model()
         if model is not None and not config.model.startswith(model):

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,11 +16,12 @@ import pytest
 from robot.arm import shared_ring, worker
 from robot.arm.channel import ArmStatus, Channel, WorkerConfig
 from robot.arm.worker_config import worker_config as config_of
-from robot.mock import MockUR
+from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
 from tests.robot.arm.mocked import HOST, PATIENCE, until
 
 ROOT = Path(worker.__file__).parents[2]
+CHANGES = (29, 17, 35)  # numbers of the commands setTcp, setPayload, setWatchdog
 NOBODY = f"127.223.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 
 
@@ -35,9 +37,9 @@ def worker_config(segment: int, **changes: object) -> WorkerConfig:
     return dataclasses.replace(config_of(config, "left", segment, []), **changes)  # type: ignore[arg-type]
 
 
-def start(config: WorkerConfig) -> subprocess.CompletedProcess[str]:
+def start(config: WorkerConfig, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "robot.arm.worker"],
+        [sys.executable, *(words or ("-m", "robot.arm.worker"))],
         pass_fds=[config.segment],
         input=json.dumps(dataclasses.asdict(config)) + "\n",
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -122,3 +124,26 @@ def test_a_driver_that_died_while_it_connected_leaves_nothing(mock: MockUR) -> N
         _, errors = process.communicate(json.dumps(dataclasses.asdict(config)).encode() + b"\n", timeout=PATIENCE)
     assert (process.returncode, errors.decode()) == (0, "")
     until(lambda: not mock.faults.state().program, "end of the program")
+
+
+UNSEEN = "from robot.arm import worker; worker.Worker._check_identity = lambda *_: None; worker.main()"
+
+
+def test_an_arm_of_another_shape_is_left_as_it_was(mock: MockUR) -> None:
+    """Also where its dashboard does not say what it is."""
+    segment, before = shared_ring.create(Channel.SIZE), mock.faults.state().payload
+    given = worker_config(segment.descriptor, host=HOST, model="ur10e", mass=2.0, tcp=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    done = start(given, "-c", UNSEEN)
+    assert done.returncode == worker.FAILED
+    assert re.search(r"its tool is \d+ mm and .* from where a ur10e would have it; check model", done.stdout)
+    asked = {entry.values.get("input_int_register_0") for entry in mock.faults.received().entries}
+    assert asked & {*CHANGES} == set()
+    assert mock.faults.state().payload == before
+    assert not mock.faults.state().program  # its own was ended
+
+
+def test_a_pinned_serial_number_tells_one_robot_from_another(mock: MockUR) -> None:
+    segment = shared_ring.create(Channel.SIZE)
+    done = start(worker_config(segment.descriptor, host=HOST, serial="20225500001"))
+    assert f"has the serial number {MOCK_SERIAL}, but the file of arm 'left' says serial: 20225500001" in done.stdout
+    assert not mock.faults.received().entries

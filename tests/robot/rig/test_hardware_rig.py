@@ -161,7 +161,12 @@ def _refuses(arm: object, error: type[DeviceError]) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("fault", "why"), [("stall", ""), ("freeze", "has shown the same picture for"), ("cut", "a damaged picture")]
+    ("fault", "why"),
+    [
+        ("stall", ""),
+        pytest.param("freeze", "has shown the same picture for", marks=pytest.mark.deep),
+        pytest.param("cut", "a damaged picture", marks=pytest.mark.deep),
+    ],
 )
 def test_a_camera_that_shows_nothing_new_ends_the_episode(shared: Opened, fault: str, why: str) -> None:
     camera = shared.cameras["right"]

@@ -299,7 +299,7 @@ class Camera(Closing):
                 hint = "" if self._config.stamped else " (a source that may repeat itself says so: repeats: true)"
                 self._error = (
                     f"sensor '{self._name}': {self._config.source} has shown the same picture for {age:.1f} s: it has "
-                    f"frozen, or is covered or dark; look at the sensor and its light, restart the camera{hint}"
+                    f"frozen, or is covered, dark or overexposed; look at its light, restart the camera{hint}"
                 )
 
     def _count_lost(self, mark: strip.Stamp | None, exposure: float, clock: ClockSource) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 
@@ -74,6 +76,16 @@ def test_flipped_bytes_are_mostly_seen() -> None:
                 continue
             passed[count] += 1
     assert passed[1] <= 90 and passed[20] <= 20
+
+
+def test_no_bytes_are_an_error_of_another_kind() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        data = bytearray(WHOLE[: rng.integers(len(WHOLE))] if rng.random() < 0.3 else WHOLE)
+        for place in rng.integers(0, min(SCAN + 20, len(data)) or 1, rng.integers(1, 10)):
+            data[place : place + 1] = rng.bytes(1)
+        with suppress(DamagedFrame, WrongSource):
+            assert decode_jpeg(bytes(data), SIZE, "here").shape == (*SIZE, 3)
 
 
 def test_what_cameras_add_is_no_damage() -> None:

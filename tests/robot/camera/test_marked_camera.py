@@ -139,7 +139,7 @@ def test_a_frozen_camera_ends_the_episode(gel: Gel) -> None:
         rig.reset()
         gel.camera.freeze(True)
         try:
-            with pytest.raises(StaleFrame, match="'finger': .* has shown the same picture for"):
+            with pytest.raises(StaleFrame, match=r"'finger': .* has shown the same picture for"):
                 seen(rig, lambda touch: False)
         finally:
             gel.camera.freeze(False)

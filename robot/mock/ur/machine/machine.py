@@ -9,6 +9,7 @@ controller may only pause it).
 from __future__ import annotations
 
 import math
+import re
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -118,6 +119,7 @@ class Machine:
         self.force_mode: ForceMode | None = None
         self.watchdog: tuple[int, float] | None = None  # input_int_register, longest silence [s]
         self.watchdog_reset = 0  # tick at which its register was last written
+        self.script_errors: deque[str] = deque(maxlen=20)  # not yet told to those who listen
         self.stop_reason = ""  # why the last program ended
         self.stopped_at = -math.inf  # time of the last protective stop [s]
         self.unlock_delay = UNLOCK_DELAY
@@ -174,19 +176,16 @@ class Machine:
         if not self.operational:
             self.write_log(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
             return False
+        if re.search(r"^\s*def\s", text, re.M) is None:
+            self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
+            return False
+        self.stop("replaced by another program")
         try:
             program = Program(self, text)
         except ProgramError as error:
             self.stop_reason = f"not run: {error}"
             self.write_log(self.stop_reason)
-            return False
-        if program.kind != "def":
-            self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
-            return False
-        self.stop("replaced by another program")
-        if not program.known:
-            self.write_log(f"program '{program.name}' ended: the mock runs no URScript but ur_rtde's control script")
-            self.stop_reason = f"'{program.name}' is not ur_rtde's control script"
+            self.script_errors.append(f"compile_error:{error}")
             return False
         self.program, self.paused = program, False
         self.write_log(f"program '{program.name}' started")
@@ -304,6 +303,7 @@ class Machine:
             work()
         except ProgramError as error:
             self.stop(str(error))
+            self.script_errors.append(f"runtime_error:{error}")
         except Exception as error:  # what the mock did not foresee is the end of this program, not of the other arms
             traceback.print_exc()
             self.stop(f"error of the mock: {type(error).__name__}: {error}")

@@ -1,7 +1,7 @@
 """The register protocol: what ur_rtde's control script does when it runs on a controller.
 
-The text of the script is recognised, not interpreted: which registers it uses, which calls its `$version` lines left in
-it, and the path that was written into it. Its loop, its threads and its answers are done here and in
+The text of that script is recognised, not interpreted: which registers it uses, which calls its `$version` lines left
+in it, and the path that was written into it. Its loop, its threads and its answers are done here and in
 `motion_commands` and `state_commands`, by the numbers of ur_rtde 1.6.5.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot.common.kinematics import matrix
-from robot.mock.ur.machine import motion_commands, state_commands  # noqa: F401  # their functions enter COMMANDS
+from robot.mock.ur.machine import motion_commands, state_commands, user_script  # noqa: F401  # they enter COMMANDS
 from robot.mock.ur.machine.arm import Arm, MotionSteps, ProgramError
 from robot.mock.ur.machine.registry import COMMANDS, LARGEST
 from tacsim.interface import FloatArray
@@ -22,6 +22,7 @@ from tacsim.interface import FloatArray
 if TYPE_CHECKING:
     from robot.mock.ur.machine.machine import Machine
 
+CONTROL_SCRIPT = "rtde_control"
 READY, DONE = 1, 2  # answers in output_int_register_0
 STOP_SCRIPT = 255  # the command that ends the script
 LAST_OFFSET = 24  # of the registers: ur_rtde uses the 24 of each kind that begin at 0, or at 24
@@ -37,7 +38,6 @@ class Program:
         self.text = _of_version(text, machine.version)
         named = re.search(r"^[ \t]*(def|sec)[ \t]+(\w+)", self.text, re.M)
         self.kind, self.name = named.groups() if named else ("", "?")
-        self.known = self.name == "rtde_control"
         self.int_offset, self.float_offset = (self._offset(kind) for kind in ("int", "float"))
         self.threads: dict[str, MotionSteps] = {}
         self.calls: dict[str, Callable[[], MotionSteps]] = {}  # what a repeating thread does next
@@ -48,12 +48,12 @@ class Program:
         self.contact_steps = 0
         self.servo_target: tuple[tuple[float, ...], FloatArray] | None = None  # pose asked for, its joints
         self._writes = self._operation = 0  # of the asynchronous word
-        self._main = self._loop()
+        self._main = self._loop() if self.name == CONTROL_SCRIPT else user_script.run(self)
 
     def step(self) -> None:
         """Main program, then its threads. Raises ProgramError where the program ends with an error."""
         if not _go_on(self._main):
-            self.machine.stop("stopped by its client")
+            self.machine.stop("stopped by its client" if self.name == CONTROL_SCRIPT else "it has come to its end")
             return
         for name, thread in list(self.threads.items()):
             if self.threads.get(name) is thread and not _go_on(thread):

@@ -21,7 +21,7 @@ from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.load import NOTHING, Mass
 from robot.mock.ur.machine.machine import Machine
 from robot.mock.ur.machine.version import VERSION, Version
-from robot.mock.ur.wire import dashboard
+from robot.mock.ur.wire import dashboard, primary
 from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.fields import apply
 from robot.mock.ur.wire.inputs import Inputs
@@ -161,6 +161,7 @@ class Controller:
                 return
         self.machine.tick()
         if not self.faults.black_hole:
+            self._tell_script_errors()
             for client in list(self._behind):
                 self._serve(client)
             self._publish()
@@ -195,6 +196,13 @@ class Controller:
                     self._cut(client, error)
                 else:
                     self._stream(client, data)
+
+    def _tell_script_errors(self) -> None:
+        while self.machine.script_errors:
+            data = primary.runtime_exception(self.machine.time, self.machine.script_errors.popleft())
+            for client in self.clients:
+                if client.port in primary.PORTS:
+                    client.send(data, due=self._due())
 
     def _stream(self, client: Connection, data: bytes) -> None:
         sent, dropped = client.sent, client.dropped

@@ -281,11 +281,6 @@ def test_jog_in_tool_axes(bench: Bench) -> None:
     assert not bench.arm.target_qd.any()
 
 
-def test_other_programs_end_at_once_and_say_so(bench: Bench) -> None:
-    assert not bench.machine.start("def mine():\n  movej([0,0,0,0,0,0])\nend\n")
-    assert bench.machine.program is None and "mine" in bench.machine.stop_reason
-
-
 def test_what_is_no_program_disturbs_nobody(bench: Bench) -> None:
     assert not bench.machine.start("garbage\nend\n")
     assert not bench.machine.start("sec hello():\n  textmsg(1)\nend\n")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import subprocess
+import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -78,13 +80,19 @@ def servo(robot: Robot) -> None:
     robot.rest()
 
 
-@case(CONTROL, "servoC", Verdict.LIBRARY, "moves; the next call waits 4 s and is False: stop it by `stopScript`")
+@case(
+    CONTROL,
+    "servoC",
+    Verdict.LIBRARY,
+    "moves; the next call, whatever it is, waits 4 s and is False, the one after that works",
+)
 def servo_circle(robot: Robot) -> None:
     """The library sends it as if nothing were to be waited for, its script answers as if something were."""
     control, goal = robot.control, robot.shifted(0, 0, -0.02)
     assert control.servoC(goal, 0.25, 1.2)
     robot.until(lambda: abs(robot.receive.getActualTCPPose()[2] - goal[2]) < 1e-4)
     assert not control.servoStop() and robot.faults.state().program
+    assert control.servoStop()
 
 
 @case(CONTROL, "speedJ speedL speedStop jogStart jogStop")
@@ -287,6 +295,37 @@ def own_control_script(robot: Robot) -> None:
         control.setCustomScriptFile(str(path))
     robot.until(lambda: bool(control.isProgramRunning()))
     assert control.moveJ(HOME)
+
+
+@case(
+    CONTROL,
+    "sendCustomScript sendCustomScriptFunction sendCustomScriptFile",
+    Verdict.ROBOT,
+    "scripts that are lists of calls (below). Any other is refused in words, which the library does not read: it waits "
+    "its 600 s, as for a robot that cannot compile it, then False",
+)
+def custom_scripts(robot: Robot) -> None:
+    control, receive = robot.control, robot.receive
+    assert control.sendCustomScriptFunction("gripper", "set_tool_digital_out(0, True)\nsleep(0.1)")
+    robot.until(lambda: receive.getActualDigitalOutputBits() == 1 << 16)
+    goal = robot.shifted(0, 0, -0.05)
+    move = f"def mine():\n movel(p{goal}, a=1.2, v=0.25)\n write_output_integer_register(0, 2)\nend\n"
+    assert control.sendCustomScript(move)
+    robot.at(goal)
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "mine.script")
+        path.write_text('def mine():\n textmsg("hello")\n write_output_integer_register(0, 2)\nend\n', "utf-8")
+        assert control.sendCustomScriptFile(str(path))
+    assert any("hello" in str(line) for line in robot.faults.log())
+    assert control.moveJ(HOME)  # the control script is back
+    code = f"import rtde_control as c; c.RTDEControlInterface({robot.host!r}).sendCustomScriptFunction('f', 'x = 1')"
+    control.disconnect()
+    with subprocess.Popen([sys.executable, "-c", code]) as waiting:
+        try:
+            robot.until(lambda: "line 3: 'x = 1'" in robot.faults.state().stop_reason)
+            assert waiting.poll() is None
+        finally:
+            waiting.kill()
 
 
 # -- what the mock refuses -------------------------------------------------------------------------------------------

@@ -1,0 +1,195 @@
+"""Programs of a user: a list of calls with numbers in them, which are done one after the other.
+
+    def open_gripper():
+      set_tool_digital_out(0, True)
+      sleep(0.5)
+    end
+
+That is all: no variables, conditions, loops, threads or functions. Like a controller that cannot compile a program, the
+mock does nothing of one with any other line, and says which.
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+import re
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robot.common.kinematics import matrix
+from robot.mock.ur.machine import motion
+from robot.mock.ur.machine.arm import PERIOD, MotionSteps, ProgramError
+from robot.mock.ur.machine.load import Mass
+from robot.mock.ur.machine.registry import LARGEST
+from tacsim.interface import FloatArray
+
+if TYPE_CHECKING:
+    from robot.mock.ur.machine.script import Program
+
+LONGEST_LINE = 1000  # characters
+CALLS: dict[str, Callable[..., MotionSteps | None]] = {}
+_SUMS: dict[type, Callable[[float, float], float]] = {ast.Add: operator.add, ast.Sub: operator.sub}
+
+
+class Pose(tuple[float, ...]):
+    """p[...] of URScript; a list is joints."""
+
+
+def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
+    """The calls of a program: name and arguments. Raises ProgramError with the first line that is no such call."""
+    found = []
+    for number, line in enumerate(text.strip().splitlines(), start=1):
+        words = line.partition("#")[0].strip()
+        if not words or words == "end" or re.fullmatch(r"def\s+\w+\s*\(\s*\)\s*:", words):
+            continue
+        try:
+            if len(words) > LONGEST_LINE:
+                raise ValueError
+            call = ast.parse(words, mode="eval").body
+            if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id not in CALLS:
+                raise ValueError
+            named = {each.arg or "": _value(each.value) for each in call.keywords}
+            found.append((call.func.id, [_value(each) for each in call.args], named))
+        except (SyntaxError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
+            runs = f"the mock runs ur_rtde's control script, and lists of calls with numbers: {', '.join(CALLS)}"
+            raise ProgramError(f"line {number}: '{words[:80]}': {runs}") from None
+    return found
+
+
+def run(program: Program) -> MotionSteps:
+    """Does what the program says; raises ProgramError at once where it cannot be compiled."""
+    calls = compiled(program.text)
+
+    def steps() -> MotionSteps:
+        for name, arguments, named in calls:
+            try:
+                yield from CALLS[name](program, *arguments, **named) or ()
+            except (TypeError, ValueError, IndexError) as error:
+                raise ProgramError(f"{name}: {error}") from None
+
+    return steps()
+
+
+def _value(node: ast.expr) -> Any:
+    match node:
+        case ast.Constant(value=str() as text):
+            return text
+        case ast.List():
+            return [_number(each) for each in node.elts]
+        case ast.Subscript(value=ast.Name(id="p"), slice=ast.Tuple() as numbers):
+            return Pose(_number(each) for each in numbers.elts)
+    return _number(node)
+
+
+def _number(node: ast.expr) -> float:
+    match node:
+        case ast.Constant(value=bool() | int() | float() as value) if abs(value) <= LARGEST:
+            return value
+        case ast.UnaryOp(op=ast.USub()):
+            return -_number(node.operand)
+        case ast.BinOp() if type(node.op) in _SUMS:
+            return _SUMS[type(node.op)](_number(node.left), _number(node.right))
+    raise ValueError
+
+
+# -- calls -----------------------------------------------------------------------------------------------------------
+
+
+def _call(work: Callable[..., MotionSteps | None]) -> Callable[..., MotionSteps | None]:
+    CALLS[work.__name__] = work
+    return work
+
+
+def _six(values: list[float] | Pose) -> FloatArray:
+    if len(values) != 6:
+        raise ValueError(f"needs six numbers, got {len(values)}")
+    return np.array(values)
+
+
+@_call
+def movej(p: Program, to: list[float] | Pose, a: float = 1.4, v: float = 1.05) -> MotionSteps:
+    q = p.arm.solve(matrix(_six(to))) if isinstance(to, Pose) else _six(to)
+    return motion.movej(p.arm, q, float(a), float(v))
+
+
+@_call
+def movel(p: Program, to: list[float] | Pose, a: float = 1.2, v: float = 0.25) -> MotionSteps:
+    frame = matrix(_six(to)) if isinstance(to, Pose) else p.arm.kinematics.forward(_six(to), p.arm.tool)
+    return motion.movel(p.arm, frame, float(a), float(v))
+
+
+@_call
+def stopj(p: Program, a: float) -> MotionSteps:
+    return motion.stopj(p.arm, float(a))
+
+
+@_call
+def stopl(p: Program, a: float) -> MotionSteps:
+    return motion.stopl(p.arm, float(a))
+
+
+@_call
+def sleep(p: Program, t: float) -> Iterator[None]:
+    for _ in range(round(float(t) / PERIOD)):
+        yield
+
+
+@_call
+def sync(p: Program) -> Iterator[None]:
+    yield
+
+
+@_call
+def textmsg(p: Program, *said: object) -> None:
+    p.machine.write_log("textmsg: " + "".join(map(str, said)))
+
+
+@_call
+def zero_ftsensor(p: Program) -> None:
+    p.machine.load.zero(p.arm)
+
+
+@_call
+def set_tcp(p: Program, pose: Pose) -> None:
+    p.arm.tool = matrix(_six(pose))
+    p.arm.update()
+
+
+@_call
+def set_payload(p: Program, m: float, cog: list[float] | None = None) -> None:
+    if m < 0:
+        raise ValueError(f"mass {m:g} kg")
+    p.machine.load.told = Mass.of([m, *(p.machine.load.told.centre if cog is None else cog)])
+
+
+def _set_output(first: int, count: int) -> Callable[[Program, int, bool], None]:
+    def work(p: Program, n: int, b: bool) -> None:
+        if not 0 <= int(n) < count:
+            raise ValueError(f"output {n} is not within 0 and {count - 1}")
+        bit, outputs = 1 << (first + int(n)), p.machine.outputs
+        outputs.digital = outputs.digital | bit if b else outputs.digital & ~bit
+
+    return work
+
+
+for _kind, _first, _count in (("standard", 0, 8), ("configurable", 8, 8), ("tool", 16, 2)):
+    CALLS[f"set_{_kind}_digital_out"] = _set_output(_first, _count)
+
+
+@_call
+def write_output_integer_register(p: Program, address: int, value: int) -> None:
+    p.machine.out_int[_register(p, address)] = int(value)
+
+
+@_call
+def write_output_float_register(p: Program, address: int, value: float) -> None:
+    p.machine.out_double[_register(p, address)] = float(value)
+
+
+def _register(p: Program, address: int) -> int:
+    if not 0 <= int(address) < len(p.machine.out_int):
+        raise ValueError(f"no register {address}")
+    return int(address)

@@ -30,6 +30,7 @@ def open_rig(
     confirm: Callable[[str], bool] | None = None,
     dry_run: bool = False,
     check: Callable[[RigSpec], None] | None = None,
+    tell: Callable[[str], None] = lambda words: None,
 ) -> Rig:
     """Opens a rig by its name ("sim", "mock", "ur5e", "replay"), the path of its file, or a loaded configuration.
 
@@ -40,6 +41,7 @@ def open_rig(
         confirm: asks a person a question and returns the answer; real arms approach nothing without a yes.
         dry_run: a rig of hardware does everything but move.
         check: is told what the rig delivers, before anything of its hardware is opened; raises to refuse it.
+        tell: is told, again and again, what the arms of hardware are doing at a reset, in a few words.
 
     Raises:
         ConfigError: the file is wrong.
@@ -59,7 +61,7 @@ def open_rig(
     if config.clock == "wall":  # each kind loads what it needs and no more
         from robot.rig.hardware_rig import open_hardware
 
-        return open_hardware(config, confirm, dry_run=dry_run, check=check)
+        return open_hardware(config, confirm, dry_run=dry_run, check=check, tell=tell)
     if config.clock == "sim":
         from robot.rig.sim_rig import open_sim
 

@@ -102,23 +102,44 @@ def progress() -> Iterator[Progress]:
         yield bar
 
 
+class Bar:
+    """One row of a progress bar."""
+
+    def __init__(self, bar: Progress, words: str) -> None:
+        self._bar, self._row = bar, bar.add_task(words, total=None)
+
+    def say(self, words: str) -> None:
+        """What is being done."""
+        self._bar.update(self._row, description=escaped(words))
+
+    def count(self, done: int, total: int | None) -> None:
+        """How many steps are done, and of how many; None: nobody knows."""
+        self._bar.update(self._row, completed=done, total=total)
+
+
+@contextmanager
+def one_bar(words: str) -> Iterator[Bar]:
+    """A progress bar of one row."""
+    with progress() as bar:
+        yield Bar(bar, words)
+
+
 @contextmanager
 def counted(words: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar, as what takes (steps done, steps in all)."""
-    with progress() as bar:
-        row = bar.add_task(words, total=None)
-        yield lambda done, total: bar.update(row, completed=done, total=total)
+    with one_bar(words) as bar:
+        yield bar.count
 
 
 @contextmanager
-def busy(words: str) -> Iterator[None]:
-    """Says what takes long; on a terminal with a spinner, else as one line."""
+def busy(words: str) -> Iterator[Callable[[str], None]]:
+    """Says what takes long; on a terminal with a spinner, which can be given other words, else as one line."""
     if notes.is_terminal:
         with notes.status(words) as status, _drawn(status):
-            yield
+            yield lambda now: status.update(escaped(now))
     else:
         notes.print(words)
-        yield
+        yield lambda now: None
 
 
 def say_files(*paths: Path) -> None:

@@ -13,7 +13,7 @@ import typer
 from robot.cli.errors import FAILED, complain
 from robot.cli.interrupt import Interrupt
 from robot.cli.options import Out, Overrides
-from robot.cli.output import busy, new_directory, notes, progress, results, writing
+from robot.cli.output import Bar, busy, new_directory, notes, one_bar, results, writing
 from robot.cli.question import ask, require_person
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from tacsim.tasks import Task
 
 STARTING = "starting (the first run compiles the kernels, up to half a minute)"
+OPENING = "opening the rig"
 NO_END = 1_000_000  # steps of a replay: its recording ends it
 WITHOUT_TASK = 40  # steps where neither a task nor a recording has an end
 
@@ -90,8 +91,9 @@ def _run(
         from tacsim.physics.failure.dump import dumps_in
         from tacsim.record.writer import Recorder
         from tacsim.tasks import make_task
+    begun = STARTING if loaded.config.scene is not None else OPENING
     if not notes.is_terminal:
-        notes.print(STARTING)
+        notes.print(begun)
     task = None if loaded.config.task is None else make_task(loaded.config.task)
     setup = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()})
     recorder: Recorder | None = None
@@ -103,7 +105,8 @@ def _run(
 
     with (
         dumps_in(folder / "diverged"),
-        open_rig(loaded, confirm=ask, dry_run=dry_run, check=fit) as rig,
+        one_bar(begun) as bar,
+        open_rig(loaded, confirm=ask, dry_run=dry_run, check=fit, tell=bar.say) as rig,
         ExitStack() as stack,
     ):
 
@@ -114,7 +117,7 @@ def _run(
                 recorder = stack.enter_context(file)
             return recorder
 
-        episode, failure = _drive(rig, fitting[0], task, steps, setup, record, interrupt)
+        episode, failure = _drive(rig, fitting[0], task, steps, setup, record, interrupt, bar)
     lost = ""
     if recorder is not None and (recorder.error or recorder.dropped):
         why = recorder.error or "the disk was too slow"
@@ -136,21 +139,19 @@ def _drive(
     setup: EpisodeSetup,
     record: Callable[[EpisodeMeta], Recorder],
     interrupt: Interrupt,
+    bar: Bar,
 ) -> tuple[Episode, str]:
-    """The episode, shown by a progress bar, and what ended it too early ("" when nothing did)."""
+    """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
 
-    with progress() as bar:
-        row = bar.add_task(STARTING, total=None)
-        known = None if steps == NO_END else steps
+    def show(step: Step) -> None:
+        bar.say(task.config.kind if task else rig.name)
+        bar.count(step.index, None if steps == NO_END else steps)
 
-        def show(step: Step) -> None:
-            bar.update(row, description=task.config.kind if task else rig.name, total=known, completed=step.index)
-
-        try:
-            episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=show, stop=interrupt)
-        except EpisodeFailed as failed:
-            return failed.episode, str(failed)
+    try:
+        episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=show, stop=interrupt)
+    except EpisodeFailed as failed:
+        return failed.episode, str(failed)
     return episode, ""
 
 

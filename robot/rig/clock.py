@@ -27,11 +27,12 @@ class WallClock(_MonotonicClock):
     """Ticks at a fixed rate. Missed periods are skipped, and counted.
 
     catch_up: waits until the simulation of a mock cell, if there is one, has followed the arms.
+    real_time: pictures and forces come as things happen; a simulation may be slower.
     """
 
-    def __init__(self, period: float, catch_up: Callable[[], None] | None = None) -> None:
+    def __init__(self, period: float, catch_up: Callable[[], None] | None = None, *, real_time: bool = True) -> None:
         super().__init__(period)
-        self._catch_up = catch_up
+        self._catch_up, self.real_time = catch_up, real_time
         self._deadline: float | None = None
         self.periods: list[float] = []  # of the last ticks [s]
         self.late = 0
@@ -68,6 +69,8 @@ class WallClock(_MonotonicClock):
 
 class LockStep(_MonotonicClock):
     """A period ends when the arms rest at their targets and the cell has drawn the pictures of just that pose."""
+
+    real_time = False
 
     def __init__(
         self, period: float, arms: Mapping[str, CommandedArm], cameras: Mapping[str, Camera], cell: MockCell

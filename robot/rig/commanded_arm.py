@@ -63,12 +63,17 @@ class CommandedArm:
 
     def advance(self) -> bool:
         """Repeats the last command, so that it does not time out; True once the arm rests at its target."""
+        if self.at_target():
+            return True
+        if self.target is not None:
+            self.driver.command(self.target)
+        return False
+
+    def at_target(self) -> bool:
+        """True once the arm rests at its target; without one, once it rests."""
         if self.target is None:
             return self.driver.at_rest()
-        if self.driver.arrived(self.target, within=NEAR, turn=TURN):
-            return True
-        self.driver.command(self.target)
-        return False
+        return self.driver.arrived(self.target, within=NEAR, turn=TURN)
 
     def suspend_tactile_guard(self) -> None:
         """For motions that no observation decides: depth, shear and the age of observations are not guarded until the

@@ -16,7 +16,7 @@ from robot.mock.cell.cell import MockCell
 from robot.rig.clock import LockStep, WallClock
 from robot.rig.commanded_arm import CommandedArm
 from robot.rig.reset import HardwareReset
-from tacsim.control.contact_signal import contact_signal
+from robot.rig.touch import ForceTouch, PictureTouch, TouchSense
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
 from tacsim.interface import Normaliser, Pose, RigSpec, SensorSpec, TactileFrame, TactileSource
@@ -26,6 +26,10 @@ from tacsim.report.series import ALIGNMENT, LIMITS, PICTURES_DAMAGED, PICTURES_L
 from tacsim.rig import Rig
 
 Confirm = Callable[[str], bool]
+MISSED = 2.5  # an approach waits when no picture came for so many periods of its camera
+SIMULATED_RATE = 10.0  # of sensors without a camera [Hz]
+UNMEASURED = 0.05  # latency of a camera whose file says 0, as far as an approach may trust it [s]
+REACTION = 0.05  # from a picture that shows a touch to an arm that brakes [s]
 QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
 
 
@@ -54,12 +58,14 @@ def open_hardware(
     *,
     dry_run: bool = False,
     check: Callable[[RigSpec], None] | None = None,
+    tell: Callable[[str], None] = lambda words: None,
 ) -> Rig:
     """Opens a rig of hardware. Starts the mocks that its file asks for. Connects; moves nothing.
 
     confirm: asks a person before anything approaches the body; not needed where all arms are mocks.
     dry_run: connects, observes and records, but sends no motion, neither in a reset nor in a step.
     check: is told what the rig delivers before anything is opened; raises to refuse it.
+    tell: is told, again and again, what the arms are doing at a reset.
 
     Raises DeviceError for what cannot be opened, calibration.errors.CalibrationError for a calibration,
     ValueError for a rig that makes no sense.
@@ -69,6 +75,7 @@ def open_hardware(
     normalisers = {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()}
     spec = _spec(config, normalisers)
     _gel_monitor(config, spec.sensors, {})
+    _require_gentle_approach(config)
     for name, arm in config.arms.items():
         assert isinstance(arm, UrArmConfig)
         check_host(arm, name)
@@ -96,11 +103,12 @@ def open_hardware(
             clock = LockStep(config.period, arms, mock_cameras, cell)
         elif cell.simulated:
             cell.run_free()
-            clock = WallClock(config.period, cell.catch_up)
+            clock = WallClock(config.period, cell.catch_up, real_time=config.contact == "hertz")
         else:
             clock = WallClock(config.period)
         for name, camera in cameras.items():
             camera.spec = spec.sensors[name]
+        monitor = _gel_monitor(config, spec.sensors, arms)
         task = config.task
         reset = HardwareReset(
             arms={} if dry_run else arms,
@@ -108,9 +116,10 @@ def open_hardware(
             start=_start_poses(config, cell),
             clock=clock,
             config=config.start,
-            contact=None if dry_run else _contact_measure(config, arms, sensors, normalisers),
+            touch_sense=None if dry_run else _touch_sense(config, arms, sensors, normalisers, monitor),
             confirm=_confirmation(config, cell, confirm, real=bool(real) and not dry_run),
             placement=0.0 if task is None else task.placement,
+            tell=tell,
         )
 
         def diagnostics() -> Mapping[str, float]:
@@ -133,7 +142,7 @@ def open_hardware(
             diagnostics=diagnostics,
             packages=lambda: {name: log.take() for name, log in logs.items()},
             on_close=cell.close,
-            on_tactile=_gel_monitor(config, spec.sensors, arms),
+            on_tactile=monitor,
             load_control=load_controller(config.task),
         )
         stack.pop_all()
@@ -173,31 +182,42 @@ def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:
     return starts
 
 
-def _contact_measure(
+def _touch_sense(
     config: RigConfig,
     arms: Mapping[str, CommandedArm],
     sensors: Mapping[str, TactileSource],
     normalisers: Mapping[str, Normaliser],
-) -> Callable[[], float] | None:
-    """How hard the gels touch, as a multiple of what counts as touch: by the picture if `touch_signal` is given, else
-    by force. None where neither is given."""
-    signal = config.start.touch_signal
-    if signal is not None:
-
-        def contact_by_picture() -> float:
-            signals = [contact_signal(normalisers[name](sensor.read(1.0), 0.0)) for name, sensor in sensors.items()]
-            return min(signals) / signal
-
-        return contact_by_picture
-    force = None if config.task is None else config.task.touch_force
-    arms_with_sensor = [sensor.arm for sensor in config.sensors.values() if sensor.arm is not None]
-    if force is None or not arms_with_sensor:
+    monitor: GelMonitor,
+) -> TouchSense | None:
+    """How touch is felt: by the picture if `touch_signal` is given, else by force. None where neither is given, or no
+    arm carries a sensor."""
+    carriers = {sensor.arm: arms[sensor.arm] for sensor in config.sensors.values() if sensor.arm is not None}
+    if not carriers:
         return None
+    if config.start.touch_signal is not None:
+        rates = [each.fps for each in config.sensors.values() if isinstance(each, CameraSensorConfig)]
+        patience = MISSED / min(rates, default=SIMULATED_RATE)
+        return PictureTouch(sensors, normalisers, monitor, config.start.touch_signal, patience)
+    force = None if config.task is None else config.task.touch_force
+    return None if force is None else ForceTouch(carriers, force)
 
-    def contact_by_force() -> float:
-        return min(-float(arms[name].state().wrench[2]) for name in arms_with_sensor) / force
 
-    return contact_by_force
+def _require_gentle_approach(config: RigConfig) -> None:
+    """Raises ValueError where a gel would be pressed beyond its limit before its camera could tell of the touch."""
+    if config.start.touch_signal is None:
+        return
+    for name, camera in config.sensors.items():
+        arm = None if camera.arm is None else config.arms[camera.arm]
+        if not isinstance(camera, CameraSensorConfig) or not isinstance(arm, UrArmConfig) or arm.limits.depth is None:
+            continue
+        late = max(camera.latency, UNMEASURED) + 1.0 / camera.fps + REACTION
+        speed, depth = config.start.approach_speed, arm.limits.depth
+        if speed * late > depth:
+            raise ValueError(
+                f"rig '{config.name}': start.approach_speed {1e3 * speed:g} mm/s is too fast: the camera of sensor "
+                f"'{name}' tells of a touch {1e3 * late:.0f} ms late, with its gel {1e3 * speed * late:.2g} mm deep, "
+                f"and limits.depth of arm '{camera.arm}' is {1e3 * depth:g} mm. At most {1e3 * depth / late:.2g} mm/s"
+            )
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SensorSpec], arms: Mapping[str, CommandedArm]) -> GelMonitor:

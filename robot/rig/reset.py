@@ -12,7 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
+from robot.errors import DeviceError
 from robot.rig.commanded_arm import CommandedArm, wait_for_arrival
+from robot.rig.touch import TouchSense
 from tacsim import pose as se3
 from tacsim.control.approach import NoTouch, approach
 from tacsim.interface import Pose, TactileFrame, TactileSource
@@ -20,7 +22,14 @@ from tacsim.models.hardware import ResetConfig
 
 RETREAT = 5e-3  # along the sensor's own axis, before anything else [m]
 TRAVEL = 60.0  # longest motion to the start [s]
+STEP = 5.0  # longest step of an approach [s]
+LOOK = 5e-3  # between two looks of an approach in motion [s]
+AT_END = 0.5  # an approach that has come to its end has met nothing when nothing is told for so long [s]
 PAUSE = 0.3  # a shaken arm comes to rest before its force is zeroed [s]
+ADVICE = (
+    "is the body before the sensors? The arms are back at their start (start.approach_distance in the rig file bounds "
+    "the approach)"
+)
 
 
 class NotConfirmed(RuntimeError):
@@ -29,6 +38,11 @@ class NotConfirmed(RuntimeError):
 
 class ResetClock(Protocol):
     """A clock that can wait until observations belong to the present poses of the arms."""
+
+    @property
+    def real_time(self) -> bool:
+        """Pictures and forces come as things happen; otherwise a simulation follows the arms as fast as it can."""
+        ...
 
     def wait_for_data(self) -> None: ...
     def restart(self) -> None: ...
@@ -42,9 +56,10 @@ class HardwareReset:
         start: world_from_sensor of each arm, clear of everything.
         clock: of the rig.
         config: of the approach.
-        contact: how hard the gels touch, as a multiple of what counts as touch; None: no approach.
+        touch_sense: what ends the approach; None: no approach. An arm that it does not know stays at its start.
         confirm: asks a person, True to go on; on a mock rig it puts the body in its place.
         placement: the arms start at most this far aside in world x and y, drawn from the seed [m].
+        tell: is told what the arms are doing, again and again, in a few words.
     """
 
     def __init__(
@@ -55,12 +70,14 @@ class HardwareReset:
         start: Mapping[str, Pose],
         clock: ResetClock,
         config: ResetConfig,
-        contact: Callable[[], float] | None,
+        touch_sense: TouchSense | None,
         confirm: Callable[[], bool],
         placement: float = 0.0,
+        tell: Callable[[str], None] = lambda words: None,
     ) -> None:
         self._arms, self._sensors, self._start, self._clock = arms, sensors, start, clock
-        self._config, self._contact, self._confirm, self._placement = config, contact, confirm, placement
+        self._config, self._touch_sense, self._confirm, self._placement = config, touch_sense, confirm, placement
+        self._tell = tell
         self._begun: dict[str, Pose] = dict(start)
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
@@ -70,6 +87,7 @@ class HardwareReset:
         offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
         shift = np.append(offset, 0.0)
         self._begun = {name: Pose(pose.position + shift, pose.quaternion) for name, pose in self._start.items()}
+        self._tell("to the start")
         self._go({name: se3.along_z(arm.state().pose, -RETREAT) for name, arm in self._arms.items()}, TRAVEL)
         self._go(self._begun, TRAVEL)
         if self._arms:
@@ -85,28 +103,71 @@ class HardwareReset:
         if not self._confirm():
             raise NotConfirmed("nobody confirmed that the body is in its place; nothing approaches it")
         self._clock.wait_for_data()
-        contact = self._contact
-        if contact is not None and self._arms:
-            advice = (
-                "is the body between the sensors? The arms are back at their start (start.approach_distance in the rig "
-                "file bounds the approach)"
-            )
-            step, longest = self._config.approach_step, self._config.approach_distance
+        if self._touch_sense is not None and self._arms:
+            go = self._approach if self._clock.real_time else self._approach_by_steps
             try:
-                approach(lambda: not contact() < 1.0, self._advance, step, longest, advice)  # NaN ends it, too
+                go(self._touch_sense)
             except NoTouch:
+                for arm in self._arms.values():
+                    arm.suspend_tactile_guard()
+                self._tell("back to the start")
                 self._go(self._begun, TRAVEL)
                 raise
+            self._tell("touching")
         self._clock.restart()
 
-    def _advance(self, distance: float) -> None:
-        """All arms `distance` [m] from their start along their sensors' axes, at the approach speed."""
-        due = time.monotonic() + self._config.approach_step / self._config.approach_speed
-        self._go({name: se3.along_z(pose, distance) for name, pose in self._begun.items()}, 5.0)
-        time.sleep(max(0.0, due - time.monotonic()))
-        self._clock.wait_for_data()
+    def _approach(self, sense: TouchSense) -> None:
+        """All arms along their sensors' axes at the approach speed, each until a gel of its own touches. Where no new
+        pictures or packages come, they wait."""
+        speed, longest = self._config.approach_speed, self._config.approach_distance
+        going = {name: self._arms[name] for name in sense.look(guarded=True).pressed}
+        ends = {name: se3.along_z(self._begun[name], longest) for name in going}
+        gone, before_end = 0.0, time.monotonic()
+        deadline = before_end + 2.0 * longest / speed + TRAVEL
+        try:
+            while going:
+                touch = sense.look(guarded=True)
+                now = time.monotonic()
+                waiting = now - touch.news > sense.patience
+                for name in list(going):
+                    if touch.pressed[name] < 1.0:
+                        going[name].send(None if waiting else ends[name], speed)
+                    else:  # NaN, too
+                        going.pop(name).send(None)
+                for name, arm in going.items():
+                    gone = max(gone, se3.distance(arm.state().pose, self._begun[name])[0])
+                self._tell(f"approach: {1e3 * gone:.1f} mm of at most {1e3 * longest:g} mm")
+                if waiting or not all(arm.at_target() for arm in going.values()):
+                    before_end = now
+                elif going and now - before_end > AT_END:
+                    raise NoTouch(f"no touch after an approach of {1e3 * gone:.3g} mm; {ADVICE}")
+                if going and now > deadline:
+                    name, arm = next(iter(going.items()))
+                    raise DeviceError(f"arm '{name}' came to no end of its approach: {arm.driver.explain()}")
+                time.sleep(LOOK)
+        except BaseException:
+            for arm in self._arms.values():
+                arm.stop()
+            raise
+        wait_for_arrival(self._arms, TRAVEL)
+
+    def _approach_by_steps(self, sense: TouchSense) -> None:
+        """The same where a simulation has to follow each step before it can be felt."""
+        going = set(sense.look(guarded=False).pressed)
+
+        def touches() -> bool:
+            pressed = sense.look(guarded=False).pressed
+            going.difference_update([name for name in going if not pressed[name] < 1.0])
+            return not going
+
+        def advance(distance: float) -> None:
+            self._go({name: se3.along_z(self._begun[name], distance) for name in going}, STEP)
+            self._clock.wait_for_data()
+
+        approach(touches, advance, self._config.approach_step, self._config.approach_distance, ADVICE)
 
     def _go(self, targets: Mapping[str, Pose], timeout: float) -> None:
+        """Arms without a target stay."""
         for name, arm in self._arms.items():  # none in a dry run
-            arm.send(targets[name])
+            arm.send(targets.get(name))
         wait_for_arrival(self._arms, timeout)

@@ -212,7 +212,7 @@ class ResetConfig(Config):
     """How an episode begins on hardware: retreat to `start`, references, a person's confirmation, slow approach."""
 
     approach_speed: Annotated[Speed, Field(gt=0, le=20e-3)] = 2e-3  # [m/s]
-    approach_step: Annotated[Length, Field(gt=0, le=1e-3)] = 20e-6  # between two measurements [m]
+    approach_step: Annotated[Length, Field(gt=0, le=1e-3)] = 20e-6  # where a simulation follows: between looks [m]
     approach_distance: Annotated[Length, Field(gt=0, le=0.1)] = 10e-3  # no touch after that: NoTouch [m]
     touch_signal: Annotated[float, Field(gt=0)] | None = None  # contact signal that counts as touch; None: by force
 

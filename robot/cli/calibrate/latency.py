@@ -39,7 +39,8 @@ def latency(
     opened = without_latency(config, arm, sensor)
     require_person(config)
     with Interrupt() as interrupt:
-        with busy("tapping"), open_rig(opened, confirm=ask) as running:
+        with busy("opening the rig") as say, open_rig(opened, confirm=ask, tell=say) as running:
+            say("tapping")
             record = record_taps(running, opened, arm, sensor, TapPlan(taps, depth, lift), interrupt)
         if interrupt():
             complain("stopped by a signal; nothing is measured")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
-from robot.errors import EmergencyStop
+from robot.errors import DeviceError, EmergencyStop
 from robot.rig import reset as resets
 from robot.rig.commanded_arm import CommandedArm
 from robot.rig.reset import RETREAT, HardwareReset, NotConfirmed
+from robot.rig.touch import Touch
 from tacsim import pose as se3
 from tacsim.control.approach import NoTouch
 from tacsim.interface import ArmState, Pose, SensorSpec, TactileFrame
@@ -34,15 +36,31 @@ class StubArm:
     def state(self) -> ArmState:
         return ArmState(self.pose, np.zeros(6), np.zeros(6), np.zeros(6), 0.0)
 
-    def command(self, target: Pose, speed: float | None = None) -> Pose:
+    def command(self, target: Pose | None, speed: float | None = None) -> Pose | None:
+        if target is None:
+            self._log.append((self.name, "hold"))
+            return None
         if self.stopped:
             raise EmergencyStop(f"arm '{self.name}' has an emergency stop")
-        self.pose = target
+        away = target.position - self.pose.position
+        if speed is not None and (length := float(np.linalg.norm(away))) > 1e-3:  # a look later it is a bit nearer
+            self.pose = Pose(self.pose.position + away * (1e-3 / length), target.quaternion)
+        else:
+            self.pose = target
         self._log.append((self.name, target))
         return target
 
     def arrived(self, target: Pose, **within: float) -> bool:
+        return se3.distance(self.pose, target)[0] < 1e-9
+
+    def at_rest(self) -> bool:
         return True
+
+    def explain(self) -> str:
+        return f"arm '{self.name}' stands still"
+
+    def stop(self) -> None:
+        self._log.append((self.name, "stop"))
 
     def zero_wrench(self) -> None:
         self._log.append((self.name, "zero"))
@@ -70,6 +88,9 @@ class Scene:
     arms: bool = True
     placement: float = 0.0
     log: list[object] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)
+    real_time = False
+    patience = 0.1
 
     def __post_init__(self) -> None:
         self.lower, self.upper = StubArm("lower", LOWER, self.log), StubArm("upper", UPPER, self.log)
@@ -80,9 +101,10 @@ class Scene:
             start={"lower": LOWER, "upper": UPPER},
             clock=self,
             config=PARAMS,
-            contact=None if self.touch_at is None else self.contact,
+            touch_sense=None if self.touch_at is None else self,
             confirm=self.confirm,
             placement=self.placement,
+            tell=self.told.append,
         )
 
     def wait_for_data(self) -> None:
@@ -95,9 +117,10 @@ class Scene:
         self.log.append("asked")
         return self.yes
 
-    def contact(self) -> float:
-        assert self.touch_at is not None
-        return float(self.lower.pose.position[2] - LOWER.position[2]) / self.touch_at
+    def look(self, *, guarded: bool) -> Touch:
+        assert self.touch_at is not None and not guarded
+        gone = float(self.lower.pose.position[2] - LOWER.position[2])
+        return Touch({"lower": gone / self.touch_at, "upper": gone / self.touch_at}, 0.0)
 
     def motions(self) -> list[tuple[str, Pose]]:
         return [each for each in self.log if isinstance(each, tuple) and isinstance(each[1], Pose)]
@@ -191,3 +214,73 @@ def test_a_dry_run_moves_nothing_and_still_asks_and_observes() -> None:
     scene.reset.touch()
     assert scene.motions() == [] and ("lower", "zero") not in scene.log
     assert scene.log == ["wait", "reference", "asked", "wait", "restart"]
+
+
+class Moving(Scene):
+    """Pictures come as things happen: both go on until each has touched for itself."""
+
+    real_time = True
+    walls: dict[str, float]  # how far each must come until it touches [m]
+    silent = False
+    looks = 0
+
+    def look(self, *, guarded: bool) -> Touch:
+        assert guarded
+        self.looks += 1
+        assert self.looks < 200
+        gone = {"lower": self.lower.pose.position[2] - LOWER.position[2]}
+        gone["upper"] = UPPER.position[2] - self.upper.pose.position[2]
+        pressed = {name: float(way) / self.walls[name] for name, way in gone.items()}
+        return Touch(pressed, -math.inf if self.silent else math.inf)
+
+
+@pytest.fixture
+def moving() -> Moving:
+    scene = Moving(touch_at=1.0)
+    scene.walls = {"lower": 2e-3, "upper": 5e-3}
+    scene.reset.clear(0)
+    return scene
+
+
+def test_in_motion_each_arm_stops_when_its_own_gel_touches(moving: Moving) -> None:
+    moving.reset.touch()
+    assert moving.lower.pose.position[2] - LOWER.position[2] == pytest.approx(2e-3)
+    assert UPPER.position[2] - moving.upper.pose.position[2] == pytest.approx(5e-3)
+    assert moving.log[-1] == "restart"
+
+
+def test_without_new_pictures_nothing_moves(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    moving.silent = True
+    monkeypatch.setattr(resets, "TRAVEL", -60.0)  # gives up at once
+    with pytest.raises(DeviceError, match="came to no end of its approach"):
+        moving.reset.touch()
+    assert moving.lower.pose.position == pytest.approx(LOWER.position)
+    assert ("lower", "stop") in moving.log and ("upper", "stop") in moving.log
+
+
+def test_what_cannot_be_known_counts_as_touch(moving: Moving) -> None:
+    moving.walls["lower"] = math.nan
+    moving.reset.touch()
+    assert moving.lower.pose.position == pytest.approx(LOWER.position)
+
+
+def test_whatever_ends_an_approach_in_motion_stops_the_arms(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    del moving.walls["upper"]
+    with pytest.raises(KeyError):
+        moving.reset.touch()
+    moving.walls["upper"] = 1.0
+    monkeypatch.setattr(moving.reset, "_tell", lambda words: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        moving.reset.touch()
+    assert moving.log[-2:] == [("lower", "stop"), ("upper", "stop")]
+
+
+def test_in_motion_no_touch_goes_back_to_the_start(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    moving.walls = {"lower": 1.0, "upper": 1.0}
+    monkeypatch.setattr(resets, "AT_END", 0.0)
+    with pytest.raises(NoTouch, match=r"no touch after an approach of 10 mm.*back at their start"):
+        moving.reset.touch()
+    assert moving.lower.pose.position == pytest.approx(LOWER.position)
+    assert moving.upper.pose.position == pytest.approx(UPPER.position)
+    assert moving.lower.told is None  # the way back is not guarded by what was seen before
+    assert moving.told[-1] == "back to the start" and "approach: 10.0 mm of at most 10 mm" in moving.told

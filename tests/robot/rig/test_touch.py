@@ -1,0 +1,86 @@
+"""The approach of real arms: at its declared speed, and with the gels pressed no deeper than camera and speed allow."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.arm.channel import HISTORY
+from robot.arm.trajectory import PERIOD
+from robot.open import open_rig
+from robot.rig.commanded_arm import CommandedArm
+from tacsim.rig import Rig
+from tests.robot.cli.lab import Lab, copy_of
+
+if find_spec("rtde_control") is None:
+    pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
+
+pytestmark = pytest.mark.usefixtures("no_pause")
+SPEED = 2e-3  # as shipped [m/s]
+LATEST = 0.75  # no picture for 2.5 periods of 0.1 s, no action for 0.2 s: then the arm waits; and its own lag [s]
+
+
+@dataclass
+class Opened:
+    lab: Lab
+    rig: Rig
+    told: list[str] = field(default_factory=list)
+
+    @property
+    def arm(self) -> CommandedArm:
+        arm = self.rig.arms["arm"]
+        assert isinstance(arm, CommandedArm)
+        return arm
+
+    @property
+    def depth(self) -> float:
+        return self.lab.depth("arm", self.lab.faults["arm"].state().pose)
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+    """A copy of the shipped one-arm file, but for time-outs that a busy machine would break."""
+    file = copy_of("ur5e-one", tmp_path_factory.mktemp("rig"), 65)
+    text = (
+        file.read_text().replace("link_timeout: 50 ms", "link_timeout: 2 s").replace("max_age: 200 ms", "max_age: 5 s")
+    )
+    file.write_text(text)
+    told: list[str] = []
+    with Lab(file) as lab, open_rig(file, confirm=lambda question: True, tell=told.append) as rig:
+        yield Opened(lab, rig, told)
+
+
+def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened) -> None:
+    opened.rig.reset()
+    depth = opened.depth
+    # The last two seconds, by the periods of the arm's own loop: neither a busy machine nor a controller that misses
+    # ticks on it changes how far the arm is sent in a period.
+    records = opened.arm.driver._channel.states.recent(HISTORY)
+    records = records[records["stamp"] > 0.0]
+    records = records[np.unique(records["cycles"], return_index=True)[1]]
+    periods = np.diff(records["cycles"]) * PERIOD
+    speeds = np.linalg.norm(np.diff(records["target"], axis=0), axis=1) / periods
+    speeds = speeds[: np.flatnonzero(speeds)[-1]]  # until it stopped
+    print(f"{1e3 * speeds.mean():.2f} mm/s on the mean of the last {periods.sum():.1f} s; depth {1e3 * depth:.3f} mm")
+    assert speeds.max() <= SPEED * 1.001
+    assert (speeds > 0.999 * SPEED).mean() > 0.5  # it waits only where no pictures come
+    assert 0.0 < depth < SPEED * LATEST
+    assert any("mm of at most 40 mm" in words for words in opened.told)
+
+
+def test_a_speed_that_would_press_a_gel_too_deep_is_refused_in_words(tmp_path: Path) -> None:
+    """Before anything is opened: nothing answers at these addresses."""
+    file = copy_of("ur5e", tmp_path, 67)
+    text = file.read_text().replace("approach_speed: 2 mm/s", "approach_speed: 20 mm/s")
+    text = text.replace("depth: null", "depth: 1 mm").replace("model: null", "model: ideal")
+    text = text.replace("width: 640", "width: 320").replace("height: 480", "height: 240")
+    file.write_text(re.sub(r"corners: .*", "", text))
+    said = "20 mm/s is too fast: .*140 ms late, with its gel 2.8 mm deep, and limits.depth.* is 1 mm. At most 7.1 mm/s"
+    with pytest.raises(ValueError, match=said):
+        open_rig(file)

@@ -12,6 +12,11 @@ There are two ways to stop. When nothing is wrong (no fresh action, `stop`) the 
 the arm. After a fault the target is reset to the *measured* pose and velocity of the arm, and brakes at least with
 FAULT_DECELERATION: the target leads the arm by the servo's lag, and an arm at a limit must not travel that distance
 too.
+
+After missed periods (the process was suspended, or came late) the target goes on from where the controller has it,
+with the speed that the arm has kept. The controller holds the last target meanwhile and lets the arm run out towards it
+with the time constant `lookahead`: the arm lags behind the target by its speed times that time, before the stall as
+after it, so nothing jumps, and a target that changes its speed within a limit moves the arm within the same limit.
 """
 
 from __future__ import annotations
@@ -50,6 +55,8 @@ RESTING, RESTING_TURN = 1e-3, 10e-3  # an arm slower than this is at rest [m/s, 
 PUSHED_AWAY, PUSHED_AWAY_TURN = 0.2e-3, 2e-3  # an arm farther than this from its held pose was moved [m, rad]
 LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 ZERO_PATIENCE = 0.5  # a wish to zero the wrench that is older is dropped [s]
+PACKAGE_DELAY = 3 * PERIOD  # from a change of the arm's speed on the controller to the target that knows of it [s]
+STALL_PATIENCE = 10  # periods that a target stands after missed ones, for a package from after them
 
 
 class Servo:
@@ -65,13 +72,16 @@ class Servo:
         self.close_requested = False
         self._zero_asked = -math.inf  # when the wrench was to be zeroed [s]
         self._sent: FloatArray | None = None  # joints
+        self._before: tuple[MotionState | None, FloatArray | None] = None, None  # motion and joints of the last period
+        self._in_time = math.nan, math.nan  # time and package's stamp of the last step that went on [s]
+        self._waited = 0  # periods for a package from after missed ones
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position (3,), rotation (3, 3)
         self._goal_time = -math.inf
         self._rates: Rates = config  # of the way to the goal
         self._tactile_read, self._exposed = tactile_read, math.nan  # reports read; exposure of the oldest picture [s]
         # joints, and their margin to a singularity
         self._last_singularity_check: tuple[FloatArray, float] | None = None
-        self._hard = (
+        self._hard = self._fault_braking = (
             max(FAULT_DECELERATION, config.acceleration),
             max(FAULT_TURN_DECELERATION, config.turn_acceleration),
         )
@@ -93,6 +103,9 @@ class Servo:
                 measured.sensor[:3, 3], measured.sensor[:3, :3], measured.twist[:3], measured.twist[3:]
             )
             self._sent = measured.joints
+            # It stands within half of the lookahead: the arm, which lags, must not be drawn on by a target ahead of it.
+            fast = 2.0 * np.linalg.norm(measured.twist.reshape(2, 3), axis=1) / self.config.lookahead
+            self._fault_braking = max(self._hard[0], float(fast[0])), max(self._hard[1], float(fast[1]))
         if not self.status.is_fault:
             self._zero_asked = -math.inf
         if not self.status.is_fault or status >= ArmStatus.PROGRAM_STOPPED:
@@ -165,6 +178,9 @@ class Servo:
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
         config = self.config
+        self._before = self.motion, self._sent
+        if self._waits_after_stall(time, measured):
+            return self._sent
         goal = self._goal if time - self._goal_time <= config.action_timeout else None
         stale = time - self._exposed > config.observation_timeout  # False without a guard by pictures (NaN)
         if self.status.is_fault or goal is None or stale:
@@ -197,6 +213,32 @@ class Servo:
         self.status = ArmStatus.OUT_OF_REACH
         return self._slow_down(measured)
 
+    def withdraw(self) -> FloatArray | None:
+        """Takes the last step back, which could not be sent in its period; returns the joints of the one before."""
+        self.motion, self._sent = self._before
+        return self._sent
+
+    def _waits_after_stall(self, time: float, measured: Measured) -> bool:
+        """True while a target in motion must stand, because no package is there from after the missed periods. Then it
+        goes on with the speed that the arm has kept along its path: no faster than before and in no other direction, so
+        where it could stop is as safe as it was."""
+        (last, stamp), motion, config = self._in_time, self.motion, self.config
+        missed = time - last - PERIOD
+        if motion is not None and not motion.at_rest and missed > 1.5 * PERIOD:  # one alone is within the limits
+            fresh = measured.stamp - stamp > missed - PACKAGE_DELAY
+            self._waited += not fresh
+            if not fresh and self._waited < STALL_PATIENCE:
+                return True
+            kept = math.exp(-min(missed, PACKAGE_DELAY) / config.lookahead) * measured.twist if fresh else np.zeros(6)
+            lead = 0.5 * config.lookahead  # a target that speeds up at its limit is ahead of the arm by twice this
+            self.motion = replace(
+                motion,
+                velocity=_no_faster(motion.velocity, kept[:3], lead * config.acceleration),
+                spin=_no_faster(motion.spin, kept[3:], lead * config.turn_acceleration),
+            )
+        self._in_time, self._waited = (time, measured.stamp), 0
+        return False
+
     def _was_moved(self, held: MotionState, measured: Measured) -> bool:
         """True if the arm rests away from its held pose (somebody moved it): the next target starts at the measured
         pose. Servo lag and the deflection by a contact are smaller than that, and cause no jump."""
@@ -216,7 +258,9 @@ class Servo:
             return None
         if self.motion.at_rest:
             return self._sent
-        limits = self._hard if self.status.is_fault else (self.config.acceleration, self.config.turn_acceleration)
+        limits = (
+            self._fault_braking if self.status.is_fault else (self.config.acceleration, self.config.turn_acceleration)
+        )
         slower = braking(self.motion, *limits)
         joints = self._joints(slower, measured)
         if joints is None:
@@ -283,6 +327,14 @@ def is_healthy(other: Record | None) -> bool:
         return False
     status = ArmStatus(int(other["status"]))
     return not status.is_fault and status != ArmStatus.CONNECTING
+
+
+def _no_faster(velocity: FloatArray, kept: FloatArray, more: float) -> FloatArray:
+    """`velocity` (3,), in its direction no faster than `kept` (3,) is, and so much `more`."""
+    speed = math.sqrt(float(velocity @ velocity))
+    if speed == 0.0:
+        return velocity
+    return velocity * min(1.0, (max(0.0, float(velocity @ kept) / speed) + more) / speed)
 
 
 def _is_at(motion: MotionState, goal: tuple[FloatArray, FloatArray]) -> bool:

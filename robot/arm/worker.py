@@ -58,6 +58,7 @@ MARGIN = 10e-3  # a call in the loop takes at most so much longer than link_time
 ZEROING = 2.0  # longest time to zero the force sensor [s]
 ENDING = 3.0  # longest time to end the program; the driver waits less, but it may be gone [s]
 BLIND = 5  # periods without a new package; then nothing is sent
+SUSPENDED = 5e-3  # a target that took this long was held up with its process, and comes too late [s]
 GRACE = 5  # periods in which a package may say why the controller takes no more commands
 FAILED = 3  # exit status; the reason is on stdout, as JSON
 WINDOW = 500  # periods in the statistics
@@ -209,6 +210,7 @@ class Worker:
                 stopped = ArmStatus.PROGRAM_STOPPED
             if stopped is not None:
                 self.servo.trip(stopped, None)
+            command = self.channel.commands.newest()  # before the report: what was seen when it was decided counts
             self.servo.check_faults(self.state, partners)
             self.servo.on_tactile(*self.channel.tactile.newest(), self.state)
             if self.servo.status != before:
@@ -216,7 +218,7 @@ class Worker:
                 if before == ArmStatus.CONNECTING:
                     with contextlib.suppress(BrokenPipeError):  # the driver has died: the next period sees it
                         parent.send({"connected": True})
-            self.servo.on_command(*self.channel.commands.newest())
+            self.servo.on_command(*command)
             if ending is None and (orphan or self.servo.close_requested):
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:
@@ -226,17 +228,20 @@ class Worker:
                     self._leave()
             else:
                 if not blind:
-                    self._act(now, partners)
+                    self._act(partners)
                 if ending is not None and (self.servo.resting or now > ending):
                     self._end_program()
                     self._leave()
             deadline = self._sleep(deadline)
 
-    def _act(self, now: float, partners: list[Any]) -> None:
+    def _act(self, partners: list[Any]) -> None:
         if self._refused:  # the next packages say why
             self._refused += 1
             return
+        now = time.monotonic()
         joints = self.servo.step(now, self.state, partners)
+        if time.monotonic() - now > SUSPENDED:
+            joints = self.servo.withdraw()
         config, control = self.config, self.control
         with self._limit, self._lost_link():
             if joints is None:

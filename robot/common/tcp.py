@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 class Measured:
     """One package of the controller, as pose, twist and wrench of the sensor."""
 
+    stamp: float  # on the controller's own clock [s]
     joints: FloatArray  # (6,) [rad]
     flange: FloatArray  # base_from_flange (4, 4) by the controller
     sensor: FloatArray  # world_from_sensor (4, 4)
@@ -57,13 +58,15 @@ class ArmFrames:
         return frame
 
     def measure(self, package: NDArray[np.void]) -> Measured:
-        """From one package of the controller: a record () with joints, tcp_pose, tcp_speed, tcp_force, each (6,)."""
+        """From one package of the controller: a record () with stamp, and joints, tcp_pose, tcp_speed, tcp_force, each
+        (6,)."""
         speed, force = package["tcp_speed"], package["tcp_force"]
         base_from_tool = matrix(package["tcp_pose"])
         base_from_sensor = base_from_tool @ self.tool_from_sensor
         lever = base_from_sensor[:3, 3] - base_from_tool[:3, 3]
         to_world, to_sensor = self.world_from_base[:3, :3], base_from_sensor[:3, :3].T
         return Measured(
+            stamp=float(package["stamp"]),
             joints=package["joints"].copy(),
             flange=base_from_tool @ self._tool_from_flange,
             sensor=self.world_from_base @ base_from_sensor,

@@ -136,24 +136,37 @@ def sensor_path(arm: URArm, joints: np.ndarray) -> np.ndarray:
     return np.array([base @ KINEMATICS.forward(q) @ flange_from_sensor for q in joints])
 
 
-def of_limits(arm: URArm, joints: np.ndarray, ticks: np.ndarray | None = None) -> dict[str, float]:
-    """What was really sent, in parts of the limits of speed, acceleration and joint speed.
-
-    ticks (n,): control periods in which the joints arrived. With them, acceleration is that of targets in periods that
-    follow each other: a machine that stops the worker for a while makes it go on from what it measures then.
-    """
+def of_limits(arm: URArm, joints: np.ndarray) -> dict[str, float]:
+    """What was really sent, in parts of the limits of speed, acceleration and joint speed; see `restarts`."""
     limits = arm.config.limits
-    velocity = np.diff(sensor_path(arm, joints)[:, :3, 3], axis=0) / PERIOD
-    change = np.diff(velocity, axis=0) / PERIOD
-    if ticks is not None:
-        steady = np.diff(ticks) == 1
-        assert steady.mean() > 0.5
-        change = change[steady[1:] & steady[:-1]]
+    velocity, change, around = _changes(arm, joints)
+    held = np.where(change > 1.01 * limits.acceleration, around, change)
     return {
         "speed": float(np.linalg.norm(velocity, axis=1).max()) / limits.speed,
-        "acceleration": float(np.linalg.norm(change, axis=1).max()) / limits.acceleration,
+        "acceleration": float(held.max()) / limits.acceleration,
         "joint step": float(np.abs(np.diff(joints, axis=0)).max()) / (limits.joint_speed * PERIOD),
     }
+
+
+def restarts(arm: URArm, joints: np.ndarray, ticks: np.ndarray) -> int:
+    """How often targets were slowed down at once, though no control period was without one: after missed periods they
+    go on with the speed that the arm has kept."""
+    velocity, change, _ = _changes(arm, joints)
+    speed = np.linalg.norm(velocity, axis=1)
+    sudden = (change > 1.01 * arm.config.limits.acceleration) & (speed[1:] < speed[:-1])
+    return int((sudden & (np.diff(ticks)[1:] < 2)).sum())
+
+
+def _changes(arm: URArm, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Velocities (n, 3) of the sensor's origin in targets of successive periods [m/s], and their changes (n - 1,)
+    [m/s^2]: all of it, and what is not a mere slowing down of the motion before."""
+    velocity = np.diff(sensor_path(arm, joints)[:, :3, 3], axis=0) / PERIOD
+    moves = np.where(velocity.any(axis=1), np.arange(len(velocity)), 0)
+    before = velocity[np.maximum.accumulate(moves)][:-1]  # of the last period in which the target moved
+    square = np.maximum((before**2).sum(axis=1), 1e-30)
+    share = np.clip((velocity[1:] * before).sum(axis=1) / square, 0.0, 1.0)[:, None]
+    change, around = np.diff(velocity, axis=0) / PERIOD, (velocity[1:] - share * before) / PERIOD
+    return velocity, np.linalg.norm(change, axis=1), np.linalg.norm(around, axis=1)
 
 
 def outside(arm: URArm, joints: np.ndarray) -> int:
@@ -161,10 +174,10 @@ def outside(arm: URArm, joints: np.ndarray) -> int:
     return int((~(arm.config.limits.region.excess(sensor_path(arm, joints)[:, :3, 3]) <= 1e-8)).sum())
 
 
-def check_path(arm: URArm, joints: np.ndarray, ticks: np.ndarray | None = None) -> None:
+def check_path(arm: URArm, joints: np.ndarray) -> None:
     """Box, planes, speed, acceleration and joint steps of what was really sent."""
     assert outside(arm, joints) == 0
-    share = of_limits(arm, joints, ticks)
+    share = of_limits(arm, joints)
     assert share["joint step"] <= 1 + 1e-9
     assert share["speed"] <= 1 + 1e-4
     assert share["acceleration"] <= 1 + 1e-2

@@ -11,7 +11,9 @@ from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, pose, rotation
-from robot.common.tcp import pose_of
+from robot.common.tcp import Measured, pose_of
+from robot.mock.ur.machine.arm import Arm
+from robot.mock.ur.machine.motion import servoj
 from tacsim.interface import FloatArray, Pose
 
 HOME = np.array([0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0])
@@ -103,6 +105,57 @@ class Bench:
         """(n, 3) origins of the sensor at the joints that were sent."""
         frames = [KINEMATICS.forward(q) @ self.calibration @ self.servo.frames.tool_from_sensor for q in self.sent]
         return np.array([frame[:3, 3] for frame in frames])
+
+
+class OnController:
+    """A servo on the mock's own arm: its servoj, its joints, its packages; one `period` after the other."""
+
+    def __init__(self, **changes: object) -> None:
+        self.servo = Servo(worker_config(**changes))
+        self.arm = Arm("ur5e", HOME)
+        self.joints: FloatArray | None = None  # of the newest servoj; the controller repeats it by itself
+        self.tick, self.number, self.partners = 0, 0, list[Record | None]()
+        self.packages: list[Measured] = []
+        self.twists: list[FloatArray] = []  # (6,) of the sensor itself, one a period
+        self.ours: list[bool] = []  # whether the newest target in this period was made in it
+        self._run(None)
+
+    @property
+    def time(self) -> float:
+        return self.tick * PERIOD
+
+    @property
+    def at(self) -> Pose:
+        return pose_of(self.packages[-1].sensor)
+
+    def ask(self, target: Pose, age: float = 0.0) -> None:
+        self.number += 1
+        row = np.array([*target.position, *target.quaternion])
+        self.servo.on_command(self.number, command_record(self.time - age, CommandKind.TARGET, row))
+
+    def period(self, late: int = 1) -> None:
+        """The newest package that the worker knows is `late` periods old."""
+        known = self.packages[max(0, len(self.packages) - 1 - late)]
+        self.servo.check_faults(known, self.partners)
+        self._run(self.servo.step(self.time, known, self.partners))
+
+    def stall(self, periods: int) -> None:
+        """The worker is suspended."""
+        for _ in range(periods):
+            self._run(None)
+
+    def _run(self, joints: FloatArray | None) -> None:
+        self.ours.append(joints is not None and (self.joints is None or bool((joints != self.joints).any())))
+        self.joints = self.joints if joints is None else joints
+        if self.joints is not None:
+            next(servoj(self.arm, self.joints, PERIOD, self.servo.config.lookahead))
+        self.arm.advance()
+        self.tick += 1
+        package = np.zeros((), STATE)
+        package["stamp"], package["joints"], package["tcp_pose"] = self.time, self.arm.q, self.arm.pose
+        package["tcp_speed"] = self.arm.twist
+        self.packages.append(self.servo.frames.measure(package))
+        self.twists.append(self.packages[-1].twist)
 
 
 def shifted(start: Pose, x: float, y: float = 0.0, z: float = 0.0) -> Pose:

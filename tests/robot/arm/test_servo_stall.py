@@ -1,0 +1,166 @@
+"""What the arm itself does when its worker misses periods: suspended, paged out, late. No sockets and no clock.
+
+While no target comes, the controller lets the arm run out towards the last one by its own law, with a deceleration of
+speed / lookahead; that part is not ours. From the first new target on, speed and acceleration of the arm are within the
+limits again, which is what is judged here: at the arm, not at the targets.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robot.arm.channel import ArmStatus
+from robot.arm.servo import STALL_PATIENCE
+from robot.arm.trajectory import PERIOD
+from robot.common.kinematics import rotation
+from tacsim import pose as se3
+from tests.robot.arm.servo_bench import OnController, shifted
+
+SETTLING = 5  # periods in which the joints of the mock follow a change of their target
+
+
+STALLS = (1, 3, 10, 20, 45)  # periods: 90 ms are just below the controller's watchdog
+
+
+def moving(**changes: object) -> OnController:
+    """At full speed, with some decimetres to go."""
+    arm = OnController(action_timeout=60.0, lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 1.5], **changes)
+    arm.ask(shifted(arm.at, 0.0, 0.4))
+    at_full_speed(arm)
+    return arm
+
+
+def at_full_speed(arm: OnController, late: int = 1) -> None:
+    config = arm.servo.config
+    for _ in range(int((config.speed / config.acceleration + 5.0 * config.lookahead) / PERIOD)):
+        arm.period(late)
+    assert np.linalg.norm(arm.twists[-1][:3]) > 0.99 * config.speed
+
+
+def ours(arm: OnController) -> np.ndarray:
+    """(n,) True for the periods whose change of the arm's speed is judged: targets came in all that it answers to."""
+    new = np.array(arm.ours) | np.array([not twist.any() for twist in arm.twists])
+    counted = np.array([new[max(0, k - SETTLING) : k + 1].all() for k in range(len(new))])
+    return counted[1:]
+
+
+def shares(arm: OnController) -> tuple[float, float]:
+    """Largest speed and acceleration of the arm itself, in parts of the limits."""
+    twists, config = np.array(arm.twists), arm.servo.config
+    speed = max(
+        np.linalg.norm(twists[:, :3], axis=1).max() / config.speed,
+        np.linalg.norm(twists[:, 3:], axis=1).max() / config.turn_rate,
+    )
+    change = np.diff(twists, axis=0)[ours(arm)] / PERIOD
+    acceleration = max(
+        np.linalg.norm(change[:, :3], axis=1).max() / config.acceleration,
+        np.linalg.norm(change[:, 3:], axis=1).max() / config.turn_acceleration,
+    )
+    return float(speed), float(acceleration)
+
+
+@pytest.mark.promise(2)
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "lookahead", "late"),
+    [(0.1, 0.5, 0.03, 1), (0.1, 0.5, 0.03, 3), (0.02, 0.2, 0.03, 0), (0.1, 1.0, 0.1, 1)],
+)
+def test_after_a_stall_the_arm_goes_on_within_its_limits(
+    speed: float, acceleration: float, lookahead: float, late: int
+) -> None:
+    arm = moving(speed=speed, acceleration=acceleration, lookahead=lookahead)
+    for stall, backlog in zip(STALLS, (0, 1, 2, 3, 3), strict=True):
+        arm.stall(stall)
+        for old in range(backlog):  # packages from before the stall come first
+            arm.period(late=stall + old + late)
+        at_full_speed(arm, late)  # it goes on
+    assert shares(arm)[0] <= 1.01
+    assert shares(arm)[1] <= 1.03
+
+
+def test_without_the_restart_it_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Guards the test above."""
+    arm = moving()
+    monkeypatch.setattr(arm.servo, "_waits_after_stall", lambda time, measured: False)
+    arm.stall(40)
+    for _ in range(50):
+        arm.period()
+    assert shares(arm)[1] > 3.0
+
+
+def test_a_stall_without_news_goes_on_from_rest_after_a_while() -> None:
+    """The controller's clock has jumped back meanwhile: no package seems to be from after the stall."""
+    arm = moving()
+    arm.stall(20)
+    target = arm.joints
+    for _ in range(STALL_PATIENCE - 1):
+        arm.period(late=60)
+        assert arm.joints is target
+    for _ in range(500):
+        arm.period(late=60)
+    assert np.linalg.norm(arm.twists[-1][:3]) > 0.99 * arm.servo.config.speed
+    assert shares(arm)[1] <= 1.03
+
+
+def way_after_a_fault(speed: float, stalls: tuple[int, ...] = ()) -> tuple[float, float]:
+    """How far the arm goes after a fault at `speed` [m/s], and its top speed once it has been braked [m/s]."""
+    arm = moving(speed=speed, acceleration=3.0)
+    begun, count = arm.at.position, len(arm.twists)
+    arm.servo.trip(ArmStatus.FORCE_LIMIT, arm.packages[-1])
+    arm.period()
+    for length in stalls:
+        arm.stall(length)
+        arm.period()
+    for _ in range(150):
+        arm.period()
+    assert arm.servo.resting
+    assert np.linalg.norm(arm.twists[-1][:3]) < 1e-4
+    gone = max(float(np.linalg.norm(package.sensor[:3, 3] - begun)) for package in arm.packages[count:])
+    return gone, float(np.linalg.norm(np.array(arm.twists)[count + 15 :, :3], axis=1).max())
+
+
+@pytest.mark.promise(3)
+@pytest.mark.parametrize("speed", [0.05, 0.1, 0.3])
+def test_an_arm_in_a_fault_is_not_drawn_on(speed: float) -> None:
+    """A target that brakes far ahead of an arm that stands already would make it move again; so would one that went on
+    at its old speed after a stall."""
+    way, later = way_after_a_fault(speed)
+    assert way <= speed * 12e-3
+    assert later <= 0.15 * speed
+    for stalls in ((1, 2, 5), (4,), (40,)):
+        stalled, later = way_after_a_fault(speed, stalls)
+        assert stalled <= 1.02 * way
+        assert later <= 0.25 * speed
+
+
+def test_what_could_not_be_sent_is_taken_back() -> None:
+    arm = moving()
+    before = arm.servo.motion
+    arm.servo.step(arm.time, arm.packages[-1], [])
+    assert arm.servo.motion is not before
+    arm.servo.withdraw()
+    assert arm.servo.motion is before
+    arm.stall(40)  # it was suspended in between
+    for _ in range(300):
+        arm.period()
+    assert shares(arm)[1] <= 1.03
+
+
+@pytest.mark.promise(1, 2)
+@pytest.mark.parametrize("seed", range(3))
+def test_random_ways_with_random_stalls_stay_within_the_limits(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    arm = OnController(action_timeout=60.0)
+    start = arm.at
+    for _ in range(16):
+        turned = se3.from_matrix(np.block([[rotation(random.uniform(-0.3, 0.3, 3)), np.zeros((3, 1))], [0, 0, 0, 1]]))
+        target = se3.compose(shifted(start, *random.uniform(-0.15, 0.15, 3)), turned)
+        arm.ask(target)
+        for _ in range(int(random.integers(5, 100))):
+            arm.period(late=int(random.integers(0, 2)))
+        arm.stall(int(random.integers(0, 46)))
+    speed, acceleration = shares(arm)
+    assert speed <= 1.02
+    assert acceleration <= 1.05
+    places = np.array([package.sensor[:3, 3] for package in arm.packages])
+    assert arm.servo.region.excess(places).max() <= 1e-6

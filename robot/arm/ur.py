@@ -8,6 +8,7 @@ belong in the safety configuration on the pendant.
 from __future__ import annotations
 
 import math
+import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -366,8 +367,9 @@ class URArm(Closing):
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
                 text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
-        if status == ArmStatus.WORKER_DEAD and self._worker is not None and (words := self._worker.last_words):
-            text += f" ({words})"
+        if status == ArmStatus.WORKER_DEAD and self._worker is not None:
+            late = self._worker.exit_status == -signal.SIGALRM
+            text += f" ({'a command took longer than link_timeout' if late else self._worker.last_words})"
         return text
 
 

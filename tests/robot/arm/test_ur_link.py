@@ -14,6 +14,7 @@ import pytest
 from robot.arm import ur
 from robot.arm.channel import ArmStatus
 from robot.arm.ur import URArm
+from robot.arm.worker import BLIND
 from robot.errors import (
     DeviceError,
     DeviceNotConnectedError,
@@ -45,13 +46,15 @@ def test_a_silent_link_is_lost_and_the_program_that_asks_is_not(mock: MockUR, me
         start = arm.state().pose
         at_full_speed(arm, moved(start, x=0.12))
         mock.faults.silence(True)
+        last = mock.faults.received().last
         told = until(lambda: arm.status() == ArmStatus.LINK_LOST, "lost link", pause=2e-4)
-        last = float(arm._channel.states.latest()["time"])  # type: ignore[index]
-        figure("silent link told (link_timeout 50 ms)", 1e3 * (told - last), "ms", at_most=60)
+        newest = float(arm._channel.states.latest()["time"])  # type: ignore[index]
+        figure("silent link told (link_timeout 50 ms)", 1e3 * (told - newest), "ms", at_most=60)
         with pytest.raises(StaleObservationError, match=f"more than link_timeout = {1e3 * timeout:g} ms"):
             arm.state()
         with pytest.raises(LinkLost, match="sends no packages"):
             arm.command(start)
+        assert len(servo_targets(mock.faults.received(last).entries)) <= 3 * BLIND  # then it sends no more
         until(lambda: mock.faults.state().rests, "rest by the controller's watchdog")
         figure("processes that did not outlive it", len(arm.history()) <= 5)
         assert len(arm.history()) > 5  # what was known stays known

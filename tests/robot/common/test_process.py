@@ -146,6 +146,33 @@ def test_what_goes_wrong_there_is_an_error_here(child: Callable[[str], Child], a
     assert not alive(running.pid)
 
 
+LAST = """
+import os, signal
+from robot.common.process import Parent
+parent = Parent()
+parent.send({"ready": True})
+print("one", flush=True)
+print("two", flush=True)
+act()
+"""
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [("os._exit(7)", "exit status 7: two"), ("os.kill(os.getpid(), signal.SIGSEGV)", "killed by SIGSEGV: two")],
+)
+def test_the_last_words_of_a_child_are_how_it_ended_and_its_last_line(
+    child: Callable[..., Child], act: str, words: str
+) -> None:
+    with child(act, LAST) as running:
+        running.receive(PATIENCE)
+        until(lambda: not running.running, "end of the child")
+        assert running.last_words == words
+        with pytest.raises(DeviceError, match=f"has ended, {words.partition(':')[0]}; start another"):
+            running.check()
+    assert running.last_words == ""
+
+
 def test_a_child_that_does_not_start_is_an_error_with_its_reason(child: Callable[..., Child]) -> None:
     why = r"(?s)exit status 1.*No module named 'no_such_module'"
     with child(stand_in="import no_such_module") as running, pytest.raises(DeviceError, match=why):

@@ -68,7 +68,7 @@ def mock(
         for each in hosts:
             results.print(f"{model} at {each}: ports {ports}; faults {FAULT_PORT}")
         for each in camera_hosts:
-            camera = stack.enter_context(MockCamera(each, camera_port, allow_network=allow_network))
+            camera = stack.enter_context(MockCamera(each, camera_port, noise=2, allow_network=allow_network))
             devices.append(camera)
             results.print(f"camera at {camera.url}", markup=False)
         results.print("Ctrl-C ends them.")

@@ -9,7 +9,7 @@ import pytest
 
 from robot.mock import MockUR
 from tests.robot.arm.mocked import HOST
-from tests.robot.stops.watched import Trial
+from tests.robot.stops.watched import LINK_TIMEOUT, Trial
 
 TRIES = 5
 BACK = (0.1, 1.0, 3.0, 0.0)  # a line is whole again after so long, in turn; 0: a cut one at once, a held one never [s]
@@ -43,7 +43,6 @@ def watch(measuring: bool) -> float:
 
 
 @pytest.fixture
-def back(request: pytest.FixtureRequest) -> float:
+def back(request: pytest.FixtureRequest, measuring: bool) -> float:
     """After how long a broken line is whole again [s]."""
-    callspec = getattr(request.node, "callspec", None)
-    return BACK[(callspec.params.get("repetition", 0) if callspec else 0) % len(BACK)]
+    return BACK[request.node.callspec.params["repetition"] % len(BACK)] if measuring else 1.5 * LINK_TIMEOUT

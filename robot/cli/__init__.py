@@ -16,6 +16,7 @@ from robot.cli.debug import debug
 from robot.cli.doctor import doctor, schema
 from robot.cli.errors import Guarded
 from robot.cli.mock import mock
+from robot.cli.recover import recover
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce
 
@@ -31,7 +32,7 @@ app = typer.Typer(
 )
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {
-    app: (run, press, reproduce, replay, mock, bench, compare, debug, schema, doctor),
+    app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor),
     calibrate: (latency, lens, touch, hand_eye),
 }
 for group, commands in COMMANDS.items():

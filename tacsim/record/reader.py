@@ -70,7 +70,7 @@ class RecordedSteps(Sequence[Step]):
             return [self[k] for k in range(*index.indices(len(self)))]
         number = range(len(self))[index]  # IndexError, and counting from the end
         place, gathered = self._places[number], _Gathered(dict(self._topics))
-        with _open(self._path) as file:
+        with open_file(self._path) as file:
             file.seek(place.offset)
             records = read_records(file, self._path.stat().st_size, str(self._path))
             for _, record in islice(records, place.skip, None):
@@ -88,7 +88,7 @@ class EpisodeFile:
         self.dropped = 0  # after the last step
         self.places: list[Place] = []  # of the steps so far
         self.topics: dict[int, str] = {}
-        self._file = _open(self.path)
+        self._file = open_file(self.path)
         try:
             check_magic(self._file, str(self.path))
             self._records = read_records(self._file, self.path.stat().st_size, str(self.path))
@@ -124,7 +124,7 @@ class EpisodeFile:
             last, inside = offset, inside + 1 if offset == last else 0
             begin = begin or Place(offset, inside)
             if isinstance(record, Metadata) and record.name == CLOSE:
-                closing = _closing(record)
+                closing = closing_account(record)
             elif isinstance(record, Footer) and closing is not None:
                 self.complete = closing["steps"] == len(self.places) and not closing["cut"]
                 self.dropped = closing["dropped"]
@@ -175,7 +175,8 @@ def _decode(data: bytes, messages: Messages, sizes: dict[str, tuple[int, int]], 
         raise EpisodeError(f"{path}: step number {number}: {failure}") from failure
 
 
-def _open(path: Path) -> BinaryIO:
+def open_file(path: Path) -> BinaryIO:
+    """Raises EpisodeError."""
     try:
         if not path.is_file():
             raise EpisodeError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
@@ -184,7 +185,7 @@ def _open(path: Path) -> BinaryIO:
         raise EpisodeError(f"{path}: cannot be opened: {failure.strerror}") from failure
 
 
-def _closing(record: Metadata) -> dict[str, int] | None:
+def closing_account(record: Metadata) -> dict[str, int] | None:
     """Numbers of the closing record; None when it is damaged."""
     try:
         values = unsealed(record.metadata, CLOSE)

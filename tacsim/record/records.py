@@ -7,7 +7,10 @@ Format: https://mcap.dev/spec
 
 from __future__ import annotations
 
+import contextlib
 import io
+import mmap
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -110,3 +113,69 @@ def open_chunk(chunk: Chunk, what: str) -> Iterator[tuple[int, McapRecord]]:
     if chunk.compression or zlib.crc32(chunk.data) != chunk.uncompressed_crc:
         raise _BadRecord
     yield from _records(io.BytesIO(chunk.data), len(chunk.data))
+
+
+# A chunk that is not compressed: opcode, length, times of its messages, size, checksum, "", size again.
+_CHUNK = re.compile(rb"\x06.{4}\0{4}.{16}.{4}\0{4}.{4}\0{4}.{4}\0{4}", re.DOTALL)
+
+
+class Survivors:
+    """What is whole in a file that was cut off or damaged: after damage the next whole chunk is looked for.
+
+    Iterates over the records of each chunk together, and of what lies between chunks each by itself. After that
+    `damaged` holds the beginning and end of what was left out [bytes], `doubtful` the definitions of topics in damaged
+    chunks, and `footer` is the last record of a file that was finished with an index. Raises EpisodeError for
+    compressed chunks.
+    """
+
+    def __init__(self, file: BinaryIO, size: int, what: str) -> None:
+        self.damaged: list[tuple[int, int]] = []
+        self.doubtful: list[Schema | Channel] = []
+        self.footer: Footer | None = None
+        self._file, self._size, self._what = file, size, what
+
+    def __iter__(self) -> Iterator[list[McapRecord]]:
+        place = len(MCAP0_MAGIC)
+        with mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ) as memory:
+            while place < self._size:
+                self._file.seek(place)
+                try:
+                    for _, record in _records(self._file, self._size - place):
+                        end = self._file.tell()
+                        if isinstance(record, Footer):
+                            self._take_footer(record)
+                            return
+                        yield self._open(record) if isinstance(record, Chunk) else [record]
+                        place = end
+                    return
+                except _BadRecord:
+                    found = _CHUNK.search(memory, place + 1)
+                    after = self._size if found is None else found.start()
+                    if self.damaged and self.damaged[-1][1] == place:  # what was found is no chunk either
+                        self.damaged[-1] = (self.damaged[-1][0], after)
+                    else:
+                        self.damaged.append((place, after))
+                    place = after
+
+    def _open(self, chunk: Chunk) -> list[McapRecord]:
+        try:
+            return [record for _, record in open_chunk(chunk, self._what)]
+        except _BadRecord:
+            with contextlib.suppress(_BadRecord):
+                for _, record in _records(io.BytesIO(chunk.data), len(chunk.data)):
+                    if isinstance(record, Schema | Channel):
+                        self.doubtful.append(record)
+            raise
+
+    def _take_footer(self, footer: Footer) -> None:
+        """Keeps the footer if the file ends with it, and the index that it tells of is there and whole."""
+        end = self._file.tell()
+        if footer.summary_start == 0 or self._file.read(len(MCAP0_MAGIC) + 1) != MCAP0_MAGIC:
+            return
+        checksum = 0
+        self._file.seek(footer.summary_start)
+        left = end - 4 - footer.summary_start  # up to the checksum itself, which ends the footer
+        while left > 0 and (part := self._file.read(min(left, 1 << 20))):
+            checksum, left = zlib.crc32(part, checksum), left - len(part)
+        if left == 0 and checksum == footer.summary_crc:
+            self.footer = footer

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.common.kinematics import Kinematics, matrix
+from robot.common.kinematics import MODELS, Kinematics, matrix
 from robot.mock import MOCK_SERIAL, FaultClient, MockUR
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
@@ -44,6 +44,42 @@ def answers(mock: MockUR) -> bool:
 
 
 # -- framing ---------------------------------------------------------------------------------------------------------
+
+
+ROS = """timestamp actual_q actual_qd speed_scaling target_speed_fraction runtime_state actual_TCP_force actual_TCP_pose
+target_TCP_pose tcp_offset actual_digital_input_bits actual_digital_output_bits standard_analog_input0
+standard_analog_input1 standard_analog_output0 standard_analog_output1 analog_io_types tool_mode tool_analog_input_types
+tool_analog_input0 tool_analog_input1 tool_output_voltage tool_output_current tool_temperature robot_mode safety_mode
+robot_status_bits safety_status_bits actual_current"""
+
+
+def test_the_recipe_of_the_ros_driver_is_known(mock: MockUR) -> None:
+    """ur_robot_driver/resources/rtde_output_recipe.txt of the ROS 2 driver."""
+    with RtdeClient(mock.host) as client:
+        client.protocol()
+        assert client.outputs(*ROS.split())[0] == 1
+        client.start()
+        state = client.receive()
+    assert state["tool_mode"] == (253,) and state["analog_io_types"] == (0,)
+
+
+def test_bit_registers_and_elbow(mock: MockUR) -> None:
+    inputs = [f"input_bit_register{which}" for which in ("s0_to_31", "s32_to_63", "_64", "_127")]
+    with RtdeClient(mock.host) as client:
+        client.protocol()
+        client.outputs(*inputs, "elbow_position", "output_bit_register_64", "tcp_force_scalar")
+        recipe, _ = client.inputs(*inputs)
+        client.start()
+        for bits in ((0xFFFFFFFF, 0x80000001, True, True), (5, 0, False, True)):
+            client.send(recipe, *bits)
+            deadline = time.monotonic() + TIMEOUT
+            while tuple(client.receive()[name][0] for name in inputs) != bits:
+                assert time.monotonic() < deadline
+        mock.faults.wrench([3, 4, 12, 1, 1, 1])
+        while (state := client.receive())["tcp_force_scalar"][0] != 13:
+            assert time.monotonic() < deadline
+    upper_arm = MODELS["ur5e"].d1 - MODELS["ur5e"].a2  # upright: joint 2 is at -90 degrees
+    assert state["elbow_position"] == pytest.approx((0, 0, upper_arm), abs=1e-9)
 
 
 def test_packages_are_taken_whole_from_any_pieces() -> None:

@@ -89,6 +89,11 @@ class Outputs:
         self.analog = [0.0, 0.0]  # fraction of the range
         self.analog_is_voltage = [False, False]
 
+    @property
+    def analog_types(self) -> int:
+        """analog_io_types: bits 0 and 1 of the inputs, 2 and 3 of the outputs; 0 is a current, 1 a voltage."""
+        return self.analog_is_voltage[0] << 2 | self.analog_is_voltage[1] << 3
+
     def analog_value(self, index: int) -> float:
         """Of a standard analog output: [V] of 0-10 V, or [A] of 4-20 mA."""
         part = self.analog[index]
@@ -111,7 +116,7 @@ class Machine:
         self.mode, self.safety = Mode.RUNNING, Safety.NORMAL
         self.in_int, self.in_double = [0] * REGISTERS, [0.0] * REGISTERS
         self.out_int, self.out_double = [0] * REGISTERS, [0.0] * REGISTERS
-        self.in_bits = [False] * 128
+        self.in_bits = 0  # input bit registers 0 to 127
         self.slider = 1.0
         self.program: Program | None = None
         self.paused = False

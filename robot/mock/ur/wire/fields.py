@@ -1,14 +1,17 @@
 """The fields of the RTDE: names, types, and where their values come from (Real-Time Data Exchange guide, Universal
 Robots).
 
-Real: everything about joints, TCP, forces on the tool, modes, registers, in- and outputs, payload. Constant, because
-nothing is modelled behind them: temperatures, voltages, currents, moments, momentum, accelerometer (the arm at rest).
+Real: everything about joints, TCP, elbow, forces on the tool, modes, registers, in- and outputs, payload. Constant,
+because nothing is modelled behind them: temperatures, voltages, currents, moments, momentum, inputs, what is plugged
+into the tool, accelerometer (the arm at rest).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -73,6 +76,26 @@ def _powered(volts: float, count: int) -> Callable[[Machine], Values]:
     return read
 
 
+def _bits(first: int, count: int) -> Callable[[Machine], Values]:
+    return lambda machine: machine.in_bits >> first & ((1 << count) - 1)
+
+
+def _elbow(machine: Machine) -> Values:
+    """Position (3,) of the end of the upper arm, base axes [m]."""
+    lengths, (q1, q2, *_) = machine.arm.kinematics.lengths, machine.arm.q.tolist()
+    out = lengths.a2 * math.cos(q2)
+    return out * math.cos(q1), out * math.sin(q1), lengths.d1 + lengths.a2 * math.sin(q2)
+
+
+def _elbow_velocity(machine: Machine) -> Values:
+    """(3,), base axes [m/s]."""
+    (q1, q2, *_), (w1, w2, *_) = machine.arm.q.tolist(), machine.arm.qd.tolist()
+    x, y, _ = cast("tuple[float, ...]", _elbow(machine))
+    a2 = machine.arm.kinematics.lengths.a2
+    outwards = -a2 * math.sin(q2) * w2
+    return -y * w1 + outwards * math.cos(q1), x * w1 + outwards * math.sin(q1), a2 * math.cos(q2) * w2
+
+
 OUTPUTS: dict[str, Output] = {
     "timestamp": Output("DOUBLE", lambda m: m.time + m.clock_offset),
     "target_q": Output("VECTOR6D", lambda m: m.arm.target_q.tolist()),
@@ -108,6 +131,17 @@ OUTPUTS: dict[str, Output] = {
     "actual_joint_voltage": Output("VECTOR6D", _powered(48.0, 6)),
     "actual_digital_output_bits": Output("UINT64", lambda m: m.outputs.digital),
     "runtime_state": Output("UINT32", lambda m: int(m.runtime)),
+    "elbow_position": Output("VECTOR3D", _elbow, since=((3, 5), (5, 0))),
+    "elbow_velocity": Output("VECTOR3D", _elbow_velocity, since=((3, 5), (5, 0))),
+    "tcp_force_scalar": Output("DOUBLE", lambda m: math.hypot(*m.load.felt[:3].tolist())),
+    "analog_io_types": Output("UINT32", lambda m: m.outputs.analog_types),
+    "tool_mode": Output("UINT32", lambda m: JOINT_MODES.get(m.mode, POWERED_OFF)),
+    "tool_analog_input_types": Output("UINT32", _constant(0)),
+    "tool_analog_input0": Output("DOUBLE", _constant(0.0)),
+    "tool_analog_input1": Output("DOUBLE", _constant(0.0)),
+    "tool_output_voltage": Output("INT32", _constant(0)),
+    "tool_output_current": Output("DOUBLE", _constant(0.0)),
+    "tool_temperature": Output("DOUBLE", _constant(30.0)),
     "standard_analog_input0": Output("DOUBLE", _constant(0.0)),
     "standard_analog_input1": Output("DOUBLE", _constant(0.0)),
     "standard_analog_output0": Output("DOUBLE", lambda m: m.outputs.analog_value(0)),
@@ -123,6 +157,10 @@ OUTPUTS: dict[str, Output] = {
     "script_control_line": Output("UINT32", _constant(0), since=((3, 14), (5, 9))),
     "output_bit_registers0_to_31": Output("UINT32", _constant(0)),
     "output_bit_registers32_to_63": Output("UINT32", _constant(0)),
+    **{f"output_bit_register_{i}": Output("BOOL", _constant(False)) for i in range(64, 128)},
+    "input_bit_registers0_to_31": Output("UINT32", _bits(0, 32)),
+    "input_bit_registers32_to_63": Output("UINT32", _bits(32, 32)),
+    **{f"input_bit_register_{i}": Output("BOOL", _bits(i, 1)) for i in range(64, 128)},
     **{f"output_int_register_{i}": Output("INT32", _register("out_int", i)) for i in range(REGISTERS)},
     **{f"output_double_register_{i}": Output("DOUBLE", _register("out_double", i)) for i in range(REGISTERS)},
     **{f"input_int_register_{i}": Output("INT32", _register("in_int", i)) for i in range(REGISTERS)},
@@ -157,6 +195,10 @@ def apply(machine: Machine, given: dict[str, Value | tuple[Value, ...]]) -> None
             machine.on_int_register(int(index))
         elif kind == "input_double_register":
             machine.in_double[int(index)] = float(value)  # type: ignore[arg-type]
+        elif name.startswith("input_bit_register"):
+            first, count = (0, 32) if index == "31" else (32, 32) if index == "63" else (int(index), 1)
+            mask = ((1 << count) - 1) << first
+            machine.in_bits = machine.in_bits & ~mask | int(value) << first  # type: ignore[arg-type]
     _outputs(machine, given)
 
 

@@ -11,6 +11,7 @@ from robot.common.kinematics import displacement, matrix, pose
 from robot.mock.ur.machine.arm import PERIOD
 from robot.mock.ur.machine.load import Mass
 from robot.mock.ur.machine.machine import Machine, Safety
+from robot.mock.ur.wire.fields import OUTPUTS
 from tacsim.interface import FloatArray
 from tests.robot.mock.machine_bench import DOWN, Bench
 from tests.robot.mock.wire_client import control_script
@@ -61,6 +62,16 @@ def test_actual_trails_target_and_both_speeds_agree(bench: Bench) -> None:
     before = bench.arm.frame.copy()
     bench.tick()
     np.testing.assert_allclose(displacement(before, bench.arm.frame) / PERIOD, bench.arm.twist, atol=1e-4)
+
+
+def test_elbow_velocity_is_that_of_its_position(bench: Bench) -> None:
+    bench.write(9, [0.3, -0.2, 0.4, 0, 0, 0, 5.0, 0.0])
+    bench.tick(300)
+    before = np.array(OUTPUTS["elbow_position"].read(bench.machine))
+    bench.tick()
+    moved = np.array(OUTPUTS["elbow_position"].read(bench.machine)) - before
+    np.testing.assert_allclose(moved / PERIOD, OUTPUTS["elbow_velocity"].read(bench.machine), atol=1e-3)
+    assert np.linalg.norm(moved) > 1e-4
 
 
 def test_speed_ramps_at_its_acceleration_and_goes_on_for_ever(bench: Bench) -> None:

@@ -15,6 +15,7 @@ from robot.mock import MOCK_SERIAL
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.machine.load import GRAVITY
 from tests.robot.mock.wheel.cases import Robot, Verdict, case
+from tests.robot.mock.wire_client import RtdeClient
 
 RECEIVE, IO, DASHBOARD = "RTDEReceiveInterface", "RTDEIOInterface", "DashboardClient"
 
@@ -120,15 +121,11 @@ def constants(robot: Robot) -> None:
     assert receive.getStandardAnalogInput0() == receive.getStandardAnalogInput1() == 0
 
 
-@case(
-    RECEIVE,
-    "getOutputIntRegister getOutputDoubleRegister",
-    Verdict.CONSTANT,
-    "0: registers 12 to 19 and 36 to 43 are for scripts of a user",
-)
+@case(RECEIVE, "getOutputIntRegister getOutputDoubleRegister")
 def output_registers(robot: Robot) -> None:
-    receive = robot.receive
-    assert [call(12) for call in (receive.getOutputIntRegister, receive.getOutputDoubleRegister)] == [0, 0.0]
+    receive, script = robot.receive, "write_output_integer_register(12, 7)\nwrite_output_float_register(19, 2.5)"
+    assert robot.control.sendCustomScriptFunction("registers", script)
+    robot.until(lambda: receive.getOutputIntRegister(12) == 7 and receive.getOutputDoubleRegister(19) == 2.5)
     with pytest.raises(ValueError, match="12-19"):
         receive.getOutputIntRegister(0)
 
@@ -180,18 +177,12 @@ def io_outputs(robot: Robot) -> None:
 
 @case(IO, "setInputIntRegister setInputDoubleRegister")
 def io_registers(robot: Robot) -> None:
-    receive = __import__("rtde_receive").RTDEReceiveInterface(
-        robot.host, 500.0, ["timestamp", "input_int_register_18", "input_double_register_19"]
-    )
     assert robot.io.setInputIntRegister(18, 42) and robot.io.setInputDoubleRegister(19, 2.5)
-    from tests.robot.mock.wire_client import RtdeClient
-
     with RtdeClient(robot.host) as client:
         client.protocol()
         client.outputs("input_int_register_18", "input_double_register_19")
         client.start()
         robot.until(lambda: client.newest() == {"input_int_register_18": (42,), "input_double_register_19": (2.5,)})
-    assert receive.isConnected()
 
 
 @case(IO, "isConnected disconnect reconnect")

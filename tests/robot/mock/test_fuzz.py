@@ -17,7 +17,7 @@ from robot.mock.ur.fault_server import ACTIONS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS
 from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, MESSAGE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, VERSION, package
-from tests.robot.mock.innocent import Innocent
+from tests.robot.mock.innocent import Innocent, until
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, control_script, wire_host
 
 KINDS = (PROTOCOL, VERSION, MESSAGE, DATA, OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE)
@@ -96,11 +96,30 @@ def door(chance: random.Random) -> bytes:
 WIRE: dict[int, Callable[[random.Random], bytes]] = {RTDE: rtde, DASHBOARD: requests, **dict.fromkeys(SCRIPTS, script)}
 
 
+def command(arms: MockArms, chance: random.Random) -> None:
+    """The control script, and commands with numbers that do not go with them."""
+    faults = arms.fault_clients[0]
+    until(lambda: faults.state().clients == (RTDE,), "the others have gone, and all they sent is served")
+    faults.recover()
+    path = [chance.choice(MOVES.split("|")) for _ in range(chance.choice((0, 3, 300)))]
+    with ControlClient(arms.hosts[0], control_script(path=path)) as client:
+        for _ in range(chance.randrange(1, 30)):
+            doubles = [chance.choice((*NUMBERS, 0.1, 0.01)) for _ in range(18)]
+            integers = [chance.choice((0, 1, 2, -1, 1 << 30)) for _ in range(7)]
+            client.write(chance.choice((0, chance.randrange(80))), doubles, integers)
+            if client.receive()["runtime_state"] != (2,):
+                return
+
+
 def abuse(arms: MockArms, seed: int, steps: int, ports: dict[int, Callable[[random.Random], bytes]]) -> None:
     """Connects to the first arm again and again, sends, sometimes reads, leaves or stays."""
     chance, lines = random.Random(seed), []
     try:
         for _ in range(steps):
+            if ports is WIRE and chance.random() < 0.15:
+                while lines:
+                    lines.pop().close()  # who hold input registers
+                command(arms, chance)
             port = chance.choice(list(ports))
             with contextlib.suppress(OSError):  # cut, or refused
                 line = socket.create_connection((arms.hosts[0], port), TIMEOUT)

@@ -8,7 +8,7 @@ from itertools import islice
 from robot.mock.ur.fault_client import Input
 from robot.mock.ur.wire.rtde import InputRecipe
 
-KEPT = 1 << 24  # of one controller; about two minutes of a driver that sends 500 times a second [bytes]
+KEPT = 1 << 24  # of one controller; a minute and a half of a driver at 500 Hz [bytes]
 OVERHEAD = 256  # of a package that is kept, besides its payload [bytes]
 
 

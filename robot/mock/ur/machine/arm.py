@@ -29,13 +29,17 @@ BRAKE = 20.0  # the same in a protective or emergency stop [rad/s^2]
 HOME = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)  # tool down, in front of the base
 HISTORY = 2500  # periods of joint positions that are kept
 REST = 1e-9  # joint speed below which the arm rests [rad/s]
-JUMP = 1.0  # farthest that a motion may take a joint in one period; no arm follows that [rad]
+TOP = 1.001  # of the joints' top speeds, beyond which a motion is refused; the rest is rounding
 
 MotionSteps = Iterator[None]  # a motion as a generator: one `yield` is one control period
 
 
 class ProgramError(Exception):
     """A run-time error of the program: on the controller it ends the program."""
+
+
+class TooFast(ProgramError):
+    """A motion asks for more than a joint's top speed: on the controller a protective stop."""
 
 
 class Arm:
@@ -62,8 +66,11 @@ class Arm:
 
     def follow(self, q: FloatArray) -> None:
         """Asks for joints q at the end of this control period."""
-        if not float(np.abs(q - self.target_q).max()) <= JUMP:  # not a number is none either
-            raise ProgramError(f"motion command that jumps by more than {JUMP:g} rad in one control period")
+        speeds = np.abs(q - self.target_q) / PERIOD
+        fast = ~(speeds <= TOP * self.kinematics.joint_speeds)  # not a number is none either
+        if fast.any():
+            joint = int(np.argmax(fast))
+            raise TooFast(f"joint {joint + 1} at {speeds[joint]:.2f} rad/s, too fast")
         if self._next is not None:
             raise ProgramError("another thread is already controlling the robot")
         self._next = q

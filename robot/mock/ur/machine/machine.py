@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot.common.kinematics import JOINT_RANGE
-from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, Arm, ProgramError
+from robot.mock.ur.machine.arm import BRAKE, COAST, HOME, PERIOD, TOP, Arm, ProgramError, TooFast
 from robot.mock.ur.machine.force_mode import ForceMode
 from robot.mock.ur.machine.load import NOTHING, Load, Mass, at_flange
 from robot.mock.ur.machine.motion import FREEDRIVE_DAMPING, FREEDRIVE_TURN_DAMPING, comply
@@ -306,6 +306,8 @@ class Machine:
     def _guarded(self, work: Callable[[], object]) -> None:
         try:
             work()
+        except TooFast as error:
+            self.protective_stop(str(error))
         except ProgramError as error:
             self.stop(str(error))
             self.script_errors.append(f"runtime_error:{error}")
@@ -339,12 +341,12 @@ class Machine:
         force = math.sqrt(sum(value * value for value in self.load.unexplained[:3].tolist()))
         if force > self.load.force_limit:
             self.protective_stop(f"force of {force:.0f} N, limit {self.load.force_limit:g} N")
-        fast = np.abs(arm.set_qd) > arm.kinematics.joint_speeds * 1.001
+        fast = np.abs(arm.set_qd) > TOP * arm.kinematics.joint_speeds  # in force mode
         if fast.any():
             joint = int(np.argmax(fast))
             self.protective_stop(f"joint {joint + 1} at {abs(arm.set_qd[joint]):.2f} rad/s, too fast")
-        beyond = np.abs(arm.set_q) > 2 * math.pi
-        if beyond.any() and arm.set_qd.any():
+        beyond = (np.abs(arm.set_q) > JOINT_RANGE) & (arm.set_q * arm.set_qd > 0)  # the way back is free
+        if beyond.any():
             self.protective_stop(f"joint {int(np.argmax(beyond)) + 1} at the end of its range")
 
     # -- what comes in -----------------------------------------------------------------------------------------------

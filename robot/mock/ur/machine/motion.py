@@ -101,7 +101,12 @@ def path(arm: Arm, waypoints: Sequence[Waypoint]) -> MotionSteps:
         stretch = waypoints[first : last + 1]
         acceleration = min(point.acceleration for point in stretch)
         yield from stopl(arm, acceleration)
-        pieces = _pieces([arm.target_frame, *(point.frame for point in stretch)], [point.blend for point in stretch])
+        corners = [arm.target_frame, *(point.frame for point in stretch)]
+        pieces: list[Piece] = []
+        for some in _pieces(corners, [point.blend for point in stretch]):
+            pieces += some
+            if len(some) > 1:  # a rounding takes a millisecond to plan, and a path may have a thousand
+                yield
         arm.waypoint = stretch[-1].frame
         ends = np.cumsum([piece.length for piece in pieces])
         for s in trapezoid(arm, float(ends[-1]), min(point.speed for point in stretch), acceleration):
@@ -121,8 +126,9 @@ class Piece:
     at: Callable[[float], FloatArray]  # distance to frame (4, 4)
 
 
-def _pieces(corners: list[FloatArray], blends: list[float]) -> list[Piece]:
-    pieces, here = [], corners[0]
+def _pieces(corners: list[FloatArray], blends: list[float]) -> Iterator[list[Piece]]:
+    """The way to each corner: a line, or a line and the rounding of the corner."""
+    here = corners[0]
     for index, corner in enumerate(corners[1:]):
         radius = blends[index] if index + 2 < len(corners) else 0.0
         if radius > 0:
@@ -131,13 +137,12 @@ def _pieces(corners: list[FloatArray], blends: list[float]) -> list[Piece]:
             # A rounding takes at most half of each of its two lines, so that neighbours do not overlap.
             radius = min(radius, 0.5 * min(arriving, leaving))
         if radius < 1e-9:
-            pieces.append(_line(here, corner))
+            yield [_line(here, corner)]
             here = corner
             continue
         begin, end = between(corner, here, radius / arriving), between(corner, following, radius / leaving)
-        pieces += [_line(here, begin), _rounding(begin, corner, end)]
+        yield [_line(here, begin), _rounding(begin, corner, end)]
         here = end
-    return pieces
 
 
 def _line(a: FloatArray, b: FloatArray) -> Piece:

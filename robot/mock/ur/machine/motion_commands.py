@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 CONTACT_FOUND = 254  # the script gives it itself
 CONTACT_FORCE, CONTACT_ONSET = 5.0, 1.0  # a contact is felt from the one, and began at the other [N]
 
+LINES = 16  # of a path that are read in one control period
 _MOVE = re.compile(r"(movej|movel|movep)\((p?)\[([^\]]*)\],\s*a=([^,]+),\s*v=([^,]+)(?:,\s*r=([^,)]+))?\)")
 _PROGRESS = re.compile(r"signal_async_progress\((\d{1,9})\)")
 
@@ -67,7 +68,9 @@ def _path(p: Program) -> MotionSteps:
     lines = map(str.strip, p.text.partition("# inject move path\n")[2].splitlines())
     block = takewhile(lambda line: not line.startswith("end"), lines)
     waiting: list[Waypoint] = []
-    for line in filter(None, block):
+    for number, line in enumerate(filter(None, block), 1):
+        if number % LINES == 0:
+            yield
         if progress := _PROGRESS.fullmatch(line):
             p.signal(int(progress.group(1)))
             continue

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -172,8 +173,12 @@ def _go_on(work: MotionSteps) -> bool:
 def _of_version(text: str, version: tuple[int, ...]) -> str:
     """The text without lines for newer controllers. `$5.10|3.15 line` needs 5.10, or 3.15 of that major version."""
 
+    @cache
+    def has(needed: str) -> bool:
+        leasts = (tuple(int(number) for number in least.split(".") if number) for least in needed.split("|"))
+        return any(least[:1] == version[:1] and version >= least for least in leasts)
+
     def kept(line: re.Match[str]) -> str:
-        needed = (tuple(int(number) for number in least.split(".") if number) for least in line[1].split("|"))
-        return line[2] if any(least[:1] == version[:1] and version >= least for least in needed) else ""
+        return line[2] if has(line[1]) else ""
 
     return re.sub(r"^[ \t]*\$([\d.|]{1,99})(.*)", kept, text, flags=re.M)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot.common import MOCK_SERIAL
+from robot.common.kinematics import JOINT_RANGE
 from robot.mock.ur.machine.arm import HOME, PERIOD
 from robot.mock.ur.machine.load import NOTHING, Mass
 from robot.mock.ur.machine.machine import Machine
@@ -124,7 +125,7 @@ class Controller:
         """Off and on again: clients are cut, ports closed for so long, then the robot is there without power."""
         self.cut(PORTS, reset=True)
         self.refuse()
-        joints = tuple(float(angle) for angle in self.machine.arm.q)
+        joints = np.clip(self.machine.arm.q, -JOINT_RANGE, JOINT_RANGE).tolist()
         self.machine = Machine(self.config.model, joints, self.machine.version, self.config.tool)
         self.machine.power_off()
         self._boot_at = self.ticks + max(1, round(seconds / PERIOD))

@@ -53,6 +53,37 @@ def test_numbers_beyond_all_measure_stop_the_program(
 
 
 @pytest.mark.parametrize(
+    ("command", "doubles"),
+    [
+        (1, [3.0, -1.0, 1.0, -1.0, -1.0, 0.0, 1e6, 1e6]),
+        (3, [*DOWN, 1e6, 1e6]),
+        (9, [1e5] * 6 + [1e5, 0]),
+        (10, [1e5] * 6 + [1e5, 0]),
+    ],
+)
+def test_a_motion_beyond_the_joints_speed_is_not_begun(bench: Bench, command: int, doubles: list[float]) -> None:
+    begun, top = bench.arm.q.copy(), bench.arm.kinematics.joint_speeds
+    bench.call(command, doubles)
+    for _ in range(100):
+        bench.tick()
+        assert (np.abs(bench.arm.qd) <= 1.01 * top).all()
+    assert bench.machine.safety is Safety.PROTECTIVE_STOP and "too fast" in bench.machine.stop_reason
+    assert np.abs(bench.arm.q - begun).max() < 0.1
+    usable(bench.machine)
+
+
+def test_an_arm_at_the_end_of_its_range_can_be_driven_back(bench: Bench) -> None:
+    begun = bench.arm.q.copy()
+    bench.call(9, [0, 0, 0, 0, 0, 3.0, 10.0, 0])
+    bench.until(lambda: bench.machine.safety is Safety.PROTECTIVE_STOP and bench.arm.rests)
+    assert bench.arm.q[5] > 2 * math.pi
+    usable(bench.machine)
+    bench.call(1, [*begun, 1.0, 1.0])
+    assert bench.machine.safety is Safety.NORMAL
+    np.testing.assert_allclose(bench.arm.target_q, begun)
+
+
+@pytest.mark.parametrize(
     ("line", "words"),
     [
         ("movej([0.1,0.2,0.3],a=1,v=1,r=0)", "six numbers"),

@@ -168,7 +168,7 @@ def test_abuse(arms: MockArms) -> None:
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("seed", (10, 11))
+@pytest.mark.parametrize("seed", [10, 11])
 def test_long_abuse(arms: MockArms, seed: int) -> None:
     survives(arms, seed, 200, WIRE)
     survives(arms, seed, 100, {arms.fault_clients[0].port: door, **WIRE})

@@ -62,7 +62,9 @@ class Lab:
             controllers = MockArms(
                 [arm.host for arm in arms.values()],
                 joints=[self._joints(name, se3.compose(self.starts[name], Pose(np.array(beside)))) for name in arms],
+                payload=[(arm.payload.mass, *arm.payload.centre) for arm in arms.values()],
                 serial=SERIAL,
+                realtime=True,  # as a controller: it shares no priority with what a busy machine does
             )
             stack.enter_context(controllers)
             self.faults = dict(zip(arms, controllers.fault_clients, strict=True))

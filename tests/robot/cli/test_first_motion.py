@@ -4,14 +4,19 @@ hosts and cameras changed, before mocks that pass for real arms."""
 from __future__ import annotations
 
 import re
+import shlex
+import time
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from robot.rig import hardware_rig
+from tests.docs.test_blocks import all_blocks
 from tests.robot.cli.invoked import tacsim
 from tests.robot.cli.lab import Lab, copy_of
+from tests.robot.cli.terminal import Terminal
 
 if find_spec("rtde_control") is None:
     pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
@@ -19,10 +24,20 @@ if find_spec("rtde_control") is None:
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
-def test_a_dry_run_on_a_copy_of_the_one_arm_file(tmp_path: Path) -> None:
-    file = copy_of("ur5e-one", tmp_path, 61)
-    with Lab(file):
-        result = tacsim("run", str(file), "--dry-run", "--steps", "2", "--out", "dry")
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a person works."""
+    return tmp_path_factory.mktemp("lab")
+
+
+@pytest.fixture(scope="module")
+def one_arm(folder: Path) -> Iterator[Lab]:
+    with Lab(copy_of("ur5e-one", folder, 61)) as lab:
+        yield lab
+
+
+def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp_path: Path) -> None:
+    result = tacsim("run", str(folder / "my.yaml"), "--dry-run", "--steps", "2", "--out", "dry")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "dry" / "report.html").exists()
 
@@ -56,3 +71,47 @@ def test_what_does_not_fit_is_refused_before_anything_is_opened(
     assert result.exit_code in (1, 2), result.output
     assert re.search(said, " ".join(result.stderr.split())), result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def commands() -> list[str]:
+    """What the pages tell a person to type once my.yaml is written."""
+    blocks = [block for block in all_blocks() if block.page in ("README.md", "bringup.md") and block.language == "bash"]
+    lines = [line.partition("#")[0].strip() for block in blocks for line in block.code.splitlines()]
+    return [line for line in lines if re.match(r"tacsim .*\bmy\.yaml", line)]
+
+
+def follow(command: str, folder: Path) -> tuple[int, str]:
+    """Types it, and y to each question that can be read on the screen. How it ended, and the screen then."""
+    asked = 0
+    with Terminal(*shlex.split(command)[1:], folder=folder) as screen:
+        while screen.process.poll() is None:
+            if screen.text.count("[y/N]:") > asked:
+                asked += 1
+                screen.type("y\n")
+            time.sleep(0.05)
+        return screen.end(), screen.picture
+
+
+def test_the_pages_lead_through_every_step() -> None:
+    told = " ".join(commands())
+    for step in ("doctor --rig", "--dry-run", "--policy grip", "calibrate latency", "calibrate touch"):
+        assert step in told
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("command", commands())
+def test_every_command_of_the_pages_runs_on_the_one_arm_file(one_arm: Lab, folder: Path, command: str) -> None:
+    code, shown = follow(command, folder)
+    if "calibrate touch" in command:  # as the page says, of a sensor whose light is calibrated
+        assert code == 2 and "calibrate its light first" in shown, shown
+    else:
+        assert code == 0, shown
+
+
+@pytest.mark.deep
+def test_a_first_episode_on_a_copy_of_the_two_arm_file(tmp_path: Path) -> None:
+    with Lab(copy_of("ur5e", tmp_path, 63)) as lab:
+        code, shown = follow("tacsim run my.yaml --steps 3 --out first", tmp_path)
+        assert code == 0, shown
+        pressed = {name: lab.depth(name, faults.state().pose) for name, faults in lab.faults.items()}
+    assert min(pressed.values()) > 0.0, pressed

@@ -310,8 +310,8 @@ class URArm(Closing):
         if status == ArmStatus.LINK_LOST and record is not None:
             age = time.monotonic() - float(record["time"])
             raise StaleObservationError(
-                f"arm '{self.name}': its last package is {1e3 * age:.0f} ms old, more than link_timeout = "
-                f"{1e3 * self.config.link_timeout:g} ms; see the cable, then recover()"
+                f"arm '{self.name}': the link is lost, its last package is {1e3 * age:.0f} ms old (link_timeout = "
+                f"{1e3 * self.config.link_timeout:g} ms); see the cable, then recover()"
             )
         if status in (ArmStatus.WORKER_DEAD, ArmStatus.CLOSED, ArmStatus.CONNECTING) or record is None:
             raise self._error(status)

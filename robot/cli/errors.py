@@ -10,7 +10,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from robot.cli.output import SafeConsole
-from tacsim.text import printable
+from tacsim.models.text import printable
 
 OURS = {"tacsim", "calibration", "robot"}
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.segment import Segment
 from rich.status import Status
 
-from tacsim.text import escaped, printable
+from tacsim.models.text import escaped, printable
 
 
 class SafeConsole(Console):

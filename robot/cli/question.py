@@ -12,7 +12,7 @@ import typer
 
 from robot.cli.interrupt import SIGNALS
 from robot.cli.output import paused
-from tacsim.text import escaped
+from tacsim.models.text import escaped
 
 if TYPE_CHECKING:
     from tacsim.models.rig import RigConfig

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import yaml
 
 from tacsim.config.errors import Place, Problem
-from tacsim.text import printable
+from tacsim.models.text import printable
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from tacsim.text import printable
+from tacsim.models.text import printable
 
 _SHOWN = 30  # a broken file can have thousands of problems
 

@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from tacsim.config.annotation import allowed, child, keys, members, models, split, tag_of, variant
 from tacsim.config.document import LoadState, Node
 from tacsim.config.errors import did_you_mean, join
-from tacsim.text import printable
+from tacsim.models.text import printable
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from datetime import datetime
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from tacsim.interface import RigSpec
+from tacsim.models.text import printable
 from tacsim.record.episode import EpisodeError, EpisodeMeta
-from tacsim.text import printable
 
 FORMAT = "1"  # of the file; raised when an old reader would misread a new file
 MAX_ATTACHMENT = 64 << 20  # [bytes]

@@ -28,7 +28,7 @@ from robot.mock.ur.machine.registry import COMMANDS
 from robot.mock.ur.machine.script import Program
 from robot.mock.ur.machine.version import VERSION, Version
 from tacsim.interface import FloatArray
-from tacsim.text import printable
+from tacsim.models.text import printable
 
 if TYPE_CHECKING:
     from tacsim.models.hardware import Model  # pydantic and SciPy: half a second of start-up

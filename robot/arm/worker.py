@@ -86,8 +86,8 @@ class Worker:
     # -- connecting ----------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Raises a DeviceError that says what is wrong. Blocks for ever if the controller falls silent half way; then
-        the driver kills the process."""
+        """Raises a DeviceError that says what is wrong. Blocks if the controller falls silent half way: the driver
+        kills the process then."""
         config = self.config
         for port, what in PORTS.items():
             try:
@@ -119,9 +119,10 @@ class Worker:
             raise DeviceNotConnectedError(f"arm '{config.name}' at {config.host}: {failure}") from failure
         try:
             self._set_up()
-        except BaseException:
-            with TimeLimit(ENDING), contextlib.suppress(RuntimeError):
-                self.control.stopScript()
+        except DeviceError:
+            if self._read() or time.monotonic() - float(self.record["time"]) < config.link_timeout:  # it answers
+                with TimeLimit(ENDING), contextlib.suppress(RuntimeError):
+                    self.control.stopScript()
             raise
 
     def _set_up(self) -> None:
@@ -166,7 +167,7 @@ class Worker:
         """Raises unless the controller's pose agrees with the forward kinematics of the model and of `tool`, which
         gives flange_from_tool (4, 4)."""
         kinematics = Kinematics(self.config.model)  # type: ignore[arg-type]  # a Model, from JSON
-        deadline = time.monotonic() + 1.0
+        found, deadline = "no RTDE package with a pose arrived within 1 s", time.monotonic() + 1.0
         while True:
             if self._read():
                 expected = kinematics.forward(self.record["joints"], tool())
@@ -178,8 +179,6 @@ class Worker:
                     f"its tool is {1e3 * shift:.0f} mm and {turn:.2f} rad from where a {self.config.model} would "
                     f"have it; check {advice}"
                 )
-            else:
-                found = "no RTDE package with a pose arrived within 1 s"
             if time.monotonic() > deadline:
                 raise DeviceNotConnectedError(f"arm '{self.config.name}': {found}")
             time.sleep(PERIOD)

@@ -181,7 +181,7 @@ class Machine:
         if not self.operational:
             self.write_log(f"program refused: robot {self.mode.name}, safety {self.safety.name}")
             return False
-        if re.search(r"^\s*def\s", text, re.M) is None:
+        if re.search(r"^[ \t]*def\s", text, re.M) is None:
             self.write_log(f"not run: {text[:60]!r}... is no program, or a secondary one")
             return False
         self.stop("replaced by another program")

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from robot.mock.ur.machine.script import Program
 
 LONGEST_LINE = 1000  # characters
+MOST_CALLS = 5000  # of one program
+BURST = 16  # calls that take no time, in one control period
 CALLS: dict[str, Callable[..., MotionSteps | None]] = {}
 _SUMS: dict[type, Callable[[float, float], float]] = {ast.Add: operator.add, ast.Sub: operator.sub}
 
@@ -53,6 +55,8 @@ def compiled(text: str) -> list[tuple[str, list[Any], dict[str, Any]]]:
                 raise ValueError
             named = {each.arg or "": _value(each.value) for each in call.keywords}
             found.append((call.func.id, [_value(each) for each in call.args], named))
+            if len(found) > MOST_CALLS:
+                raise ProgramError(f"line {number}: the mock takes at most {MOST_CALLS} calls")
         except (SyntaxError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
             runs = f"the mock runs ur_rtde's control script, and lists of calls with numbers: {', '.join(CALLS)}"
             raise ProgramError(f"line {number}: '{words[:80]}': {runs}") from None
@@ -64,7 +68,9 @@ def run(program: Program) -> MotionSteps:
     calls = compiled(program.text)
 
     def steps() -> MotionSteps:
-        for name, arguments, named in calls:
+        for number, (name, arguments, named) in enumerate(calls, start=1):
+            if number % BURST == 0:
+                yield
             try:
                 yield from CALLS[name](program, *arguments, **named) or ()
             except (TypeError, ValueError, IndexError) as error:

@@ -120,8 +120,10 @@ def test_register_offsets_beyond_the_registers(offset: str) -> None:
         "$" * 300_000 + "\nend",
         "def rtde_control():\n" + "# inject move path\n" * 20_000 + "\n" * 100_000 + "\nend",
         "def rtde_control():\n  $" + "9" * 5000 + " x\nend",
+        "def mine():\n" + "textmsg(1)\n" * 90_000 + "end",
+        "def mine():\n" + "\n" * 300_000 + "x\nend",
     ],
-    ids=["blank", "dollars", "paths", "version"],
+    ids=["blank", "dollars", "paths", "version", "calls", "blank lines"],
 )
 def test_programs_that_are_long_or_odd_take_no_time_to_speak_of(text: str) -> None:
     """Without a bound these took minutes or raised; pytest's time-out of a test ends it then."""

@@ -148,12 +148,12 @@ class Servo:
             self.trip(ArmStatus.GEL_LIMIT, measured)
 
     def on_command(self, number: int, command: Record | None) -> None:
-        """Reads the newest command, once. A target that is not a pose is rejected, and the arm holds."""
+        """Reads the newest command, once. A target that is no pose or has no speed is rejected, and the arm holds."""
         if command is None or number == self.commands_read:
             return
         self.commands_read, kind = number, int(command["kind"])
         self._zero_asked = float(command["time"]) if kind == CommandKind.ZERO_WRENCH else -math.inf
-        if kind == CommandKind.TARGET and not bool(finite_targets(command["pose"])):
+        if kind == CommandKind.TARGET and not (bool(finite_targets(command["pose"])) and command["speed"] > 0.0):
             self.rejected += 1
             self._goal = None
         elif kind == CommandKind.TARGET and not self.status.is_fault and self.status != ArmStatus.WAITING:
@@ -181,18 +181,22 @@ class Servo:
         self._before = self.motion, self._sent
         if self._waits_after_stall(time, measured):
             return self._sent
-        goal = self._goal if time - self._goal_time <= config.action_timeout else None
-        stale = time - self._exposed > config.observation_timeout  # False without a guard by pictures (NaN)
-        if self.status.is_fault or goal is None or stale:
-            if not self.status.is_fault and self.status != ArmStatus.WAITING:
-                self.status = ArmStatus.HOLD if goal is None else ArmStatus.OBSERVATION_STALE
+        if time - self._goal_time > config.action_timeout:
+            self._goal = None
+        blind = time - self._exposed > config.observation_timeout  # False without a guard by pictures (NaN)
+        if blind and self._goal is not None:  # forgotten: nothing goes on by itself when pictures come again
+            self.status, self._goal = ArmStatus.OBSERVATION_STALE, None
+        if self._goal is None:
+            still_blind = blind and self.status == ArmStatus.OBSERVATION_STALE
+            if not (self.status.is_fault or self.status == ArmStatus.WAITING or still_blind):
+                self.status = ArmStatus.HOLD
             return self._slow_down(measured)
         if self.motion is None or (
             self.status in (ArmStatus.HOLD, ArmStatus.OBSERVATION_STALE) and self._was_moved(self.motion, measured)
         ):
             self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
-            goal = self._clip_goal(self.motion) or goal
-        elif self._sent is not None and self.motion.at_rest and _is_at(self.motion, goal):
+            self._clip_goal(self.motion)
+        elif self._sent is not None and self.motion.at_rest and _is_at(self.motion, self._goal):
             self.status = ArmStatus.OK
             return self._sent
         gaps = self._gaps(self.motion, partners)
@@ -205,7 +209,7 @@ class Servo:
                 return False
             return all(new >= 0.0 or new >= old for new, old in zip(self._gaps(motion, partners), gaps, strict=True))
 
-        wanted = towards(self.motion, *goal, self._rates, allowed)
+        wanted = towards(self.motion, *self._goal, self._rates, allowed)
         joints = self._joints(wanted, measured)
         if joints is not None:
             self.status = ArmStatus.OK
@@ -307,18 +311,21 @@ class Servo:
             gaps.append(gap - partner.distance - 2.0 * float(other["top_speed"]) * LOOP_OFFSET)
         return gaps
 
-    def _clip_goal(self, start: MotionState) -> tuple[FloatArray, FloatArray] | None:
-        """Clips the goal to the region on the straight path from `start`, so that the arm lands on the boundary instead
-        of braking at it. The driver has clipped it already, from an older state; what this changes is counted."""
+    def _clip_goal(self, start: MotionState) -> None:
+        """Clips the goal on the straight path from `start`: to the region, so that the arm lands on the boundary
+        instead of braking at it (the driver has done so from an older state; what this changes is counted), and to what
+        can be gone within `action_timeout`, so that an arm that is asked nothing more comes to rest within that way."""
         if self._goal is None:
-            return None
-        end, turn = self._goal
-        share = fraction_inside(start.position, end, self.region)
+            return
+        end, rotation_end = self._goal
+        turn = rotation_vector(rotation_end @ start.rotation.T)
+        inside = float(fraction_inside(start.position, end, self.region))
+        self.shortened += inside < 1.0
+        way, angle = math.dist(end, start.position), math.sqrt(float(turn @ turn))
+        longest, most = (rate * self.config.action_timeout for rate in (self._rates.speed, self._rates.turn_rate))
+        share = min(inside, longest / max(way, longest), most / max(angle, most))
         if share < 1.0:
-            self.shortened += 1
-            turn = rotation(share * rotation_vector(turn @ start.rotation.T)) @ start.rotation
-            self._goal = start.position + share * (end - start.position), turn
-        return self._goal
+            self._goal = start.position + share * (end - start.position), rotation(share * turn) @ start.rotation
 
 
 def is_healthy(other: Record | None) -> bool:

@@ -164,3 +164,29 @@ def test_random_ways_with_random_stalls_stay_within_the_limits(seed: int) -> Non
     assert acceleration <= 1.05
     places = np.array([package.sensor[:3, 3] for package in arm.packages])
     assert arm.servo.region.excess(places).max() <= 1e-6
+
+
+@pytest.mark.promise(5)
+@pytest.mark.parametrize(("speed", "acceleration"), [(0.1, 0.5), (0.02, 0.2), (0.05, 0.5)])
+def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
+    speed: float, acceleration: float
+) -> None:
+    """And a policy that keeps its control period, half of the time-out, is not slowed down by that."""
+    arm = OnController(
+        lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 1.5], speed=speed, acceleration=acceleration, action_timeout=0.2
+    )
+    start = arm.at
+    for _ in range(8):
+        arm.ask(shifted(start, 0.0, 0.5))
+        for _ in range(50):
+            arm.period()
+    steady = np.linalg.norm(np.array(arm.twists)[-100:, :3], axis=1)
+    assert steady.min() > 0.98 * speed
+    arm.ask(shifted(start, 0.0, 0.5))
+    begun = arm.at.position
+    for _ in range(400):
+        arm.period()
+    gone = float(np.linalg.norm(arm.at.position - begun))
+    lag = arm.servo.config.lookahead + SETTLING * PERIOD
+    assert 0.8 * speed * 0.2 < gone <= speed * (0.2 + lag)
+    assert arm.servo.status == ArmStatus.HOLD and shares(arm)[1] <= 1.03

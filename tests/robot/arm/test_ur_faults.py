@@ -154,6 +154,32 @@ def test_without_actions_the_arm_holds_and_goes_on_from_there(mock: MockUR, meas
         check_path(arm, sent)
 
 
+@pytest.mark.promise(5)
+def test_after_the_last_action_the_arm_goes_no_farther_than_its_time_out_allows(
+    mock: MockUR, measuring: bool, figure: Record
+) -> None:
+    """A policy that hangs in full motion, its target far away."""
+    timeout = 0.2 if measuring else 0.3
+    with URArm(config(realtime=measuring, action_timeout=timeout), "left") as arm:
+        start, limits = arm.state().pose, arm.config.limits
+        far = moved(start, x=0.14)
+
+        def under_way() -> bool:
+            arm.command(far)
+            return float(np.linalg.norm(arm.state().pose.position - start.position)) > 0.04
+
+        until(under_way, "motion", pause=0.02)
+        asked = arm._channel.commands.count
+        until(lambda: arm.status() == ArmStatus.HOLD, "hold")
+        until(arm.at_rest, "rest")
+        seen = records(arm)
+        last = seen[seen["commands_read"] == asked][0]
+        gone = float(np.linalg.norm(arm.state().pose.position - last["position"]))
+        allowed = limits.speed * (timeout + arm.config.lookahead + 10e-3)  # the arm lags by those
+        figure("way after the last action, at 0.1 m/s (time-out 200 ms)", 1e3 * gone, "mm", at_most=1e3 * allowed)
+        assert gone <= allowed
+
+
 # -- stops of the controller -----------------------------------------------------------------------------------------
 
 

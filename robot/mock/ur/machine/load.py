@@ -71,13 +71,15 @@ class Load:
 
     def update(self, arm: Arm) -> None:
         """Renews what is measured and felt at the arm's present pose."""
-        flange = arm.frame @ inverse_frame(arm.tool)
         measured = self.wrench.copy()
         if self.wall is not None:
             measured[2] += self.wall.stiffness * max(0.0, self.wall.z - float(arm.frame[2, 3]))
+        self.measured = self.unexplained = self.felt = measured
+        if self.told.mass == self.tool.mass == self.hidden.mass == 0.0 and not self.bias.any():
+            return
+        flange = arm.frame @ inverse_frame(arm.tool)
         for each in (self.tool, self.hidden):
             measured += _weight(each, UP, flange, arm.frame)
-        self.measured = measured
         self.unexplained = measured - _weight(self.told, self.gravity, flange, arm.frame)
         self.felt = self.unexplained - _moved(self.bias, flange, arm.frame[:3, 3])
 

@@ -31,6 +31,10 @@ def mock(
     version: Annotated[
         str | None, typer.Option("--version", help="Of PolyScope, which the arms claim.", show_default="5.11")
     ] = None,
+    payload: Annotated[
+        str | None,
+        typer.Option(help="What hangs on each flange: kg, or kg,x,y,z with its centre [m].", show_default="nothing"),
+    ] = None,
     allow_network: Annotated[
         bool, typer.Option("--allow-network", help="Allow addresses that other machines reach.")
     ] = False,
@@ -46,6 +50,7 @@ def mock(
     from robot.common.kinematics import MODELS
     from robot.mock import MockArms, MockCamera
     from robot.mock.ur.fault_client import FAULT_PORT
+    from robot.mock.ur.machine.load import Mass
     from robot.mock.ur.machine.version import VERSION, parse_version
     from robot.mock.ur.wire.controller import PORTS
 
@@ -55,6 +60,11 @@ def mock(
         claimed = VERSION if version is None else parse_version(version)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--version") from None
+    try:
+        numbers = [float(number) for number in (payload or "0").split(",")]
+        tool = Mass.of(numbers + [0.0] * 3 if len(numbers) == 1 else numbers)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--payload") from None
     hosts = host or [f"127.0.0.{2 + index}" for index in range(arms)]
     if not hosts and not cameras:
         raise typer.BadParameter("nothing to run: give at least one arm or camera", param_hint="--arms, --cameras")
@@ -62,7 +72,10 @@ def mock(
     with Interrupt() as interrupt, ExitStack() as stack:
         devices: list[MockArms | MockCamera] = []
         if hosts:
-            controllers = MockArms(hosts, model=model, version=claimed, allow_network=allow_network)
+            hanging = (tool.mass, *tool.centre)
+            controllers = MockArms(
+                hosts, model=model, payload=[hanging] * len(hosts), version=claimed, allow_network=allow_network
+            )
             devices.append(stack.enter_context(controllers))
         ports = ", ".join(map(str, sorted(PORTS)))
         for each in hosts:

@@ -21,7 +21,7 @@ START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 def test_it_serves_until_ctrl_c() -> None:
     hosts = [wire_host(40), wire_host(41)]
     options = [word for host in hosts for word in ("--host", host)]
-    options += ["--model", "ur3e", "--version", "5.23.1"]
+    options += ["--model", "ur3e", "--version", "5.23.1", "--payload", "0.5,0,0,0.03"]
     process = subprocess.Popen([*START, *options], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process, process.stdout:
@@ -29,7 +29,7 @@ def test_it_serves_until_ctrl_c() -> None:
         assert all(host in line for host, line in zip(hosts, said, strict=False))
         for host in hosts:
             faults = FaultClient(host)
-            assert faults.state().mode == "RUNNING"
+            assert faults.state().mode == "RUNNING" and faults.state().wrench[2] == pytest.approx(-4.91)
             faults.close()
             assert dashboard(host, "PolyscopeVersion")[0].startswith("URSoftware 5.23.1.0 ")
         dashboard(hosts[1], "addToLog \x1b[2J hello")
@@ -63,6 +63,9 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
         (["--version", "5"], "like 5.11", 2),
         (["--version", "5.x"], "like 5.11", 2),
         (["--version", "5.9999999999"], "4294967295", 2),
+        (["--payload", "0.5,0"], "mass [kg]", 2),
+        (["--payload", "nan"], "mass [kg]", 2),
+        (["--payload", "heavy"], "--payload", 2),
         (["--arms", "0", "--cameras", "1", "--camera-port", "70000"], "--camera-port", 2),
     ],
 )

@@ -112,6 +112,7 @@ class Machine:
     ) -> None:
         self.version = version
         self.arm, self.load, self.outputs = Arm(model, joints), Load(tool), Outputs()
+        self.load.update(self.arm)
         self.ticks = 0
         self.mode, self.safety = Mode.RUNNING, Safety.NORMAL
         self.in_int, self.in_double = [0] * REGISTERS, [0.0] * REGISTERS

@@ -169,9 +169,9 @@ def contact(robot: Robot) -> None:
     assert control.moveL(robot.shifted(0, 0, -0.1), 0.05, 0.5, True)
     control.startContactDetection([0, 0, -1, 0, 0, 0])
     assert not control.readContactDetection()
-    robot.until(lambda: bool(control.readContactDetection()))
-    assert control.stopContactDetection()
-    assert abs(robot.rest()[2] - top) < 1e-3
+    # It rests beyond the contact for a moment, then goes back. A client that asks meanwhile keeps the script from that.
+    robot.until(lambda: abs(robot.rest()[2] - top) < 0.5e-3)
+    assert control.readContactDetection() and control.stopContactDetection()
 
 
 @case(CONTROL, "freedriveMode endFreedriveMode getFreedriveStatus teachMode endTeachMode")

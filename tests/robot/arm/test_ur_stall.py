@@ -31,7 +31,7 @@ from tests.robot.arm.mocked import (
     servo_ticks,
     until,
 )
-from tests.robot.stops import observer
+from tests.stops import observer
 
 WINDOW = 20  # periods
 BEFORE = 6  # periods before it in which targets came, too: so long the joints of the mock take to follow

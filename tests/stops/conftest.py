@@ -9,7 +9,7 @@ import pytest
 
 from robot.mock import MockUR
 from tests.robot.arm.mocked import HOST
-from tests.robot.stops.watched import LINK_TIMEOUT, Trial
+from tests.stops.watched import LINK_TIMEOUT, Trial
 
 TRIES = 5
 BACK = (0.1, 1.0, 3.0, 0.0)  # a line is whole again after so long, in turn; 0: a cut one at once, a held one never [s]

@@ -15,7 +15,7 @@ import pytest
 from robot.mock import FaultClient
 from tests.promises import Record
 from tests.robot.arm.mocked import PATIENCE
-from tests.robot.stops.watched import Trial, judge
+from tests.stops.watched import Trial, judge
 
 
 def to_all(trial: Trial, number: signal.Signals) -> float:

@@ -1,7 +1,7 @@
 """What each public call of ur_rtde 1.6.5 does against a mock, and the process that tries one of them.
 
 A case is a function that calls some methods of one class of ur_rtde and asserts what came of it: by effect, seen in the
-packages of another connection, wherever there is one. `python -m tests.robot.mock.wheel.cases HOST NAME` runs one.
+packages of another connection, wherever there is one. `python -m tests.robot.mock.ur.cases HOST NAME` runs one.
 """
 
 from __future__ import annotations
@@ -141,6 +141,6 @@ def main(host: str, name: str) -> None:
 
 
 if __name__ == "__main__":
-    from tests.robot.mock.wheel import cases, control_cases, other_cases  # noqa: F401  # they enter CASES
+    from tests.robot.mock.ur import cases, control_cases, other_cases  # noqa: F401  # they enter CASES
 
     cases.main(*sys.argv[1:])

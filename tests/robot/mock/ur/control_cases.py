@@ -14,7 +14,7 @@ import numpy as np
 from robot.common.kinematics import displacement, matrix, pose
 from robot.mock.ur.machine.arm import HOME
 from robot.mock.ur.machine.load import GRAVITY
-from tests.robot.mock.wheel.cases import Robot, Verdict, case
+from tests.robot.mock.ur.cases import Robot, Verdict, case
 
 CONTROL = "RTDEControlInterface"
 NO_DYNAMICS = "the program ends, as by a run-time error"

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.promises import Record
-from tests.robot.stops.watched import PORTS, Trial, judge
+from tests.stops.watched import PORTS, Trial, judge
 
 Break = Callable[[Trial, tuple[int, ...], float], float]
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from robot.mock import MockUR
-from tests.robot.mock.wheel import control_cases, other_cases  # noqa: F401  # they enter CASES
-from tests.robot.mock.wheel.cases import CASES, CLASSES, Verdict
+from tests.robot.mock.ur import control_cases, other_cases  # noqa: F401  # they enter CASES
+from tests.robot.mock.ur.cases import CASES, CLASSES, Verdict
 from tests.robot.mock.wire_client import wire_host
 
 ROOT = Path(__file__).resolve().parents[4]
 PAGE = ROOT / "docs" / "mock.md"
-BEGIN, END = "<!-- calls of ur_rtde: written by tests/robot/mock/wheel/test_calls.py -->\n", "<!-- end of calls -->"
+BEGIN, END = "<!-- calls of ur_rtde: written by tests/robot/mock/ur/test_calls.py -->\n", "<!-- end of calls -->"
 LIMIT = 120.0  # of one client process [s]
 
 pytestmark = pytest.mark.skipif(
@@ -71,7 +71,7 @@ def called() -> Iterator[MockUR]:
 @pytest.mark.deep
 @pytest.mark.parametrize("name", CASES)
 def test_call(called: MockUR, name: str) -> None:
-    command = [sys.executable, "-m", "tests.robot.mock.wheel.cases", called.host, name]
+    command = [sys.executable, "-m", "tests.robot.mock.ur.cases", called.host, name]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert called.running

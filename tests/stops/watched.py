@@ -22,10 +22,10 @@ from robot.arm.channel import ArmStatus
 from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import PATIENCE, config, until
-from tests.robot.stops.observer import PACKAGE
+from tests.stops.observer import PACKAGE
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[2]
+ROOT = HERE.parents[1]
 PROXY = f"127.24.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 LINK_TIMEOUT = 1.0  # of a patient arm [s]
 GOES = 0.28  # how far the arm is sent [m]

@@ -101,6 +101,7 @@ def command(arms: MockArms, chance: random.Random) -> None:
     faults = arms.fault_clients[0]
     until(lambda: faults.state().clients == (RTDE,), "the others have gone, and all they sent is served")
     faults.recover()
+    faults.force_limit(1e6)  # it may have been told of any payload
     path = [chance.choice(MOVES.split("|")) for _ in range(chance.choice((0, 3, 300)))]
     with ControlClient(arms.hosts[0], control_script(path=path)) as client:
         for _ in range(chance.randrange(1, 30)):

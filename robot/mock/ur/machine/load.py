@@ -19,6 +19,7 @@ from robot.mock.ur.machine.arm import HISTORY, Arm
 from tacsim.interface import FloatArray
 
 GRAVITY = 9.82  # what the controller compensates with by default [m/s^2] (URScript manual, set_gravity)
+HEAVIEST = 100.0  # mass that a payload may have; the strongest UR arm bears 35 kg [kg]
 FORCE_LIMIT = 250.0  # |force| beyond which the mock stops for protection [N]
 UP = np.array([0.0, 0.0, GRAVITY])  # acceleration that a standing arm feels, base axes [m/s^2]
 
@@ -41,8 +42,9 @@ class Mass:
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Mass:
         """From mass and centre (4,)."""
-        if len(numbers) != 4 or not np.isfinite(numbers).all():
-            raise ValueError(f"a payload is a mass [kg] and its centre x, y, z [m], got {list(numbers)}")
+        if len(numbers) != 4 or not float(np.abs(numbers).max()) <= HEAVIEST:
+            limit = f"none beyond {HEAVIEST:g}"
+            raise ValueError(f"a payload is a mass [kg] and its centre x, y, z [m], {limit}, got {list(numbers)}")
         mass, x, y, z = (float(number) for number in numbers)
         return cls(mass, (x, y, z))
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from robot.common.kinematics import pose
 from robot.mock.ur.machine.arm import PERIOD, ProgramError
-from robot.mock.ur.machine.load import Mass
+from robot.mock.ur.machine.load import HEAVIEST, Mass
 from robot.mock.ur.machine.registry import command
 from tacsim.interface import FloatArray
 
 if TYPE_CHECKING:
     from robot.mock.ur.machine.script import Program
 
+STEEPEST = 100.0  # of set_gravity [m/s^2]
 NEAR_SINGULAR, SINGULAR = 0.05, 0.02  # of Kinematics.singularity, for get_freedrive_status
 
 # -- settings --------------------------------------------------------------------------------------------------------
@@ -30,7 +31,7 @@ def zero_sensor(p: Program) -> None:
 def payload(p: Program) -> None:
     """A centre of gravity that is all zero keeps the one before: the script has it so."""
     mass, centre, load = p.double(0), p.doubles(1, 3), p.machine.load
-    if mass < 0:
+    if not (0 <= mass <= HEAVIEST and np.abs(centre).max() <= HEAVIEST):
         raise ProgramError(f"set_payload: mass {mass:g} kg, centre {centre.tolist()} m")
     load.told = Mass.of([mass, *(centre if centre.any() else load.told.centre)])
 
@@ -50,7 +51,10 @@ def tool(p: Program) -> None:
 
 @command(59)
 def gravity(p: Program) -> None:
-    p.machine.load.gravity = p.doubles(0, 3)
+    towards = p.doubles(0, 3)
+    if np.abs(towards).max() > STEEPEST:
+        raise ProgramError(f"set_gravity: {towards.tolist()} m/s^2")
+    p.machine.load.gravity = towards
 
 
 @command(35)

@@ -39,6 +39,9 @@ def usable(machine: Machine) -> None:
         (10, [1e300] * 6 + [1e300, 0], []),  # speedL
         (6, [1e300] * 18, [2, 1, 1, 1, 1, 1, 1]),  # forceMode
         (41, [1e300] * 6 + [0, 1e300, *[0] * 6], []),  # jogStart
+        (17, [1e5, 0, 0, 0], []),  # setPayload
+        (17, [1.0, 0, 0, 1e5], []),
+        (59, [0, 0, 1e5], []),  # setGravity
         (51, [*DOWN, 0, 0, 0, 0, 0, 1e300, 1e300], []),  # moveUntilContact
     ],
 )

@@ -65,6 +65,10 @@ class Dashboard(Closing):
         """Such as RUNNING, IDLE, POWER_OFF."""
         return _value(self.ask("robotmode"))
 
+    def program(self) -> str:
+        """Such as STOPPED, PLAYING or PAUSED."""
+        return self.ask("programState").partition(" ")[0]
+
     def require_ready(self, who: str) -> None:
         """Raises EmergencyStop, ProtectiveStop or DeviceError unless the arm is powered, free and in remote control."""
         safety = self.safety()

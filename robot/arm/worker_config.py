@@ -69,5 +69,5 @@ def worker_config(config: UrArmConfig, name: str, segment: int, partners: Sequen
         lookahead=config.lookahead,
         gain=config.gain,
         partners=list(partners),
-        serial=getattr(config, "serial", None),
+        serial=config.serial,
     )

@@ -43,7 +43,7 @@ def schema(
 def doctor(
     rig: Annotated[
         str | None,
-        typer.Option("--rig", metavar="FILE", help="Look at this rig instead: network, versions, cameras, limits."),
+        typer.Option("--rig", metavar="FILE", help="Look at this rig instead: arms, what they feel, cameras, limits."),
     ] = None,
     set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
@@ -68,7 +68,7 @@ def doctor(
         with busy("looking at the rig"):
             config = load_rig(rig, overrides=set_ or []).config
             check_sensors(config)
-            checks = examine_rig(config)
+            checks = examine_rig(config, rig)
     report = machine.as_json(checks)
     if as_json:
         typer.echo(json.dumps(report, indent=2))

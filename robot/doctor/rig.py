@@ -1,4 +1,5 @@
-"""Checks of a rig of hardware before anything moves: network, versions, remote control, cameras, limits.
+"""Checks of a rig of hardware before anything moves: network, versions, remote control, where the arms stand and what
+they feel, cameras, limits.
 
 Connects to the dashboard and to the RTDE port of each arm, and reads each camera for a second. It never becomes a
 commander: no input register is claimed and no program is sent, so it may check an arm that another program drives.
@@ -8,48 +9,73 @@ from __future__ import annotations
 
 import re
 import socket
-import struct
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from robot.arm.dashboard import PORT as DASHBOARD
 from robot.arm.dashboard import Dashboard
+from robot.arm.rtde import PORT as RTDE
+from robot.arm.rtde import read_controller
 from robot.camera.camera import Camera
 from robot.common import MOCK_SERIAL
 from robot.common.kinematics import Kinematics
 from robot.common.tcp import ArmFrames
 from robot.doctor.machine import Check
+from robot.doctor.stand import Stand, compare, keep_out, stand
 from robot.errors import DeviceError
 from robot.mock.cell.cell import MockCell
 from tacsim import pose as se3
+from tacsim.interface import Pose
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig
 
-PORTS = {DASHBOARD: "dashboard", 30003: "script", 30004: "RTDE"}
+PORTS = {DASHBOARD: "dashboard", 30003: "script", RTDE: "RTDE"}
 TIMEOUT = 2.0  # of each connection [s]
 CAMERA_TIME = 1.0  # for which a camera is read [s]
 MIN_POLYSCOPE = (5, 6)  # the first version that tells whether it is in remote control
 MIN_FRAME_RATE = 0.8  # share of the rate asked for; a slower camera is a warning
 
 
-def examine_rig(config: RigConfig) -> list[Check]:
-    """All checks of one rig. Mocks that its file asks for are started for as long as it takes."""
+def examine_rig(config: RigConfig, file: str | None = None) -> list[Check]:
+    """All checks of one rig. Mocks that its file asks for are started for as long as it takes.
+
+    file: what the rig is called on the command line, for the commands to be typed next.
+    """
     arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
     cameras = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, CameraSensorConfig)}
     if not (arms or cameras):
         return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
     try:
-        with MockCell(config):
-            checks = [check for name, arm in arms.items() for check in _arm(name, arm)]
+        with MockCell(config) as cell:
+            found = _Found(file or config.name, dict(cell.start_poses), {})
+            checks = [check for name, arm in arms.items() for check in _arm(name, arm, found)]
+            checks += _keep_outs(config, found)
             checks += [_camera(name, camera) for name, camera in cameras.items()]
     except (DeviceError, ValueError, RuntimeError) as failure:
         return [Check("rig", "fail", str(failure), "mend the rig file")]
     return checks
 
 
-def _arm(name: str, config: UrArmConfig) -> Iterator[Check]:
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What the checks of one arm leave for others."""
+
+    file: str
+    starts: dict[str, Pose]  # where the scene of a mock rig says
+    stands: dict[str, Stand]
+
+
+def _keep_outs(config: RigConfig, found: _Found) -> Iterator[Check]:
+    for pair in config.keep_out:
+        first, second = ((name, found.stands.get(name)) for name in pair.arms)
+        if first[1] is not None and second[1] is not None:
+            yield keep_out((first[0], first[1]), (second[0], second[1]), pair.distance, found.file)
+
+
+def _arm(name: str, config: UrArmConfig, found: _Found) -> Iterator[Check]:
     closed = [f"{port} ({what})" for port, what in PORTS.items() if not _open(config.host, port)]
     if closed:
         advice = "is the controller on, the address right, and the service allowed (Settings, Security, Services)?"
@@ -61,7 +87,14 @@ def _arm(name: str, config: UrArmConfig) -> Iterator[Check]:
             yield from _controller(name, config, dashboard)
     except DeviceError as failure:
         yield Check(f"{name}: dashboard", "fail", str(failure), "restart the controller, and look at its log")
-    yield _protocol(name, config)
+    try:
+        now = found.stands[name] = stand(config, read_controller(config.host, TIMEOUT))
+    except DeviceError as failure:
+        yield Check(f"{name}: RTDE", "fail", str(failure), "restart the controller")
+    else:
+        yield Check(f"{name}: RTDE", "ok", "version 2")
+        start = found.starts.get(name) if config.start is None else config.start.pose
+        yield from compare(name, config, now, start, found.file)
     yield _limits(name, config)
     yield _start(name, config)
 
@@ -89,6 +122,10 @@ def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterato
         f"{(model or 'not told').upper()}, serial number {serial}",
         f"the file says {config.model}; correct one of the two" if wrong else "",
     )
+    if config.serial not in (None, serial):
+        advice = "is it the right robot, at the right address? Else correct serial in the rig file"
+        words = f"the robot has {serial}, the file says {config.serial}"
+        yield Check(f"{name}: serial number", "fail", words, advice)
     mock = serial == MOCK_SERIAL
     if mock != (config.mock is not None):
         yield Check(
@@ -96,28 +133,10 @@ def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterato
         )
     try:
         dashboard.require_ready(f"arm '{name}'")
-        yield Check(f"{name}: ready", "ok", "powered, no stop, in remote control")
+        words = f"robot mode {dashboard.mode()}, safety {dashboard.safety()}, remote control"
+        yield Check(f"{name}: ready", "ok", f"{words}, program {dashboard.program()}")
     except DeviceError as failure:
         yield Check(f"{name}: ready", "fail", str(failure), "see to it at the pendant, then look again")
-
-
-def _protocol(name: str, config: UrArmConfig) -> Check:
-    """RTDE version 2, asked for as a client would, without claiming anything."""
-    label = f"{name}: RTDE"
-    try:
-        with socket.create_connection((config.host, 30004), TIMEOUT) as line:
-            line.sendall(struct.pack(">HBH", 5, ord("V"), 2))
-            answer = b""
-            while len(answer) < 4:
-                part = line.recv(64)
-                if not part:
-                    raise OSError("closed")
-                answer += part
-    except OSError as failure:
-        return Check(label, "fail", f"no answer ({failure})", "restart the controller")
-    accepted = answer[2] == ord("V") and answer[3] == 1
-    advice = "" if accepted else "RTDE version 2 needs PolyScope 3.5 or later"
-    return Check(label, "ok" if accepted else "fail", "version 2" if accepted else f"refused: {answer.hex()}", advice)
 
 
 def _limits(name: str, config: UrArmConfig) -> Check:

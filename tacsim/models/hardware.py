@@ -7,7 +7,7 @@ from operator import attrgetter
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from tacsim import pose as se3
 from tacsim.interface import Pose
@@ -21,6 +21,12 @@ Corner = tuple[float, float]
 
 SLOWEST_WATCHDOG = 10.0  # of a real arm [Hz]
 POLYSCOPE = r"[0-9]{1,9}(\.[0-9]{1,9}){1,3}"  # a version of it
+
+
+def _as_text(value: object) -> object:
+    """A serial number without quotes is an integer to YAML."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
 
 Model = Literal["ur3e", "ur5e", "ur10e"]
 
@@ -119,6 +125,8 @@ class UrArmConfig(Config):
     driver: Literal["ur"]
     host: Annotated[str, Field(min_length=1, max_length=253)]
     model: Model = "ur5e"
+    # Serial number that the robot must have, as its dashboard tells it; None: any.
+    serial: Annotated[str, BeforeValidator(_as_text), Field(min_length=1, max_length=64)] | None = None
     world_from_base: Placement
     flange_from_tool: Placement = Placement()  # the tool centre point (TCP) that the controller is given
     tool_from_sensor: Placement = Placement()

@@ -29,7 +29,7 @@ arms:
     world_from_base: { position: [-450 mm, 0, -300 mm] }
     limits: { workspace: { lower: [-30 mm, -30 mm, -30 mm], upper: [30 mm, 30 mm, 60 mm] } }
     start: { position: [0, 0, 0] }
-    mock: { joints: [0, -1.5, 1.5, -1.5, -1.5, 0] }
+    mock: {}
 sensors:
   finger: { driver: camera, source: 'SOURCE', arm: left, width: 80, height: 60, stamped: true }
 """
@@ -95,6 +95,7 @@ def bad(checks: dict[str, Check]) -> dict[str, str]:
 def test_a_sound_rig_passes_every_check(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
     checks = looked(monkeypatch, file)
     kinds = {"network", "PolyScope", "model", "ready", "RTDE", "limits", "start"}
+    kinds |= {"pose", "workspace", "way to start", "force", "payload", "TCP", "speed slider"}
     assert set(checks) == {f"left: {kind}" for kind in kinds} | {"finger: camera"}
     camera = checks.pop("finger: camera")
     assert bad(checks) == {}
@@ -159,7 +160,7 @@ def test_a_mock_is_not_taken_for_a_robot(monkeypatch: pytest.MonkeyPatch, file: 
 def test_what_the_file_has_wrong_is_named(
     monkeypatch: pytest.MonkeyPatch, file: Path, override: str, check: str, words: str
 ) -> None:
-    found = looked(monkeypatch, file, override)
+    found = looked(monkeypatch, file, "arms.left.mock.joints=[0, -1.5, 1.5, -1.5, -1.5, 0]", override)
     assert found[check].state == "fail" and words in found[check].found and found[check].advice
 
 

@@ -87,7 +87,8 @@ class HardwareReset:
         offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
         shift = np.append(offset, 0.0)
         self._begun = {name: Pose(pose.position + shift, pose.quaternion) for name, pose in self._start.items()}
-        self._tell("to the start")
+        if self._arms:
+            self._tell("to the start")
         self._go({name: se3.along_z(arm.state().pose, -RETREAT) for name, arm in self._arms.items()}, TRAVEL)
         self._go(self._begun, TRAVEL)
         if self._arms:

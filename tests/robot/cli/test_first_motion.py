@@ -115,3 +115,22 @@ def test_a_first_episode_on_a_copy_of_the_two_arm_file(tmp_path: Path) -> None:
         assert code == 0, shown
         pressed = {name: lab.depth(name, faults.state().pose) for name, faults in lab.faults.items()}
     assert min(pressed.values()) > 0.0, pressed
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize(
+    ("moment", "key", "code"), [("[y/N]:", "\x03", 130), ("[y/N]:", "\x04", 1), ("mm of", "\x03", 130)]
+)
+def test_who_wants_to_stop_is_heard_at_once(one_arm: Lab, folder: Path, moment: str, key: str, code: int) -> None:
+    """At the question, and on the approach: the arm rests, nothing was touched."""
+    with Terminal("run", "my.yaml", "--out", "never", folder=folder) as screen:
+        screen.wait_for("[y/N]:")
+        if moment != "[y/N]:":
+            screen.type("y\n")
+            screen.wait_for(moment)
+        screen.type(key)
+        assert screen.end() == code, screen.picture
+        assert screen.shows("nobody answered" if key == "\x04" else "stopped by SIGINT")
+    state = one_arm.faults["arm"].state()
+    assert state.rests and one_arm.depth("arm", state.pose) < 0.0
+    assert not (folder / "never").exists()

@@ -212,6 +212,7 @@ def test_a_dry_run_moves_nothing_and_still_asks_and_observes() -> None:
     scene = Scene(arms=False, touch_at=1.0)
     scene.reset.clear(0)
     scene.reset.touch()
+    assert scene.told == []
     assert scene.motions() == [] and ("lower", "zero") not in scene.log
     assert scene.log == ["wait", "reference", "asked", "wait", "restart"]
 

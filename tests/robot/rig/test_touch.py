@@ -13,6 +13,7 @@ import pytest
 
 from robot.arm.channel import HISTORY
 from robot.arm.trajectory import PERIOD
+from robot.camera.camera import StaleFrame
 from robot.open import open_rig
 from robot.rig.commanded_arm import CommandedArm
 from tacsim.rig import Rig
@@ -72,6 +73,29 @@ def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened) -> 
     assert (speeds > 0.999 * SPEED).mean() > 0.5  # it waits only where no pictures come
     assert 0.0 < depth < SPEED * LATEST
     assert any("mm of at most 40 mm" in words for words in opened.told)
+
+
+@pytest.mark.deep
+def test_an_approach_waits_when_no_pictures_come_and_ends_when_none_do(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The camera falls silent a millimetre on, three before the touch."""
+    camera, faults = opened.lab.cameras["finger"], opened.lab.faults["arm"]
+    places: list[float] = []
+
+    def stall(words: str) -> None:
+        if not places and (found := re.match(r"approach: ([\d.]+) mm", words)) and float(found[1]) > 1.0:
+            camera.stall(True)
+            places.append(opened.depth)
+
+    monkeypatch.setattr(opened.rig._reset, "_tell", stall)
+    try:
+        with pytest.raises(StaleFrame):
+            opened.rig.reset()
+    finally:
+        camera.stall(False)
+    assert faults.state().rests
+    assert opened.depth < places[0] + SPEED * LATEST < 0.0
 
 
 def test_a_speed_that_would_press_a_gel_too_deep_is_refused_in_words(tmp_path: Path) -> None:

@@ -156,7 +156,10 @@ def survives(arms: MockArms, seed: int, steps: int, ports: dict[int, Callable[[r
         arms.check()
         for innocent, faults in zip(innocents, arms.fault_clients[spared], strict=True):
             innocent.check(faults)
-    arms.fault_clients[0].reset()
+    abused = arms.fault_clients[0]
+    abused.reset()
+    until(lambda: not abused.state().clients, "those that still waited have gone")
+    abused.reset()
     with ControlClient(arms.hosts[0]) as client:
         assert client.call(40) is not None
     errors = os.pread(arms._errors.fileno(), 1 << 20, 0).decode()

@@ -248,7 +248,7 @@ def dashboard_commands(robot: Robot) -> None:
     DASHBOARD,
     "popup closePopup closeSafetyPopup addToLog isProgramSaved shutdown",
     Verdict.CONSTANT,
-    "answered, with nothing behind; after `shutdown` the mock goes on",
+    "answered, with nothing behind (`isProgramSaved` is False); after `shutdown` the mock goes on",
 )
 def dashboard_answers(robot: Robot) -> None:
     dashboard = robot.dashboard
@@ -257,7 +257,7 @@ def dashboard_answers(robot: Robot) -> None:
     dashboard.closePopup()
     dashboard.closeSafetyPopup()
     assert any("hello" in str(line) for line in robot.faults.log())
-    dashboard.isProgramSaved()
+    assert not dashboard.isProgramSaved()
     dashboard.shutdown()
     assert robot.faults.state().mode == "RUNNING"
 

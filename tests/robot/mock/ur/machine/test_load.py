@@ -97,6 +97,12 @@ def test_an_arm_with_a_wrong_payload_drifts_in_freedrive_and_with_the_right_one_
     assert bench.arm.frame[2, 3] < z - 0.005
 
 
+@pytest.mark.parametrize("numbers", [(1, 2, 3), (1, 2, 3, math.nan), (1e300, 0, 0, 1e300), (math.inf, 0, 0, 0)])
+def test_what_is_no_payload(numbers: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="a payload is"):
+        Mass.of(numbers)
+
+
 def test_a_mock_carries_what_it_was_started_with() -> None:
     with MockUR(wire_host(30), payload=(0.4, *CENTRE), ready_timeout=60) as carrier:
         for _ in range(2):

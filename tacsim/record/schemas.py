@@ -17,8 +17,9 @@ import json
 import zlib
 from collections.abc import Mapping
 from datetime import datetime
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from tacsim.interface import RigSpec
 from tacsim.models.text import printable
@@ -79,7 +80,7 @@ class FrameMessage(_Message):
 
 
 class StepMessage(_Message):
-    index: int
+    index: Annotated[int, Field(gt=-(2**53), lt=2**53)]
     time: float  # rig clock [s]
     seconds: float  # wall time of the step [s]
     reward: float | None

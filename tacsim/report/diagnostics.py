@@ -41,6 +41,7 @@ def timing(series: Series) -> dict[str, Any] | None:
     if len(done) < 2 or not arms:
         return None
     periods = np.diff(done.time)
+    median = _spread(periods)["median"]
     return {
         "period": _spread(periods),
         "asked_period": done.meta.spec.period,
@@ -52,7 +53,7 @@ def timing(series: Series) -> dict[str, Any] | None:
             word: {name: _newest(values) for name, values in _named(done, key).items()}
             for word, key in PICTURES.items()
         },
-        "real_time_factor": float(done.meta.spec.period / np.median(periods)),
+        "real_time_factor": done.meta.spec.period / median if median > 0.0 else 0.0,
     }
 
 

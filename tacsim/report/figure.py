@@ -16,6 +16,7 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.image import imsave
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.stats import pearsonr
 
 from tacsim.interface import FloatArray
@@ -26,6 +27,7 @@ INK, QUIET, GRID = "#22262b", "#6b737c", "#e3e6e9"
 GOAL = "#1f8a4c"
 COLOURS = ("#2a6db5", "#cf5b17", "#7a4fb0", "#b0891f", "#1b8f8f", "#a8325e")  # told apart by most colour-blind people
 THUMBNAIL = 320  # [px]
+TALLEST = 3.0  # height of a row of pictures, over the width of one
 DPI, WIDTH, COLUMNS = 100, 14.0, 6  # dots an inch, page width [inches], images in a row of the overview
 
 
@@ -76,9 +78,7 @@ def shrunk(image: NDArray[np.uint8], max_width: int) -> NDArray[np.uint8]:
     """An (H, W, 3) RGB image averaged down by a whole factor until it is at most `max_width` wide."""
     factor = min(-(-image.shape[1] // max_width), image.shape[0])
     rows, columns = (image.shape[0] // factor) * factor, (image.shape[1] // factor) * factor
-    blocks = image[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor, 3)
-    small: NDArray[np.uint8] = np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
-    return small
+    return np.asarray(Image.fromarray(image[:rows, :columns]).reduce(factor))
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
@@ -200,7 +200,7 @@ def _draw_timing(axes: Axes, series: Series) -> None:
     plain(axes, "wall time of a step", "step", "s")
     done = series.after_reset()
     _line(axes, done, done.seconds, "#9fb4c8")
-    middle = float(np.median(done.seconds))
+    middle = float(np.median(done.seconds[np.isfinite(done.seconds)]))
     axes.axhline(middle, color=INK, linewidth=1, label=f"median {middle:.3f} s")
     axes.set_ylim(bottom=0.0)
     _legend(axes)
@@ -213,7 +213,7 @@ def _panels(series: Series) -> list[Callable[[Axes, Series], None]]:
         (bool(series.force), _draw_force),
         (bool(series.signals), _draw_signal),
         (bool(np.isfinite(series.distance).any()), _draw_distance),
-        (bool((series.index > 0).any()), _draw_timing),
+        (bool(np.isfinite(series.after_reset().seconds).any()), _draw_timing),
         (bool(signal_against_force(series)), _draw_signal_against_force),
     ]
     return [draw for there, draw in offered if there]
@@ -240,7 +240,7 @@ def plots(series: Series) -> Figure:
 def overview(strips: Mapping[str, Sequence[Picture]], series: Series, title: str, subtitle: str) -> Figure:
     """The whole episode on one page: the pictures of each sensor in a row, at most COLUMNS, and the plots below."""
     shapes = [pictures[0].image.shape for pictures in strips.values()]
-    tall = [rows / columns * WIDTH * 0.93 / COLUMNS + 0.22 for rows, columns, _ in shapes]
+    tall = [min(rows / columns, TALLEST) * WIDTH * 0.93 / COLUMNS + 0.22 for rows, columns, _ in shapes]
     below, head = 3.1 * _rows(series), 0.95
     height = head + sum(tall) + below
     figure = canvas(WIDTH, height)

@@ -43,7 +43,7 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
         "task": meta.task,
         "policy": meta.policy,
         "seed": meta.seed,
-        "goal": list(meta.goal) if isinstance(meta.goal, tuple) else meta.goal,
+        "goal": [_number(each) for each in meta.goal] if isinstance(meta.goal, tuple) else _number(meta.goal),
         "started": None if meta.started is None else meta.started.isoformat(timespec="milliseconds"),
         "steps": len(done),
         "step": done.index.tolist(),
@@ -80,7 +80,7 @@ def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
     paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats))
+    subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats, series))
     few = {name: [each[k] for k in figure.moments(len(each), figure.COLUMNS)] for name, each in strips.items()}
     figure.save(figure.overview(few, series, _title(stats), subtitle), paths["report.png"])
     paths["report.html"].write_text(_html(series, stats, strips), encoding="utf-8")
@@ -143,15 +143,14 @@ def _title(stats: Mapping[str, Any]) -> str:
     return f"{stats['task'] or 'episode'} on rig {stats['rig']}"
 
 
-def _headline(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _headline(stats: Mapping[str, Any], series: Series) -> list[tuple[str, str]]:
     from tacsim.report.figure import goal_text
 
-    goal = stats["goal"]
     lines = [
         ("policy", str(stats["policy"])),
         ("seed", str(stats["seed"])),
         ("steps", str(stats["steps"])),
-        ("goal", goal_text(tuple(goal) if isinstance(goal, list) else goal)),
+        ("goal", goal_text(series.meta.goal)),
     ]
     started = stats["started"]
     return lines if started is None else [*lines, ("started", f"{started[:10]} {started[11:19]} {started[23:]}")]
@@ -179,7 +178,7 @@ def _html(series: Series, stats: Mapping[str, Any], strips: Mapping[str, Sequenc
     ).from_string(Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8"))
     return template.render(
         title=_title(stats),
-        about=[("rig", stats["rig"]), ("task", stats["task"] or "–"), *_headline(stats)],
+        about=[("rig", stats["rig"]), ("task", stats["task"] or "–"), *_headline(stats, series)],
         results=_results(stats),
         versions=sorted(stats["versions"].items()),
         strips=[

@@ -29,6 +29,7 @@ KEPT = "kept_"  # share of the markers that were seen
 SETTLED = "settled"
 _OF_ARMS = (ALIGNMENT, LIMITS, LOST)
 _OF_SENSORS = (SIGNAL, STALE, DRIFT, BACKGROUND, BEYOND, KEPT, PICTURES_LOST, PICTURES_DAMAGED, PICTURES_REPEATED)
+LARGEST = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
 _OWN = ("time", "seconds", "reward", "distance")
 
 
@@ -59,7 +60,8 @@ class Series:
             index[at] = step.index
             for name, column in own.items():
                 value = getattr(step, name)
-                column[at] = np.nan if value is None else value
+                if value is not None and _is_known(value):
+                    column[at] = value
             force.put(at, {name: abs(float(state.wrench[2])) for name, state in step.arms.items()})
             exposed.put(at, step.exposed)
             info.put(at, step.info)
@@ -112,9 +114,14 @@ class _Columns:
 
     def put(self, at: int, row: Mapping[str, float]) -> None:
         for name in self._names & row.keys():
-            if name not in self.found:
-                self.found[name] = np.full(self._count, np.nan)
-            self.found[name][at] = row[name]
+            if _is_known(row[name]):
+                if name not in self.found:
+                    self.found[name] = np.full(self._count, np.nan)
+                self.found[name][at] = row[name]
+
+
+def _is_known(value: float) -> bool:
+    return abs(value) <= LARGEST  # False for what is not a number
 
 
 def upper_first(names: Iterable[str]) -> list[str]:

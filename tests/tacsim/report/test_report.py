@@ -107,6 +107,25 @@ def test_summary_is_valid_json_even_with_numbers_that_are_not() -> None:
     assert config["reward"][1] is not None
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e308])
+def test_numbers_that_no_report_can_draw_count_as_unknown(value: float, tmp_path: Path) -> None:
+    """Those of a damaged recording, or of one made to break its reader; with pictures of one column too."""
+    episode = made_up(width=1, steps=3)
+    keys = ("contact_signal_upper", "alignment_upper", "limits_hit_upper", "packages_lost_upper", "stale_upper")
+    arms = {"upper": ArmState(Pose(), np.zeros(6), np.full(6, value), None, 0.0)}
+    episode.steps = [
+        replace(
+            step, time=value, seconds=value, reward=value, distance=value, info=dict.fromkeys(keys, value), arms=arms
+        )
+        for step in episode.steps
+    ]
+    episode.meta = replace(episode.meta, goal=(value, value))
+    paths = write_report(episode, tmp_path)
+    told = json.loads(paths["summary.json"].read_text(), parse_constant=lambda text: pytest.fail(text))
+    assert told["reward"] == [None] * 3 and told["timing"] is None
+    assert imread(paths["report.png"]).shape[0] < 5000
+
+
 def test_step_numbers_survive_dropped_steps() -> None:
     episode = made_up()
     episode.steps = [step for step in episode.steps if step.index != 3]

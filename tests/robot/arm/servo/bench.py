@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from robot.arm.channel import STATE, CommandKind, WorkerConfig, command_record
+from robot.arm.channel import STATE, ArmStatus, CommandKind, WorkerConfig, command_record
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.trajectory import PERIOD
@@ -115,10 +115,11 @@ class OnController:
         self.arm = Arm("ur5e", HOME)
         self.joints: FloatArray | None = None  # of the newest servoj; the controller repeats it by itself
         self.tick, self.number, self.partners = 0, 0, list[Record | None]()
+        self.force, self.jump = 0.0, 0.0  # on the tool [N]; of the controller's clock [s]
         self.packages: list[Measured] = []
         self.twists: list[FloatArray] = []  # (6,) of the sensor itself, one a period
         self.ours: list[bool] = []  # whether the newest target in this period was made in it
-        self._run(None)
+        self.run(None)
 
     @property
     def time(self) -> float:
@@ -137,14 +138,15 @@ class OnController:
         """The newest package that the worker knows is `late` periods old."""
         known = self.packages[max(0, len(self.packages) - 1 - late)]
         self.servo.check_faults(known, self.partners)
-        self._run(self.servo.step(self.time, known, self.partners))
+        self.run(self.servo.step(self.time, known, self.partners))
 
     def stall(self, periods: int) -> None:
         """The worker is suspended."""
         for _ in range(periods):
-            self._run(None)
+            self.run(None)
 
-    def _run(self, joints: FloatArray | None) -> None:
+    def run(self, joints: FloatArray | None) -> None:
+        """One period of the controller, with the joints that were sent in it."""
         self.ours.append(joints is not None and (self.joints is None or bool((joints != self.joints).any())))
         self.joints = self.joints if joints is None else joints
         if self.joints is not None:
@@ -152,10 +154,19 @@ class OnController:
         self.arm.advance()
         self.tick += 1
         package = np.zeros((), STATE)
-        package["stamp"], package["joints"], package["tcp_pose"] = self.time, self.arm.q, self.arm.pose
-        package["tcp_speed"] = self.arm.twist
+        package["stamp"], package["joints"] = self.time + self.jump, self.arm.q
+        package["tcp_pose"], package["tcp_speed"] = self.arm.pose, self.arm.twist
+        package["tcp_force"][2] = self.force
         self.packages.append(self.servo.frames.measure(package))
         self.twists.append(self.packages[-1].twist)
+
+
+def other(position: list[float], stop: list[float] | None = None, status: ArmStatus = ArmStatus.OK) -> Record:
+    """The state of another arm."""
+    record = np.zeros((), STATE)
+    record["position"], record["stopping_point"] = position, stop or position
+    record["status"], record["top_speed"] = status, 0.1
+    return record
 
 
 def shifted(start: Pose, x: float, y: float = 0.0, z: float = 0.0) -> Pose:

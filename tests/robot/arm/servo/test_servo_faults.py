@@ -8,11 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, ArmStatus, CommandKind, Partner, tactile_record
+from robot.arm.channel import ArmStatus, CommandKind, Partner, tactile_record
 from robot.arm.servo import FAULT_DECELERATION, ZERO_PATIENCE, Servo
-from robot.arm.shared_ring import Record
 from robot.arm.trajectory import PERIOD
-from tests.robot.arm.servo_bench import Bench, shifted, worker_config
+from tests.robot.arm.servo.bench import Bench, other, shifted, worker_config
 
 
 @pytest.mark.promise(3)
@@ -51,13 +50,6 @@ def test_an_arm_that_is_pushed_out_of_its_box_stops() -> None:
     bench.look()
     bench.run(3)
     assert bench.servo.status == ArmStatus.WORKSPACE_LIMIT
-
-
-def other(position: list[float], stop: list[float] | None = None, status: ArmStatus = ArmStatus.OK) -> Record:
-    record = np.zeros((), STATE)
-    record["position"], record["stopping_point"] = position, stop or position
-    record["status"], record["top_speed"] = status, 0.1
-    return record
 
 
 @pytest.mark.promise(15)

@@ -134,3 +134,15 @@ def test_who_wants_to_stop_is_heard_at_once(one_arm: Lab, folder: Path, moment: 
     state = one_arm.faults["arm"].state()
     assert state.rests and one_arm.depth("arm", state.pose) < 0.0
     assert not (folder / "never").exists()
+
+
+@pytest.mark.deep
+def test_the_question_before_presses_by_hand_stays_on_the_screen(one_arm: Lab, folder: Path) -> None:
+    words = ("calibrate", "sensor", "--camera", "my.yaml/finger", "--ball-radius", "4 mm", "--pixel-pitch", "0.03 mm")
+    with Terminal(*words, folder=folder, columns=40) as screen:
+        screen.wait_for("Is nothing touching the gel? [Y/n]:")
+        screen.type("n\n")
+        screen.wait_for("Take everything off the gel first.")
+        screen.until(lambda: screen.text.count("[Y/n]:") == 2, "the question once more")
+        screen.type("\x04")
+        assert screen.end() == 1 and screen.shows("nobody answered")

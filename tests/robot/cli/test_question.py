@@ -109,3 +109,15 @@ def test_a_question_that_nobody_could_read_is_not_asked(tmp_path: Path) -> None:
 def test_a_program_without_standard_input_has_nobody_to_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", None)  # started by `<&-`, or by a service
     assert not ask("Is anybody there?")
+
+
+def test_a_calibration_asks_before_it_opens_anything(tmp_path: Path) -> None:
+    """Nothing answers at the file's addresses."""
+    text = copy_of("ur5e-one", tmp_path, 61).read_text().replace("model: null", "model: ideal")
+    text = re.sub(r"corners: .*", "", text).replace("width: 640", "width: 320").replace("height: 480", "height: 240")
+    (tmp_path / "my.yaml").write_text(text)
+    words = ("calibrate", "touch", "--rig", "my.yaml", "--arm", "arm", "--sensor", "finger", "--ball-radius", "4 mm")
+    with Terminal(*words, folder=tmp_path, columns=40) as screen:
+        screen.wait_for("may the arm move? [y/N]:")
+        screen.type("n\n")
+        assert screen.end() == 2 and screen.shows("nobody confirmed")

@@ -45,7 +45,7 @@ def stays(screen: Terminal, words: str) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("columns", [100, 30])
+@pytest.mark.parametrize("columns", [100, pytest.param(30, marks=pytest.mark.deep)])
 def test_a_question_stays_on_the_screen_and_the_bar_goes_on_after_it(tmp_path: Path, columns: int) -> None:
     with Terminal(program=ASKING, folder=tmp_path, columns=columns) as screen:
         screen.wait_for("starting")

@@ -57,6 +57,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
         yield Opened(lab, rig, told)
 
 
+@pytest.mark.deep
 def test_the_approach_goes_at_its_speed_and_stops_on_contact(opened: Opened) -> None:
     opened.rig.reset()
     depth = opened.depth

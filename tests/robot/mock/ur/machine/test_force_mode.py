@@ -171,6 +171,7 @@ def test_type_1_presses_towards_a_point(bench: Bench) -> None:
         bench.call(3, [*bench.shifted(0.1, -0.1, 0), 0.2, 1.0], [0])
         begin(bench, (0, 10, 0), (0, 1, 0, 0, 0, 0), kind=1, frame=[*point, 0.3, -0.2, 0.5])
         bench.tick(200)
+    begin(bench, (0, 100, 0), (0, 1, 0, 0, 0, 0), kind=1, frame=[*point, 0.3, -0.2, 0.5])
     bench.until(lambda: bench.machine.program is None)
     assert "10 mm" in bench.machine.stop_reason and bench.machine.force_mode is None
 

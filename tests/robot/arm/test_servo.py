@@ -14,7 +14,7 @@ from robot.arm.servo import MAX_SINGULAR_VALUE_RATE
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import rotation
 from tacsim.limits import region
-from tests.robot.arm.servo.bench import KINEMATICS, Bench, shifted, worker_config
+from tests.robot.arm.servo_bench import KINEMATICS, Bench, shifted, worker_config
 
 
 def test_nothing_is_sent_before_the_first_command() -> None:

@@ -12,7 +12,7 @@ from robot.arm.channel import ArmStatus, CommandKind, Partner, command_record, t
 from robot.arm.servo import Servo
 from robot.arm.trajectory import PERIOD
 from robot.common.tcp import Measured
-from tests.robot.arm.servo.bench import OnController, other, shifted
+from tests.robot.arm.servo_bench import OnController, other, shifted
 
 OBSERVATION_TIMEOUT = 0.15
 STANDING = (ArmStatus.HOLD, ArmStatus.WAITING, ArmStatus.OBSERVATION_STALE)

@@ -11,7 +11,7 @@ import pytest
 from robot.arm.channel import ArmStatus, CommandKind, Partner, tactile_record
 from robot.arm.servo import FAULT_DECELERATION, ZERO_PATIENCE, Servo
 from robot.arm.trajectory import PERIOD
-from tests.robot.arm.servo.bench import Bench, other, shifted, worker_config
+from tests.robot.arm.servo_bench import Bench, other, shifted, worker_config
 
 
 @pytest.mark.promise(3)

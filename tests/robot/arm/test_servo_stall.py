@@ -15,7 +15,7 @@ from robot.arm.servo import STALL_PATIENCE
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import rotation
 from tacsim import pose as se3
-from tests.robot.arm.servo.bench import OnController, shifted
+from tests.robot.arm.servo_bench import OnController, shifted
 
 SETTLING = 5  # periods in which the joints of the mock follow a change of their target
 

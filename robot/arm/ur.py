@@ -169,9 +169,10 @@ class URArm(Closing):
         the pose that is sent: a target outside the workspace, or too near to another arm, is clipped on the straight
         path there.
 
-        Must be repeated within `action_timeout`, else the arm holds. Raises ActionError for what is not a pose or is
-        out of reach, and the error of its status (ProtectiveStop, EmergencyStop, SafetyViolation, LinkLost,
-        DeviceNotConnectedError) when it cannot follow; then only `recover` helps.
+        Must be repeated within `action_timeout`, else the arm comes to rest, at most limits.speed x action_timeout
+        farther. Raises ActionError for what is not a pose or is out of reach, and the error of its status
+        (ProtectiveStop, EmergencyStop, SafetyViolation, LinkLost, DeviceNotConnectedError) when it cannot follow; then
+        only `recover` helps.
         """
         with self._lock:
             self._require_able()

@@ -35,6 +35,7 @@ class ArmStatus(IntEnum):
     KEEP_OUT = 12  # came too near to the other arm
     PARTNER_STOPPED = 13  # the other arm of a keep-out stopped, or its state is unknown
     GEL_LIMIT = 14  # its gel was pressed or dragged too far
+    OFF_WAY = 15  # left its way to the start
     PROGRAM_STOPPED = 20  # on the controller: its watchdog, the pendant, or power
     PROTECTIVE_STOP = 21
     EMERGENCY_STOP = 22  # also a safeguard stop, a safety violation, a fault
@@ -71,6 +72,7 @@ _TEXTS = {
     ArmStatus.PARTNER_STOPPED: "stopped because the other arm did; recover() that one, then this",
     ArmStatus.GEL_LIMIT: "pressed or dragged its gel farther than limits.depth or limits.shear and stopped; move it "
     "away, then recover()",
+    ArmStatus.OFF_WAY: "left its way to the start and stopped; look why, then begin anew",
     ArmStatus.PROGRAM_STOPPED: "has no running program (watchdog, pendant or power); look why, then recover()",
     ArmStatus.PROTECTIVE_STOP: "made a protective stop; look why, then recover()",
     ArmStatus.EMERGENCY_STOP: "has an emergency or safeguard stop; a person must release it, then recover()",
@@ -97,6 +99,7 @@ class CommandKind(IntEnum):
     TARGET = 1
     ZERO_WRENCH = 2
     CLOSE = 3
+    GO_ON = 4  # along the way to the start; only an arm that was opened for it takes this
 
 
 # One controller package and the worker's judgement of it. Written every period, and again as soon as a fault is found.
@@ -134,6 +137,7 @@ COMMAND = np.dtype(
         ("kind", np.int64),
         ("pose", np.float64, 7),  # position, quaternion x y z w
         ("speed", np.float64),  # at most this fast, and never faster than limits.speed [m/s]
+        ("share", np.float64),  # of the way to the start, 0 to 1: up to there
     ]
 )
 # What the driver reports after every observation: exposure time of the oldest picture (NaN: do not guard by pictures
@@ -186,6 +190,7 @@ class WorkerConfig:
     gain: float
     partners: list[Partner]
     serial: str | None = None  # of the robot; None: any
+    way: list[list[float]] | None = None  # joints (2, 6): the arm may go straight from the first to the second, no more
 
     @property
     def frames(self) -> ArmFrames:
@@ -226,10 +231,10 @@ def segment_of(arm: str) -> shared_ring.Segment:
 
 
 def command_record(
-    time: float, kind: CommandKind, pose: FloatArray | None = None, speed: float = math.inf
+    time: float, kind: CommandKind, pose: FloatArray | None = None, speed: float = math.inf, share: float = 0.0
 ) -> shared_ring.Record:
-    """A command record; `pose` (7,) and top `speed` [m/s] for CommandKind.TARGET."""
-    return np.array((time, kind, np.zeros(7) if pose is None else pose, speed), COMMAND)
+    """A command record; `pose` (7,) and top `speed` [m/s] for CommandKind.TARGET, `share` for CommandKind.GO_ON."""
+    return np.array((time, kind, np.zeros(7) if pose is None else pose, speed, share), COMMAND)
 
 
 def tactile_record(exposed: float, depth: float, shear: float) -> shared_ring.Record:

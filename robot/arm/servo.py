@@ -118,8 +118,7 @@ class Servo:
         if exceeds_wrench(measured.wrench, config.force, config.torque):
             self.trip(ArmStatus.FORCE_LIMIT, measured)
         here = measured.sensor[:3, 3]
-        if self.region.excess(braking_end(here, measured.twist[:3], self._hard[0])) > ALLOWED_OVERSHOOT:
-            self.trip(ArmStatus.WORKSPACE_LIMIT, measured)
+        self._check_place(measured)
         if not all(map(is_healthy, partners)):
             if self.resting and not self.status.is_fault:
                 self.status, self._goal = ArmStatus.WAITING, None
@@ -135,6 +134,13 @@ class Servo:
                 approach = float(measured.twist[:3] @ (other["position"] - here))
                 if approach > 0.0 and not self.resting:
                     self.trip(ArmStatus.KEEP_OUT, measured)
+
+    def _check_place(self, measured: Measured) -> None:
+        if (
+            self.region.excess(braking_end(measured.sensor[:3, 3], measured.twist[:3], self._hard[0]))
+            > ALLOWED_OVERSHOOT
+        ):
+            self.trip(ArmStatus.WORKSPACE_LIMIT, measured)
 
     def on_tactile(self, number: int, report: Record | None, measured: Measured) -> None:
         """Reads the newest tactile report, once: a gel pressed or sheared beyond its limit trips."""
@@ -299,11 +305,13 @@ class Servo:
         self._last_singularity_check = joints, distance - LEAST_SINGULAR_VALUE
         return distance < LEAST_SINGULAR_VALUE and distance < self.kinematics.singularity(self._sent)
 
-    def _gaps(self, motion: MotionState, partners: Sequence[Record | None]) -> list[float]:
+    def _gaps(
+        self, motion: MotionState, partners: Sequence[Record | None], end: FloatArray | None = None
+    ) -> list[float]:
         """Distance [m] between the braking path of `motion` and that of each other arm, less the keep-out distance and
         less what the other arm may cover within LOOP_OFFSET (the end of a braking path moves at most twice as fast as
         the arm)."""
-        end = stopping_point(motion, self.config.acceleration)
+        end = stopping_point(motion, self.config.acceleration) if end is None else end
         gaps = []
         for partner, other in zip(self.config.partners, partners, strict=True):
             assert other is not None  # else the arm waits

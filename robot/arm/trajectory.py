@@ -87,8 +87,8 @@ def towards(
     `allowed` says whether a motion state is allowed, judged by where it could still be stopped. Where it is not, the
     origin brakes straight on instead: its stopping point stays the one that was allowed before.
     """
-    velocity, moved, arrived = _approach(position - now.position, now.velocity, rates.speed, rates.acceleration, period)
-    spin, turned, rotation_arrived = _approach(
+    velocity, moved, arrived = advance(position - now.position, now.velocity, rates.speed, rates.acceleration, period)
+    spin, turned, rotation_arrived = advance(
         rotation_vector(rotation @ now.rotation.T), now.spin, rates.turn_rate, rates.turn_acceleration, period
     )
     step = MotionState(
@@ -105,8 +105,8 @@ def towards(
 
 def braking(now: MotionState, deceleration: float, turn_deceleration: float, period: float = PERIOD) -> MotionState:
     """One period nearer to rest, straight on."""
-    velocity = _slower(now.velocity, deceleration * period)
-    spin = _slower(now.spin, turn_deceleration * period)
+    velocity = slower(now.velocity, deceleration * period)
+    spin = slower(now.spin, turn_deceleration * period)
     return MotionState(now.position + velocity * period, turn(spin * period) @ now.rotation, velocity, spin)
 
 
@@ -119,13 +119,14 @@ def stopping_point(motion: MotionState, deceleration: float, period: float = PER
     return point
 
 
-def _approach(
-    error: FloatArray, velocity: FloatArray, top: float, acceleration: float, period: float
+def advance(
+    error: FloatArray, velocity: FloatArray, top: float, acceleration: float, period: float = PERIOD
 ) -> tuple[FloatArray, FloatArray, bool]:
-    """The next velocity (3,) towards a point `error` (3,) away, its displacement, and whether that arrives."""
+    """The next velocity towards a point `error` away, its displacement, and whether that arrives; vectors of any length
+    alike, `top` and `acceleration` bound their norms."""
     distance = math.sqrt(float(error @ error))
     speed = min(top, landing_speed(distance, acceleration, period))
-    wanted = error * (speed / distance) if distance > 0.0 else np.zeros(3)
+    wanted = error * (speed / distance) if distance > 0.0 else np.zeros_like(velocity)
     change = wanted - velocity
     excess = math.sqrt(float(change @ change)) / (acceleration * period)
     if excess > 1.0 + 1e-12:
@@ -134,6 +135,6 @@ def _approach(
     return wanted, wanted * period, speed * period >= distance * (1.0 - 1e-12)
 
 
-def _slower(velocity: FloatArray, change: float) -> FloatArray:
+def slower(velocity: FloatArray, change: float) -> FloatArray:
     speed = math.sqrt(float(velocity @ velocity))
-    return np.zeros(3) if speed <= change else velocity * (1.0 - change / speed)
+    return np.zeros_like(velocity) if speed <= change else velocity * (1.0 - change / speed)

@@ -37,7 +37,7 @@ from robot.common.tcp import pose_of
 from robot.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleObservationError
 from tacsim import pose as se3
 from tacsim.control.gel_monitor import GelReading
-from tacsim.interface import Action, ArmState, Pose
+from tacsim.interface import Action, ArmState, FloatArray, Pose
 from tacsim.limits import ActionError, check_action, clip_to_region
 from tacsim.models.hardware import UrArmConfig
 
@@ -76,6 +76,9 @@ class URArm(Closing):
     SafetyViolation (it stands outside its workspace, or feels too much), DeviceAlreadyConnectedError.
     """
 
+    _way: tuple[FloatArray, FloatArray] | None = None  # of an arm that is led to its start (robot.arm.start_arm)
+    _bearable: tuple[ArmStatus, ...] = ()  # faults that it may be opened with
+
     def __init__(
         self,
         config: UrArmConfig,
@@ -96,7 +99,7 @@ class URArm(Closing):
         gaps = (keep_out or {}).values()
         partners = [Partner(each.descriptor, gap) for each, gap in zip(self._segments[1:], gaps, strict=True)]
         self._channel, *self._others = map(Channel, self._segments)
-        self._worker_config = worker_config(config, name, self._segments[0].descriptor, partners)
+        self._worker_config = worker_config(config, name, self._segments[0].descriptor, partners, self._way)
         self._frames = self._worker_config.frames
         with _opening:
             if name in _open:
@@ -274,8 +277,8 @@ class URArm(Closing):
                 f"{self._timeout:g} s. Restart it, or look what else holds it"
             ) from failure
         status = self.status()
-        if status.is_fault:
-            raise self._error(status)
+        if status.is_fault and status not in self._bearable:
+            raise status.error(self._explain(status) + _AT_CONNECTING.get(status, ""))
 
     def _end_worker(self) -> None:
         """Asks the worker to brake and end, then kills it."""
@@ -288,9 +291,9 @@ class URArm(Closing):
         self._worker.close(CLOSE_TIMEOUT if connected else 0.0)
         self._worker = None
 
-    def _send(self, kind: CommandKind, target: Pose | None = None, speed: float = math.inf) -> None:
+    def _send(self, kind: CommandKind, target: Pose | None = None, speed: float = math.inf, share: float = 0.0) -> None:
         vector = None if target is None else np.concatenate([target.position, target.quaternion])
-        self._channel.commands.write(command_record(time.monotonic(), kind, vector, speed))
+        self._channel.commands.write(command_record(time.monotonic(), kind, vector, speed, share))
 
     def _await(self, done: Callable[[], bool], timeout: float, otherwise: str) -> None:
         deadline = time.monotonic() + timeout
@@ -374,6 +377,12 @@ class URArm(Closing):
         return text
 
 
+_AT_CONNECTING = {
+    ArmStatus.FORCE_LIMIT: ". If it touches nothing, its force sensor is off: `tacsim doctor --rig FILE` shows by how "
+    "much, `tacsim start FILE` zeroes it",
+    ArmStatus.WORKSPACE_LIMIT: ". `tacsim doctor --rig FILE` says how to jog it back, `tacsim start FILE` leads it to "
+    "its start",
+}
 _DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStatus.PROGRAM_STOPPED)
 
 

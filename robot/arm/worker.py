@@ -28,6 +28,7 @@ from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
 from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
 from robot.arm.shared_ring import Segment
+from robot.arm.start_servo import StartServo
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.common.process import Parent
@@ -74,7 +75,8 @@ class Worker:
         self.record = np.zeros((), STATE)
         self.record["top_speed"] = config.speed
         self.partners = [Channel(Segment(partner.segment)) for partner in config.partners]
-        self.servo = Servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
+        servo = Servo if config.way is None else StartServo
+        self.servo = servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(WINDOW, PERIOD)
         self._limit = TimeLimit(config.link_timeout + MARGIN)  # of calls into the library
         self._last = 0.0  # when the last period ended

@@ -11,6 +11,7 @@ from robot.common.kinematics import pose
 from robot.common.loopback import is_loopback
 from robot.errors import DeviceNotConnectedError
 from tacsim import pose as se3
+from tacsim.interface import FloatArray
 from tacsim.models.hardware import UrArmConfig
 
 
@@ -34,7 +35,14 @@ def check_host(config: UrArmConfig, name: str) -> None:
         )
 
 
-def worker_config(config: UrArmConfig, name: str, segment: int, partners: Sequence[Partner]) -> WorkerConfig:
+def worker_config(
+    config: UrArmConfig,
+    name: str,
+    segment: int,
+    partners: Sequence[Partner],
+    way: tuple[FloatArray, FloatArray] | None = None,
+) -> WorkerConfig:
+    """`way`: joints (6,) that it may go between, straight; None: it follows commands within its limits."""
     limits, tool = config.limits, se3.to_matrix(config.flange_from_tool.pose)
     return WorkerConfig(
         name=name,
@@ -70,4 +78,5 @@ def worker_config(config: UrArmConfig, name: str, segment: int, partners: Sequen
         gain=config.gain,
         partners=list(partners),
         serial=config.serial,
+        way=None if way is None else [end.tolist() for end in way],
     )

@@ -19,6 +19,7 @@ from robot.cli.mock import mock
 from robot.cli.recover import recover
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce
+from robot.cli.start import start
 
 app = typer.Typer(
     name="tacsim",
@@ -32,7 +33,7 @@ app = typer.Typer(
 )
 app.add_typer(calibrate, name="calibrate")
 COMMANDS = {
-    app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor),
+    app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor, start),
     calibrate: (latency, lens, touch, hand_eye),
 }
 for group, commands in COMMANDS.items():

@@ -73,11 +73,11 @@ def doctor(
     if as_json:
         typer.echo(json.dumps(report, indent=2))
     else:
-        _print_checks(checks)
+        print_checks(checks)
     raise typer.Exit(0 if report["ok"] else 1)
 
 
-def _print_checks(checks: list[machine.Check]) -> None:
+def print_checks(checks: list[machine.Check]) -> None:
     from rich.table import Table
     from rich.text import Text
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,13 +50,18 @@ def examine_rig(config: RigConfig, file: str | None = None) -> list[Check]:
         return [Check("rig", "ok", f"'{config.name}' has no hardware: nothing to check")]
     try:
         with MockCell(config) as cell:
-            found = _Found(file or config.name, dict(cell.start_poses), {})
-            checks = [check for name, arm in arms.items() for check in _arm(name, arm, found)]
-            checks += _keep_outs(config, found)
+            checks = examine_arms(config, cell.start_poses, file or config.name)
             checks += [_camera(name, camera) for name, camera in cameras.items()]
     except (DeviceError, ValueError, RuntimeError) as failure:
         return [Check("rig", "fail", str(failure), "mend the rig file")]
     return checks
+
+
+def examine_arms(config: RigConfig, starts: Mapping[str, Pose], file: str) -> list[Check]:
+    """The checks of its arms alone. starts: where the scene of a mock rig has them."""
+    found = _Found(file, dict(starts), {})
+    arms = {name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig)}
+    return [*(check for name, arm in arms.items() for check in _arm(name, arm, found)), *_keep_outs(config, found)]
 
 
 @dataclass(frozen=True, slots=True)

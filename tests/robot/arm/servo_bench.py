@@ -9,6 +9,7 @@ import numpy as np
 from robot.arm.channel import STATE, ArmStatus, CommandKind, WorkerConfig, command_record
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
+from robot.arm.start_servo import StartServo
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, pose, rotation
 from robot.common.tcp import Measured, pose_of
@@ -65,7 +66,8 @@ class Bench:
     """A servo and an arm whose joints make up a part of their error in each period."""
 
     def __init__(self, calibration: FloatArray | None = None, **changes: object) -> None:
-        self.servo = Servo(worker_config(**changes))
+        config = worker_config(**changes)
+        self.servo = Servo(config) if config.way is None else StartServo(config)
         self.q, self.time, self.number = HOME.copy(), 0.0, 0
         self.calibration = np.eye(4) if calibration is None else calibration  # the true flange, seen from the nominal
         self.record: Record = np.zeros((), STATE)

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from robot.cli import errors
-from robot.cli.doctor import _print_checks
+from robot.cli.doctor import print_checks
 from robot.cli.output import SafeConsole
 from robot.doctor.machine import Check
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
@@ -53,7 +53,7 @@ def test_its_own_colours_and_cursor_stay() -> None:
 def test_errors_and_checks_are_shown_the_same_way(capsys: pytest.CaptureFixture[str]) -> None:
     errors.complain(EVIL)
     check(capsys.readouterr().err)
-    _print_checks([Check("serial", "warn", EVIL, "do this")])
+    print_checks([Check("serial", "warn", EVIL, "do this")])
     check(capsys.readouterr().out)
     message, _ = errors.explain(FileNotFoundError(2, "No such file", "x\ny" + EVIL))
     check(message)

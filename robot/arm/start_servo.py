@@ -1,0 +1,177 @@
+"""The servo of an arm that is led to its start: straight in joint space, slowly, and nowhere else.
+
+An arm that stands outside its workspace follows no ordinary command. Here the region is replaced by the way: the
+measured joints must be on it, within OFF_WAY. Targets are refused; CommandKind.GO_ON moves the arm along the way, up to
+a share of it, and must be repeated within `action_timeout` as any command. Limits of force, the keep-out, the partners,
+the link, the stops of the controller and the driver's death are guarded as ever, by the same code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from robot.arm.channel import ArmStatus, CommandKind, WorkerConfig
+from robot.arm.servo import Servo
+from robot.arm.shared_ring import Record
+from robot.arm.trajectory import PERIOD, MotionState, Rates, advance, resting, slower, stopping_distance
+from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
+from robot.common.tcp import ArmFrames, Measured
+from tacsim.interface import FloatArray
+
+JOINT_SPEED, JOINT_ACCELERATION = 0.1, 0.5  # of the fastest joint, at most [rad/s, rad/s^2]
+OFF_WAY = 20e-3  # an arm with a joint farther than this from the way has left it [rad]
+LAG = 15e-3  # the target waits for an arm that is farther behind, such as one slowed down on its pendant [rad]
+SAMPLES = 100  # points of a way at which speeds are judged
+MARGIN = 0.95  # of the speeds there: they differ between the samples
+STALL = 1.5 * PERIOD  # a longer pause between two targets has let the arm run out [s]
+
+
+class WayRates(Rates, Protocol):
+    """What limits a motion along a way; tacsim.models.hardware.ArmLimits and WorkerConfig have it."""
+
+    @property
+    def joint_speed(self) -> float: ...  # [rad/s]
+
+
+def sensor_path(kinematics: Kinematics, frames: ArmFrames, joints: FloatArray) -> FloatArray:
+    """world_from_sensor (n, 4, 4) at joints (n, 6), by the nominal lengths of the model."""
+    flange_from_sensor = frames.flange_from_tool @ frames.tool_from_sensor
+    return np.array([frames.world_from_base @ kinematics.forward(q) @ flange_from_sensor for q in joints])
+
+
+def way_rates(
+    kinematics: Kinematics, frames: ArmFrames, begin: FloatArray, end: FloatArray, limits: WayRates
+) -> tuple[float, float]:
+    """Top speed [rad/s] and acceleration [rad/s^2] of the joint vector along the straight way from `begin` to `end`
+    (6,), such that neither a joint nor the sensor ever exceeds its limits."""
+    joints = begin + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - begin)
+    step = float(np.linalg.norm(joints[1] - joints[0]))
+    if step < 1e-9:
+        return JOINT_SPEED, JOINT_ACCELERATION
+    path = sensor_path(kinematics, frames, joints)
+    shift = float(np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1).max()) / step + 1e-9
+    turns = [np.linalg.norm(rotation_vector(b[:3, :3] @ a[:3, :3].T)) for a, b in pairwise(path)]
+    turn, joint = float(max(turns)) / step + 1e-9, float(np.abs(joints[1] - joints[0]).max()) / step
+    return (
+        MARGIN * min(min(JOINT_SPEED, limits.joint_speed) / joint, limits.speed / shift, limits.turn_rate / turn),
+        MARGIN * min(JOINT_ACCELERATION / joint, limits.acceleration / shift, limits.turn_acceleration / turn),
+    )
+
+
+def distance_from_way(joints: FloatArray, begin: FloatArray, end: FloatArray) -> float:
+    """How far the joint that is farthest off lies from the straight way [rad]."""
+    along = end - begin
+    share = float(np.clip((joints - begin) @ along / max(float(along @ along), 1e-12), 0.0, 1.0))
+    return float(np.abs(joints - begin - share * along).max())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Target:
+    """A point of the way, for one period."""
+
+    joints: FloatArray  # (6,) [rad]
+    rate: FloatArray  # (6,) [rad/s]
+    motion: MotionState  # of the sensor
+    stop: FloatArray  # (3,) where the sensor comes to rest if it brakes from then on [m]
+
+
+class StartServo(Servo):
+    """As its base, for the one way of `config.way`."""
+
+    def __init__(self, config: WorkerConfig, commands_read: int = 0, tactile_read: int = 0) -> None:
+        super().__init__(config, commands_read, tactile_read)
+        assert config.way is not None
+        self._begin, self._end = np.array(config.way)
+        self._top, self._acceleration = way_rates(self.kinematics, self.frames, self._begin, self._end, config)
+        self._flange_from_sensor = self.frames.flange_from_tool @ self.frames.tool_from_sensor
+        self._share: float | None = None  # up to where it may go; None: it stays
+        self._share_time = 0.0
+        self._rate = np.zeros(6)  # of the target [rad/s]
+        self._stop = np.zeros(3)  # where the sensor would come to rest if the target braked now [m]
+        self._last = -math.inf  # when the last target was made [s]
+
+    def _check_place(self, measured: Measured) -> None:
+        if distance_from_way(measured.joints, self._begin, self._end) > OFF_WAY:
+            self.trip(ArmStatus.OFF_WAY, measured)
+
+    def on_command(self, number: int, command: Record | None) -> None:
+        """A target is rejected: only the way is open."""
+        if command is None or number == self.commands_read:
+            return
+        super().on_command(number, command)
+        self.rejected += self._goal is not None
+        self._goal = self._share = None
+        share = float(command["share"])
+        if int(command["kind"]) == CommandKind.GO_ON and 0.0 <= share <= 1.0:
+            self._share, self._share_time = share, float(command["time"])
+
+    def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
+        """The joints (6,) to send in this period; None: send nothing, the controller holds."""
+        self._before = self.motion, self._sent
+        paused, self._last = time - self._last, time
+        if self.status.is_fault:
+            return self._slow_down(measured)
+        waits = self.status == ArmStatus.WAITING
+        goes = not waits and self._share is not None and time - self._share_time <= self.config.action_timeout
+        if not waits:
+            self.status = ArmStatus.OK if goes else ArmStatus.HOLD
+        if (
+            self._sent is None
+            or self.motion is None
+            or (self.motion.at_rest and self._was_moved(self.motion, measured))
+        ):
+            if not goes:
+                return None if self._sent is None else self._sent
+            self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
+            self._rate, self._stop = np.zeros(6), self.motion.position
+        if paused > STALL:  # as far as the arm has run out meanwhile, the target goes on more slowly
+            self._rate = self._rate * math.exp(-(paused - PERIOD) / self.config.lookahead)
+        if goes and float(np.abs(measured.joints - self._sent).max()) < LAG:
+            assert self._share is not None
+            goal = self._begin + self._share * (self._end - self._begin)
+            rate, moved, arrived = advance(goal - self._sent, self._rate, self._top, self._acceleration)
+            wanted = self._target(goal if arrived else self._sent + moved, np.zeros(6) if arrived else rate, measured)
+            if self._keeps_clear(wanted, partners):
+                return self._follow(wanted)
+        rate = slower(self._rate, self._acceleration * PERIOD)
+        return self._follow(self._target(self._sent + rate * PERIOD, rate, measured))
+
+    @property
+    def stop(self) -> FloatArray | None:
+        return super().stop if self.status.is_fault or self.motion is None else self._stop
+
+    def _follow(self, target: _Target) -> FloatArray:
+        self._rate, self._stop = target.rate, target.stop
+        return self._send(target.motion, target.joints)
+
+    def _target(self, joints: FloatArray, rate: FloatArray, measured: Measured) -> _Target:
+        """A real arm's own lengths, which the model does not contain, follow from `measured`."""
+        model_from_controller = inverse_frame(self.kinematics.forward(measured.joints)) @ measured.flange
+
+        def sensor(q: FloatArray) -> FloatArray:
+            flange = self.kinematics.forward(q) @ model_from_controller
+            frame: FloatArray = self.frames.world_from_base @ flange @ self._flange_from_sensor
+            return frame
+
+        here = sensor(joints)
+        if not rate.any():
+            return _Target(joints, rate, resting(here[:3, 3], here[:3, :3]), here[:3, 3])
+        before = sensor(joints - rate * PERIOD)
+        velocity = (here[:3, 3] - before[:3, 3]) / PERIOD
+        spin = rotation_vector(here[:3, :3] @ before[:3, :3].T) / PERIOD
+        speed = float(np.linalg.norm(rate))
+        end = sensor(joints + rate * (stopping_distance(speed, self._acceleration) / speed))
+        return _Target(joints, rate, MotionState(here[:3, 3], here[:3, :3], velocity, spin), end[:3, 3])
+
+    def _keeps_clear(self, target: _Target, partners: Sequence[Record | None]) -> bool:
+        """True if the arm could still stop clear of the other arms, or moves away from them."""
+        assert self.motion is not None
+        before = self._gaps(self.motion, partners, self._stop)
+        now = self._gaps(target.motion, partners, target.stop)
+        return all(new >= 0.0 or new >= old for new, old in zip(now, before, strict=True))

@@ -1,0 +1,90 @@
+"""`tacsim start`: from arms that stand anywhere to a dry run, as a person at a terminal goes."""
+
+from __future__ import annotations
+
+import signal
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tacsim import pose as se3
+from tests.robot.cli.invoked import tacsim
+from tests.robot.cli.lab import Lab, copy_of
+from tests.robot.cli.terminal import Terminal
+
+if find_spec("rtde_control") is None:
+    pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+AWAY = (40e-3, -30e-3, -50e-3)  # of the start, sensor axes: far outside the box of the shipped file [m]
+OFFSET = 24.0  # what the force sensor is off by [N]
+
+
+def slow_to_die(file: Path) -> Path:
+    """On a busy machine no time-out ends the test; 100 mm/s: the joints' own speed bounds the way."""
+    text = file.read_text(encoding="utf-8")
+    text = text.replace("link_timeout: 50 ms", "link_timeout: 2 s").replace("speed: 20 mm/s", "speed: 100 mm/s")
+    file.write_text(text.replace("approach_speed: 100 mm/s", "approach_speed: 2 mm/s"), encoding="utf-8")
+    return file
+
+
+@pytest.mark.deep
+def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> None:
+    file = slow_to_die(copy_of("ur5e-one", tmp_path, 66))
+    with Lab(file, beside=AWAY) as lab:
+        lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
+        refused = tacsim("run", str(file), "--dry-run", "--steps", "2", "--out", "dry")
+        assert refused.exit_code == 2, refused.output
+        assert "`tacsim start FILE`" in " ".join(refused.stderr.split())
+        here = lab.faults["arm"].state().joints
+        with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
+            terminal.wait_for("outside:")
+            for question in ("Connect", "shall it be zeroed?", "of this way (Ctrl-C brakes it)?"):
+                terminal.wait_for(question)
+                assert np.allclose(lab.faults["arm"].state().joints, here, atol=1e-6)
+                terminal.type("y\n")
+            terminal.wait_for("shall it go on to its start")
+            terminal.type("y\n")
+            terminal.wait_for("Next: tacsim run")
+            assert terminal.end() == 0, terminal.picture
+        assert lab.faults["arm"].state().rests
+        start = lab.config.arms["arm"].start  # type: ignore[union-attr]
+        pose = np.array(lab.faults["arm"].state().pose)  # base and world are one, and the TCP is the sensor
+        assert start is not None and np.linalg.norm(pose[:3] - start.position) < 1e-3
+        assert se3.distance(start.pose, se3.from_rotation_vector(pose[:3], pose[3:]))[1] < 5e-3
+        done = tacsim("run", str(file), "--dry-run", "--steps", "2", "--out", "dry")
+        assert done.exit_code == 0, done.output
+
+
+@pytest.mark.deep
+def test_ctrl_c_brakes_an_arm_on_its_way_and_a_no_moves_nothing(tmp_path: Path) -> None:
+    file = slow_to_die(copy_of("ur5e-one", tmp_path, 66))
+    with Lab(file, beside=AWAY) as lab:
+        faults, here = lab.faults["arm"], lab.faults["arm"].state().joints
+        with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
+            terminal.wait_for("Connect")
+            terminal.type("y\n")
+            terminal.wait_for("of this way (Ctrl-C brakes it)?")
+            terminal.type("n\n")
+            terminal.wait_for("stays where it is")
+            assert terminal.end() == 1
+        assert np.allclose(faults.state().joints, here, atol=1e-6)
+        with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
+            for question in ("Connect", "of this way (Ctrl-C brakes it)?", "shall it go on to its start"):
+                terminal.wait_for(question)
+                terminal.type("y\n")
+            terminal.until(lambda: not faults.state().rests, "motion")
+            terminal.type("\x03")
+            assert terminal.end() == 128 + signal.SIGINT
+            assert terminal.shows("was stopped on its way to the start"), terminal.picture
+        state = faults.state()
+        assert state.rests and not state.program and not np.allclose(state.joints, here, atol=1e-3)
+
+
+def test_without_a_terminal_nothing_is_led(tmp_path: Path) -> None:
+    result = tacsim("start", str(copy_of("ur5e-one", tmp_path, 66)))
+    assert result.exit_code == 2 and "run this from a terminal" in " ".join(result.stderr.split())
+    result = tacsim("start", "sim")
+    assert result.exit_code == 2 and "has no UR arm" in " ".join(result.stderr.split())

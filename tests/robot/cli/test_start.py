@@ -36,7 +36,7 @@ def test_arms_are_led_to_their_start_and_a_dry_run_follows(tmp_path: Path) -> No
     with Lab(file, beside=AWAY) as lab:
         lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
         refused = tacsim("run", str(file), "--dry-run", "--steps", "2", "--out", "dry")
-        assert refused.exit_code == 2, refused.output
+        assert refused.exit_code == 1, refused.output
         assert "`tacsim start FILE`" in " ".join(refused.stderr.split())
         here = lab.faults["arm"].state().joints
         with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
@@ -75,7 +75,7 @@ def test_ctrl_c_brakes_an_arm_on_its_way_and_a_no_moves_nothing(tmp_path: Path) 
             for question in ("Connect", "of this way (Ctrl-C brakes it)?", "shall it go on to its start"):
                 terminal.wait_for(question)
                 terminal.type("y\n")
-            terminal.until(lambda: not faults.state().rests, "motion")
+            terminal.until(lambda: np.abs(np.array(faults.state().joints) - here).max() > 0.04, "most of the way")
             terminal.type("\x03")
             assert terminal.end() == 128 + signal.SIGINT
             assert terminal.shows("was stopped on its way to the start"), terminal.picture

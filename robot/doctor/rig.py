@@ -139,7 +139,10 @@ def _controller(name: str, config: UrArmConfig, dashboard: Dashboard) -> Iterato
     try:
         dashboard.require_ready(f"arm '{name}'")
         words = f"robot mode {dashboard.mode()}, safety {dashboard.safety()}, remote control"
-        yield Check(f"{name}: ready", "ok", f"{words}, program {dashboard.program()}")
+        program = dashboard.program()
+        busy = program == "PLAYING"
+        advice = "another program drives it: end that one before a run" if busy else ""
+        yield Check(f"{name}: ready", "warn" if busy else "ok", f"{words}, program {program}", advice)
     except DeviceError as failure:
         yield Check(f"{name}: ready", "fail", str(failure), "see to it at the pendant, then look again")
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robot.procedures.to_start import Guide, lead_to_start
 from tacsim import pose as se3
+from tests.robot.arm.mocked import until
 from tests.robot.cli.invoked import tacsim
 from tests.robot.cli.lab import Lab, copy_of
 from tests.robot.cli.terminal import Terminal
@@ -88,3 +90,29 @@ def test_without_a_terminal_nothing_is_led(tmp_path: Path) -> None:
     assert result.exit_code == 2 and "run this from a terminal" in " ".join(result.stderr.split())
     result = tacsim("start", "sim")
     assert result.exit_code == 2 and "has no UR arm" in " ".join(result.stderr.split())
+
+
+@pytest.mark.deep
+def test_an_arm_whose_assistant_is_killed_comes_to_rest(tmp_path: Path) -> None:
+    file = slow_to_die(copy_of("ur5e-one", tmp_path, 66))
+    with Lab(file, beside=AWAY) as lab:
+        faults, here = lab.faults["arm"], np.array(lab.faults["arm"].state().joints)
+        with Terminal("start", str(file), folder=tmp_path, lines=80) as terminal:
+            for question in ("Connect", "of this way (Ctrl-C brakes it)?", "shall it go on to its start"):
+                terminal.wait_for(question)
+                terminal.type("y\n")
+            terminal.until(lambda: np.abs(np.array(faults.state().joints) - here).max() > 0.04, "most of the way")
+            terminal.process.kill()
+            until(lambda: faults.state().rests and not faults.state().program, "rest without a program")
+        gone = np.abs(np.array(faults.state().joints) - here).max()
+        assert 0.04 < gone < 0.12  # of 0.157 rad
+
+
+def test_a_no_to_zeroing_leaves_an_arm_that_feels_too_much(tmp_path: Path) -> None:
+    file = slow_to_die(copy_of("ur5e-one", tmp_path, 66))
+    with Lab(file, beside=AWAY) as lab:
+        lab.faults["arm"].wrench([0.0, OFFSET, 0.0, 0.0, 0.0, 0.0])
+        here, said = lab.faults["arm"].state().joints, list[str]()
+        away = lead_to_start(lab.config, lab.starts, Guide(lambda question: "Connect" in question, said.append))
+        assert away["arm"] > 0.05 and "cannot be moved" in said[-1]
+        assert np.allclose(lab.faults["arm"].state().joints, here, atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from robot.mock.fixtures import mock_host
 from tacsim import pose as se3
 from tacsim.config import config_root, load_rig
 from tacsim.models.hardware import Placement, UrArmConfig
+from tests.robot.mock.wire_client import RtdeClient
 
 HOST = mock_host(77)
 SERIAL = "20195501234"
@@ -49,7 +51,7 @@ def file(tmp_path: Path) -> Path:
     text = (config_root() / "rigs" / "ur5e-one.yaml").read_text(encoding="utf-8")
     text = text.replace("192.168.1.101", HOST).replace("simulator: false", "simulator: true")
     path = tmp_path / "my.yaml"
-    path.write_text(text.replace("model: ur5e #", "serial: 20190000001\n    model: ur5e #"), encoding="utf-8")
+    path.write_text(text.replace("serial: null", "serial: 20190000001"), encoding="utf-8")
     return path
 
 
@@ -165,6 +167,18 @@ def test_a_slow_slider_is_a_warning() -> None:
 def test_joints_of_another_model_are_told() -> None:
     found = _at_start(shipped(), joints=np.array(JOINTS))["pose"]
     assert found.state == "fail" and "from where a ur5e would have it" in found.found
+
+
+def test_the_slider_is_read_from_the_controller(mock: MockUR) -> None:
+    with RtdeClient(HOST) as pendant:
+        assert pendant.protocol()
+        recipe, _ = pendant.inputs("speed_slider_mask", "speed_slider_fraction")
+        pendant.start()
+        for fraction in (0.4, 1.0):
+            pendant.send(recipe, 1, fraction)
+            deadline = time.monotonic() + 10.0
+            while (slider := read_controller(HOST).speed_slider) != fraction:
+                assert time.monotonic() < deadline, slider
 
 
 def test_sensors_nearer_than_their_keep_out_fail() -> None:

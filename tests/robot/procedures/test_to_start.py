@@ -1,0 +1,155 @@
+"""The way of an arm to its start is checked before anything moves; two arms are led one after the other."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.arm.rtde import Reading
+from robot.common.kinematics import Kinematics, pose
+from robot.common.tcp import ArmFrames
+from robot.procedures.start_way import NoWay, Way, find_way, require_clear
+from robot.procedures.to_start import Guide, Halted, lead_to_start
+from tacsim import pose as se3
+from tacsim.config import load_rig
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.hardware import Placement, Plane, UrArmConfig
+from tests.robot.arm.mocked import until
+from tests.robot.cli.lab import Lab, copy_of
+from tests.robot.cli.test_start import AWAY, slow_to_die
+
+KINEMATICS = Kinematics("ur5e")
+TURNED = np.array([0.5, -0.2, 0.1, 0.0, 0.1, 0.3])  # from the start to where the arm stands [rad]
+
+
+def shipped(**limits: object) -> UrArmConfig:
+    found = load_rig("ur5e-one").config.arms["arm"]
+    assert isinstance(found, UrArmConfig)
+    return found.model_copy(update={"limits": found.limits.model_copy(update=limits)})
+
+
+def start_of(config: UrArmConfig) -> Pose:
+    assert config.start is not None
+    return config.start.pose
+
+
+def standing(config: UrArmConfig, joints: FloatArray, calibration: FloatArray | None = None) -> Reading:
+    """calibration: the true flange, seen from that of the nominal lengths (4, 4)."""
+    tcp = se3.to_matrix(config.flange_from_tool.pose)
+    flange = KINEMATICS.forward(joints) @ (np.eye(4) if calibration is None else calibration)
+    return Reading(joints, pose(flange @ tcp), np.zeros(6), 1, 0.3, np.zeros(3), pose(tcp), 1.0)
+
+
+def at_start(config: UrArmConfig) -> FloatArray:
+    flange = ArmFrames.of(config).flange(se3.to_matrix(start_of(config)))
+    return max(KINEMATICS.solutions(flange, np.zeros(6)), key=KINEMATICS.singularity)
+
+
+def way(config: UrArmConfig) -> Way:
+    return find_way("arm", config, standing(config, at_start(config) + TURNED), start_of(config))
+
+
+def test_a_way_leads_to_the_nearest_posture_and_is_described() -> None:
+    config = shipped()
+    found = way(config)
+    assert np.allclose(found.end, at_start(config), atol=1e-9) and np.allclose(found.begin - found.end, TURNED)
+    assert np.allclose(found.path[-1], start_of(config).position, atol=1e-9)
+    words = found.describe()
+    assert "turns most is base, by -29 deg" in words and "to [-130, -490, 200] mm" in words
+    length = np.linalg.norm(np.diff(found.path, axis=0), axis=1).sum()
+    assert found.seconds > length / config.limits.speed  # 20 mm/s
+
+
+def test_the_lengths_of_a_real_arm_are_allowed_for() -> None:
+    """The sensor of an arm that is a millimetre longer than its model stands at its start by the controller's pose."""
+    config, calibration = shipped(), np.eye(4)
+    calibration[:3, 3] = [0.5e-3, -0.3e-3, 1e-3]
+    found = find_way("arm", config, standing(config, at_start(config) + TURNED, calibration), start_of(config))
+    flange = KINEMATICS.forward(found.end) @ calibration
+    assert np.allclose(flange, ArmFrames.of(config).flange(se3.to_matrix(start_of(config))), atol=1e-9)
+
+
+def test_an_arm_at_its_start_has_no_way_to_go() -> None:
+    config = shipped()
+    assert find_way("arm", config, standing(config, at_start(config)), start_of(config)).is_there
+
+
+def test_a_start_out_of_reach_is_refused() -> None:
+    far = Placement(position=(2.0, 0.0, 0.2)).pose
+    with pytest.raises(NoWay, match="out of reach"):
+        find_way("arm", shipped(), standing(shipped(), at_start(shipped())), far)
+
+
+def test_a_way_behind_a_wall_is_refused_and_one_from_behind_it_is_not() -> None:
+    config = shipped()
+    path = way(config).path
+    chord = path[-1] - path[0]
+    middle = path[len(path) // 2]
+    bulge = (
+        middle - path[0] - chord * float((middle - path[0]) @ chord / (chord @ chord))
+    )  # the way is no straight line
+    assert np.linalg.norm(bulge) > 5e-3
+    between = tuple(middle - 0.5 * bulge)
+    with pytest.raises(NoWay, match=r"its sensor would come .* mm beyond plane 0; jog it nearer"):
+        way(shipped(planes=(Plane(point=between, normal=tuple(-bulge)),)))
+    way(shipped(planes=(Plane(point=between, normal=tuple(bulge)),)))  # it begins behind this one, and comes out
+
+
+def test_a_way_past_another_sensor_is_refused() -> None:
+    found = way(shipped())
+    middle = found.path[len(found.path) // 2]
+    with pytest.raises(NoWay, match=r"within 0 mm of that of arm 'other'; jog one of them away"):
+        require_clear("arm", found, {"other": middle}, {"other": 3e-3})
+    require_clear("arm", found, {"other": middle + [0.0, 0.0, 0.2]}, {"other": 3e-3})
+    require_clear("arm", found, {"other": found.path[-1]}, {"other": 3e-3})  # starts may be near each other
+
+
+needs_arms = pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python")
+
+
+@needs_arms
+@pytest.mark.deep
+def test_two_arms_are_led_one_after_the_other(tmp_path: Path) -> None:
+    file = slow_to_die(copy_of("ur5e", tmp_path, 86))
+    with Lab(file, beside=AWAY) as lab:
+        config = load_rig(file).config
+        said: list[str] = []
+        moved: list[set[str]] = []
+        last = {name: np.array(faults.state().joints) for name, faults in lab.faults.items()}
+
+        def look(words: str) -> None:
+            now = {name: np.array(faults.state().joints) for name, faults in lab.faults.items()}
+            moved.append({name for name in now if np.abs(now[name] - last[name]).max() > 1e-4})
+            last.update(now)
+
+        def ask(question: str) -> bool:
+            look("")
+            moved.clear()
+            return True
+
+        away = lead_to_start(config, lab.starts, Guide(ask, said.append, look))
+        assert all(distance < 2e-3 for distance in away.values()) and set(away) == {"lower", "upper"}
+        assert all(len(names) <= 1 for names in moved), moved  # since the last question
+        assert sum("stands at its start" in words for words in said) == 2
+
+
+@needs_arms
+@pytest.mark.deep
+def test_a_stop_brakes_and_a_no_leaves_every_arm(tmp_path: Path) -> None:
+    file = slow_to_die(copy_of("ur5e", tmp_path, 86))
+    with Lab(file, beside=AWAY) as lab:
+        config = load_rig(file).config
+        here = {name: faults.state().joints for name, faults in lab.faults.items()}
+        assert lead_to_start(config, lab.starts, Guide(lambda question: False, print)) == {}
+        looks = iter(range(1000))
+        guide = Guide(lambda question: True, lambda words: None, stop=lambda: next(looks) > 20)
+        with pytest.raises(Halted, match="was stopped on its way"):
+            lead_to_start(config, lab.starts, guide)
+        for name, faults in lab.faults.items():
+            halted = faults.state()
+            assert not halted.program and np.abs(np.array(halted.joints) - here[name]).max() < 0.1
+            until(lambda faults=faults: faults.state().rests, "rest")  # type: ignore[misc]
+            assert np.abs(np.array(faults.state().joints) - halted.joints).max() < 1e-3

@@ -18,6 +18,7 @@ from tacsim.limits import Region
 from tacsim.models.hardware import UrArmConfig
 
 SAMPLE = 5e-3  # between two points of a way at which it is checked [rad of the joint that turns most]
+SAG = 10e-3  # below both ends and the workspace, where the file has no walls, and so no table [m]
 NEAR_LINE = 0.5e-3  # nearer to a wall by no more than that is not nearer [m]
 KEEP_OUT_MARGIN = 10e-3  # beyond the keep-out distance, between a way and the other sensors [m]
 AT_START = 1e-3  # an arm whose joints are all this near to the start's stands there [rad]
@@ -58,7 +59,8 @@ class Way:
 def find_way(name: str, config: UrArmConfig, reading: Reading, start: Pose) -> Way:
     """The straight way in joint space to the nearest posture that has the sensor at `start`.
 
-    Raises NoWay: out of reach, or the sensor would come nearer to a wall (limits.planes) than at both ends, beyond it.
+    Raises NoWay: out of reach, or the sensor would go farther behind a wall (limits.planes) than it is at both ends; in
+    a file without walls, lower than both ends and the workspace.
     """
     kinematics, frames, begin = Kinematics(config.model), ArmFrames.of(config), reading.joints
     goal = frames.flange(se3.to_matrix(start))
@@ -81,6 +83,14 @@ def find_way(name: str, config: UrArmConfig, reading: Reading, start: Pose) -> W
             raise NoWay(
                 f"arm '{name}': on the straight way of the joints its sensor would come {walls.broken(path[worst])}; "
                 "jog it nearer to its start by hand first"
+            )
+    else:
+        sunk = min(path[0, 2], path[-1, 2], config.limits.workspace.lower[2]) - float(path[:, 2].min())
+        if sunk > SAG:
+            raise NoWay(
+                f"arm '{name}': on the straight way of the joints its sensor would sink {1e3 * sunk:.0f} mm below where "
+                "it stands, its start and its workspace; give the table as a plane (limits.planes), or jog it nearer to "
+                "its start by hand first"
             )
     top, acceleration = way_rates(kinematics, frames, begin, end, config.limits)
     return Way(begin, end, path, float(np.linalg.norm(end - begin)) / top + top / acceleration)

@@ -98,6 +98,17 @@ def test_a_way_behind_a_wall_is_refused_and_one_from_behind_it_is_not() -> None:
     way(shipped(planes=(Plane(point=between, normal=tuple(bulge)),)))  # it begins behind this one, and comes out
 
 
+def test_a_way_that_sinks_is_refused_where_the_file_has_no_table() -> None:
+    config = shipped()
+    turned = at_start(config) + [0.0, -1.3, 1.3, 1.4, 0.0, -1.3]
+    with pytest.raises(NoWay, match=r"would sink 37 mm below .*give the table as a plane"):
+        find_way("arm", config, standing(config, turned), start_of(config))
+    table = Plane(point=(0.0, 0.0, -0.5), normal=(0.0, 0.0, 1.0))
+    low = shipped(planes=(table,))
+    sinks = find_way("arm", low, standing(low, turned), start_of(low)).path[:, 2]
+    assert sinks.min() < min(sinks[0], sinks[-1], 0.15) - 10e-3
+
+
 def test_a_way_past_another_sensor_is_refused() -> None:
     found = way(shipped())
     middle = found.path[len(found.path) // 2]

@@ -88,9 +88,9 @@ def find_way(name: str, config: UrArmConfig, reading: Reading, start: Pose) -> W
         sunk = min(path[0, 2], path[-1, 2], config.limits.workspace.lower[2]) - float(path[:, 2].min())
         if sunk > SAG:
             raise NoWay(
-                f"arm '{name}': on the straight way of the joints its sensor would sink {1e3 * sunk:.0f} mm below where "
-                "it stands, its start and its workspace; give the table as a plane (limits.planes), or jog it nearer to "
-                "its start by hand first"
+                f"arm '{name}': on the straight way of the joints its sensor would sink {1e3 * sunk:.0f} mm below "
+                "where it stands, its start and its workspace; give the table as a plane (limits.planes), or jog it "
+                "nearer to its start by hand first"
             )
     top, acceleration = way_rates(kinematics, frames, begin, end, config.limits)
     return Way(begin, end, path, float(np.linalg.norm(end - begin)) / top + top / acceleration)

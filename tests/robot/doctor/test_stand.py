@@ -11,6 +11,7 @@ import pytest
 
 import robot.doctor.rig
 from robot.arm.rtde import Reading, read_controller
+from robot.arm.ur import URArm
 from robot.common.kinematics import Kinematics, matrix, pose
 from robot.common.tcp import ArmFrames
 from robot.doctor.machine import Check
@@ -20,7 +21,7 @@ from robot.errors import DeviceNotConnectedError
 from robot.mock import MockUR
 from robot.mock.fixtures import mock_host
 from tacsim import pose as se3
-from tacsim.config import config_root, load_rig
+from tacsim.config import ConfigError, config_root, load_rig
 from tacsim.models.hardware import Placement, UrArmConfig
 from tests.robot.mock.wire_client import RtdeClient
 
@@ -167,6 +168,22 @@ def test_a_slow_slider_is_a_warning() -> None:
 def test_joints_of_another_model_are_told() -> None:
     found = _at_start(shipped(), joints=np.array(JOINTS))["pose"]
     assert found.state == "fail" and "from where a ur5e would have it" in found.found
+
+
+def test_connecting_refuses_another_robot_than_the_pinned_one(mock: MockUR, file: Path) -> None:
+    pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this Python")
+    config = load_rig(file).config.arms["arm"]
+    assert isinstance(config, UrArmConfig) and config.serial == "20190000001"  # written without quotes
+    before = mock.faults.received().last
+    with pytest.raises(DeviceNotConnectedError, match=f"serial number {SERIAL}, .* says serial: 20190000001"):
+        URArm(config, "arm")
+    assert mock.faults.received().last == before
+
+
+@pytest.mark.parametrize("serial", ["true", "[1, 2]", "''"])
+def test_what_is_no_serial_number_is_refused(file: Path, serial: str) -> None:
+    with pytest.raises(ConfigError, match="serial"):
+        load_rig(file, overrides=[f"arms.arm.serial={serial}"])
 
 
 def test_the_slider_is_read_from_the_controller(mock: MockUR) -> None:

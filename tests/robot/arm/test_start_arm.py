@@ -9,11 +9,13 @@ import pytest
 
 from robot.arm.channel import ArmStatus
 from robot.arm.start_arm import StartArm
+from robot.arm.start_servo import JOINT_SPEED, distance_from_way
+from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock import MockUR
 from tacsim.models.hardware import UrArmConfig, Workspace
-from tests.robot.arm.mocked import config, moved, until
+from tests.robot.arm.mocked import config, moved, servo_targets, until
 
 TURN = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.05])
 ELSEWHERE = Workspace(lower=(1.0, 1.0, 1.0), upper=(1.1, 1.1, 1.1))
@@ -27,7 +29,7 @@ def away() -> UrArmConfig:
 def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR) -> None:
     with pytest.raises(SafetyViolation, match=r"outside its workspace.*`tacsim start FILE` leads it"):
         URArm(away(), "left")
-    here = np.array(mock.faults.state().joints)
+    here, before = np.array(mock.faults.state().joints), mock.faults.received().last
     with StartArm(away(), "left", here, here + TURN) as arm:
         assert arm.status() == ArmStatus.HOLD
         with pytest.raises(DeviceError, match="follows no targets"):
@@ -41,6 +43,9 @@ def test_an_arm_outside_its_box_goes_to_its_start_and_nowhere_else(mock: MockUR)
         assert np.allclose(mock.faults.state().joints, here + 0.5 * TURN, atol=4e-3)
         until(lambda: there(1.0), "the start")
     assert np.allclose(mock.faults.state().joints, here + TURN, atol=4e-3)
+    sent = servo_targets(mock.faults.received(before).entries)
+    assert len(sent) > 100 and np.abs(np.diff(sent, axis=0)).max() <= JOINT_SPEED * PERIOD
+    assert max(distance_from_way(joints, here, here + TURN) for joints in sent) < 1e-5
 
 
 def test_an_arm_that_stands_off_its_way_is_refused(mock: MockUR) -> None:

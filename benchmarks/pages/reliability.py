@@ -39,9 +39,17 @@ PROMISES: tuple[tuple[str, str], ...] = (  # promise n is the n-th
     ),
     ("Force", "Too much force stops the arm in the period of its package."),
     ("Stale", "A silent link is told and outlived; a frame beyond its age is refused."),
-    ("Late policy", "Without a fresh action the arm holds, says so, and goes on from where it is measured."),
+    (
+        "Late policy",
+        "Without a fresh action the arm holds, says so, and goes on from where it is measured. After its last one it "
+        "goes at most speed x (action_timeout + the servo's lag of some 0.04 s).",
+    ),
     ("Death", "A policy or a worker that is killed leaves a standing arm; another worker is there soon."),
-    ("Stops", "A stop is told by its kind; nothing moves before recover(), and no old command comes again."),
+    (
+        "Stops",
+        "A stop is told by its kind and its first cause; an arm that has come to rest does not move before recover(), "
+        "whatever failed, no program runs on, and no old command comes again.",
+    ),
     ("One commander", "A second driver is refused, the first goes on."),
     ("Connecting", "Connecting to nobody ends with its time-out and holds up no other thread."),
     ("One instant", "All fields of a state are of one package; a pose is that of the picture's exposure."),

@@ -1,5 +1,5 @@
-"""Ctrl-C works in these tests whoever started them: a shell's background job inherits SIGINT as ignored, and so would
-the processes that tests start."""
+"""Signals work in these tests whoever started them: a shell's background job inherits SIGINT as ignored, `nohup`'s
+SIGHUP, and so would the processes that tests start."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ import pytest
 
 @pytest.fixture(autouse=True, scope="session")
 def interruptible() -> Iterator[None]:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    before = {
+        number: signal.signal(number, handler)
+        for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL))
+    }
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -47,7 +46,6 @@ def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
 
 def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
-    monkeypatch.setattr(sys, "path", list(sys.path))  # the command adds the current folder
     result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
     assert result.exit_code == 1
     assert "no idea" in result.stderr
@@ -98,7 +96,6 @@ def test_a_signal_in_this_process_ends_the_episode_and_saves_it(
     text = "import os, signal\nfrom tacsim.interface import Action\n"
     text += "def act(observation):\n    os.kill(os.getpid(), signal.SIGTERM)\n    return Action({})\n"
     (tmp_path / "ending.py").write_text(text)
-    monkeypatch.setattr(sys, "path", list(sys.path))
     result = tacsim("run", "--policy", "ending:act", "--steps", "9", "--out", "r", *TINY)
     assert result.exit_code == 143, result.output
     assert "stopped by a signal before the last step; what was done is saved" in result.stderr

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from benchmarks.cases import incline, large_strain, materials, press, scenes, squeeze
+from benchmarks.cases import incline, large_strain, materials, presets, press, scenes, squeeze
 from benchmarks.cases.real import (
     ball_touch,
     balls,
@@ -27,6 +27,7 @@ from benchmarks.harness.schema import Group
 CASES: tuple[Case, ...] = (
     *press.CASES,
     *squeeze.CASES,
+    *presets.CASES,
     *large_strain.CASES,
     *incline.CASES,
     *materials.CASES,

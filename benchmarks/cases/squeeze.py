@@ -275,7 +275,11 @@ def _rough_row(preset: str, sampling: Literal["lattice", "random"], by: float, r
 
 
 SEED_DRAFT = "particles 0.5 mm, dx 1 mm"
-PRESETS = {"draft": "particles 0.5 mm, gel 1 mm", "standard": "particles 0.25 mm, gel 0.5 mm"}
+PRESETS = {
+    "learn": "particles 1 mm, gel 2 mm",
+    "draft": "particles 0.5 mm, gel 1 mm",
+    "standard": "particles 0.25 mm, gel 0.5 mm",
+}
 
 
 def _cases(physics: str, method: str) -> tuple[Case, ...]:
@@ -291,6 +295,10 @@ def _cases(physics: str, method: str) -> tuple[Case, ...]:
             long=preset == "standard" or (run is settled_squeeze and method == "tacsim"),
         )
         for preset, run, baseline in (
+            ("learn", squeeze, False),
+            ("learn", settled_squeeze, False),
+            ("learn", control_step, False),
+            ("learn", reposition, False),
             ("draft", squeeze, method != "tacsim"),
             ("draft", settled_squeeze, method != "tacsim"),
             ("draft", control_step, method != "tacsim"),
@@ -299,7 +307,8 @@ def _cases(physics: str, method: str) -> tuple[Case, ...]:
             ("standard", settled_squeeze, False),
             ("standard", reposition, False),
         )
-        if method == "tacsim" or preset == "draft"  # the seed's scheme at `standard` takes many minutes
+        # the seed's scheme at `standard` takes many minutes, and `learn` is not for comparisons
+        if method == "tacsim" or preset == "draft"
     )
 
 

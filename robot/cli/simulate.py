@@ -30,7 +30,7 @@ def press(
         Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
     ] = "5 mm, 5 mm, 5 mm",
     scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
-    preset: Annotated[Literal["draft", "standard"], typer.Option(help="Resolution.")] = "standard",
+    preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:

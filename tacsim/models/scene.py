@@ -19,8 +19,11 @@ Size3 = tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)], An
 Along = Annotated[Acceleration, Field(ge=-1e5, le=1e5)]  # one axis [m/s^2]
 PoissonRatio = Annotated[float, Field(ge=0.0, le=0.499)]
 
+Preset = Literal["learn", "draft", "standard"]
 # particle spacing and gel element size [m] of each preset
-PRESETS = {"draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3)}
+PRESETS: dict[Preset, tuple[float, float]] = {
+    "learn": (1.0e-3, 2.0e-3), "draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3),
+}  # fmt: skip
 # Peak Mach number of motions between states of rest: what a tolerance asks for and what the elastic strain at yield
 # allows, within bounds (docs/decisions/0002).
 MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST_MACH, FASTEST_MACH = 3.0, 1.5, 0.001, 0.03
@@ -159,7 +162,7 @@ class Scene(Config):
 
     name: str = "scene"
     physics: Literal["hybrid", "seed"] = "hybrid"
-    preset: Literal["draft", "standard"] = "draft"
+    preset: Preset = "draft"
     particle_spacing: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
     element_size: Annotated[Length, Field(gt=0)] | None = None  # overrides the preset
     gel: Gel = Gel()

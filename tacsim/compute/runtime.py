@@ -12,12 +12,18 @@ import threading
 import warnings
 from collections.abc import Iterator
 
+from tacsim.compute.front_end import quicken
+
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
     warnings.simplefilter("ignore")
     import taichi as ti
+    from taichi.lang import kernel_impl
+    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+quicken(kernel_impl, ASTTransformerContext)
 
 DEVICES = ("cpu", "cuda", "vulkan", "metal")
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.

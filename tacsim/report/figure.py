@@ -17,7 +17,6 @@ from matplotlib.image import imsave
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.stats import pearsonr
 
 from tacsim.interface import FloatArray
 from tacsim.record.episode import Episode
@@ -133,7 +132,7 @@ def signal_against_force(series: Series) -> dict[str, tuple[FloatArray, FloatArr
         values = both[np.isfinite(both).all(axis=1)]
         varies = len(values) >= 3 and bool((np.ptp(values, axis=0) > 1e-12).all())
         force, contact = values[:, 0], values[:, 1]
-        pairs[name] = (force, contact, float(pearsonr(force, contact).statistic) if varies else None)
+        pairs[name] = (force, contact, float(np.corrcoef(force, contact)[0, 1]) if varies else None)
     return {name: pair for name, pair in pairs.items() if len(pair[0])}
 
 

@@ -72,19 +72,22 @@ class Servo:
         self.close_requested = False
         self._zero_asked = -math.inf  # when the wrench was to be zeroed [s]
         self._sent: FloatArray | None = None  # joints
-        self._before: tuple[MotionState | None, FloatArray | None] = None, None  # motion and joints of the last period
-        self._in_time = math.nan, math.nan  # time and package's stamp of the last step that went on [s]
-        self._waited = 0  # periods for a package from after missed ones
+        self._in_time = math.nan  # when the last step went on [s]
+        self._package = math.nan, math.nan  # when its package was new, and that one's stamp [s]
+        self._waited = 0  # periods for a package that tells what the arm does now
         self._goal: tuple[FloatArray, FloatArray] | None = None  # position (3,), rotation (3, 3)
         self._goal_time = -math.inf
         self._rates: Rates = config  # of the way to the goal
         self._tactile_read, self._exposed = tactile_read, math.nan  # reports read; exposure of the oldest picture [s]
         # joints, and their margin to a singularity
         self._last_singularity_check: tuple[FloatArray, float] | None = None
-        self._hard = self._fault_braking = (
+        self._hard = (
             max(FAULT_DECELERATION, config.acceleration),
             max(FAULT_TURN_DECELERATION, config.turn_acceleration),
         )
+        self._fault_braking: tuple[float, float] | None = None  # None: the target was not yet reset after a fault
+        # of the last period
+        self._before: tuple[MotionState | None, FloatArray | None, tuple[float, float] | None] = None, None, None
 
     @property
     def resting(self) -> bool:
@@ -95,17 +98,10 @@ class Servo:
         """(3,) where the servo target comes to rest if it brakes now [m]; None while nothing is sent."""
         return None if self.motion is None else stopping_point(self.motion, self.config.acceleration)
 
-    def trip(self, status: ArmStatus, measured: Measured | None) -> None:
-        """Enters a fault: brakes hard and moves no more. A fault stays, for what comes later may be its consequence;
-        only a stop of the controller replaces it, and a worse one that, because it takes more to recover from."""
-        if not self.status.is_fault and self.motion is not None and measured is not None:
-            self.motion = MotionState(
-                measured.sensor[:3, 3], measured.sensor[:3, :3], measured.twist[:3], measured.twist[3:]
-            )
-            self._sent = measured.joints
-            # It stands within half of the lookahead: the arm, which lags, must not be drawn on by a target ahead of it.
-            fast = 2.0 * np.linalg.norm(measured.twist.reshape(2, 3), axis=1) / self.config.lookahead
-            self._fault_braking = max(self._hard[0], float(fast[0])), max(self._hard[1], float(fast[1]))
+    def trip(self, status: ArmStatus) -> None:
+        """Enters a fault: from the next step on it brakes hard and moves no more. A fault stays, for what comes later
+        may be its consequence; only a stop of the controller replaces it, and a worse one that, because it takes more
+        to recover from."""
         if not self.status.is_fault:
             self._zero_asked = -math.inf
         if not self.status.is_fault or status >= ArmStatus.PROGRAM_STOPPED:
@@ -116,14 +112,14 @@ class Servo:
         """Trips on the measured state: force, region, keep-out, faults of the other arms."""
         config = self.config
         if exceeds_wrench(measured.wrench, config.force, config.torque):
-            self.trip(ArmStatus.FORCE_LIMIT, measured)
+            self.trip(ArmStatus.FORCE_LIMIT)
         here = measured.sensor[:3, 3]
         self._check_place(measured)
         if not all(map(is_healthy, partners)):
             if self.resting and not self.status.is_fault:
                 self.status, self._goal = ArmStatus.WAITING, None
             else:
-                self.trip(ArmStatus.PARTNER_STOPPED, measured)
+                self.trip(ArmStatus.PARTNER_STOPPED)
         elif self.status in (ArmStatus.CONNECTING, ArmStatus.WAITING):
             self.status = ArmStatus.HOLD
         for partner, other in zip(config.partners, partners, strict=True):
@@ -133,16 +129,16 @@ class Servo:
             ):
                 approach = float(measured.twist[:3] @ (other["position"] - here))
                 if approach > 0.0 and not self.resting:
-                    self.trip(ArmStatus.KEEP_OUT, measured)
+                    self.trip(ArmStatus.KEEP_OUT)
 
     def _check_place(self, measured: Measured) -> None:
         if (
             self.region.excess(braking_end(measured.sensor[:3, 3], measured.twist[:3], self._hard[0]))
             > ALLOWED_OVERSHOOT
         ):
-            self.trip(ArmStatus.WORKSPACE_LIMIT, measured)
+            self.trip(ArmStatus.WORKSPACE_LIMIT)
 
-    def on_tactile(self, number: int, report: Record | None, measured: Measured) -> None:
+    def on_tactile(self, number: int, report: Record | None) -> None:
         """Reads the newest tactile report, once: a gel pressed or sheared beyond its limit trips."""
         if report is None or number == self._tactile_read:
             return
@@ -151,7 +147,7 @@ class Servo:
         if not math.isnan(self._exposed) and (
             exceeds(float(report["depth"]), config.depth) or exceeds(float(report["shear"]), config.shear)
         ):
-            self.trip(ArmStatus.GEL_LIMIT, measured)
+            self.trip(ArmStatus.GEL_LIMIT)
 
     def on_command(self, number: int, command: Record | None) -> None:
         """Reads the newest command, once. A target that is no pose or has no speed is rejected, and the arm holds."""
@@ -184,8 +180,8 @@ class Servo:
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
         config = self.config
-        self._before = self.motion, self._sent
-        if self._waits_after_stall(time, measured):
+        self._before = self.motion, self._sent, self._fault_braking
+        if self._waits_for_package(time, measured):
             return self._sent
         if time - self._goal_time > config.action_timeout:
             self._goal = None
@@ -225,29 +221,56 @@ class Servo:
 
     def withdraw(self) -> FloatArray | None:
         """Takes the last step back, which could not be sent in its period; returns the joints of the one before."""
-        self.motion, self._sent = self._before
+        self.motion, self._sent, self._fault_braking = self._before
         return self._sent
 
-    def _waits_after_stall(self, time: float, measured: Measured) -> bool:
-        """True while a target in motion must stand, because no package is there from after the missed periods. Then it
-        goes on with the speed that the arm has kept along its path: no faster than before and in no other direction, so
-        where it could stop is as safe as it was."""
-        (last, stamp), motion, config = self._in_time, self.motion, self.config
-        missed = time - last - PERIOD
-        if motion is not None and not motion.at_rest and missed > 1.5 * PERIOD:  # one alone is within the limits
-            fresh = measured.stamp - stamp > missed - PACKAGE_DELAY
+    def _waits_for_package(self, time: float, measured: Measured) -> bool:
+        """True while the target must stand, because no package is there that tells what the arm does now: after missed
+        periods, and after a fault. With one, the target is led on from there."""
+        motion = self.motion
+        missed = time - self._in_time - PERIOD
+        late = motion is not None and not motion.at_rest and missed > 1.5 * PERIOD  # one alone is within the limits
+        tripped = motion is not None and self.status.is_fault and self._fault_braking is None
+        if late or tripped:
+            new, stamp = self._package
+            age = 0.5 * PERIOD if tripped else PACKAGE_DELAY  # more than is usual
+            fresh = measured.stamp - stamp > max(0.0, time - new - PERIOD - age)
             self._waited += not fresh
             if not fresh and self._waited < STALL_PATIENCE:
                 return True
-            kept = math.exp(-min(missed, PACKAGE_DELAY) / config.lookahead) * measured.twist if fresh else np.zeros(6)
-            lead = 0.5 * config.lookahead  # a target that speeds up at its limit is ahead of the arm by twice this
-            self.motion = replace(
-                motion,
-                velocity=_no_faster(motion.velocity, kept[:3], lead * config.acceleration),
-                spin=_no_faster(motion.spin, kept[3:], lead * config.turn_acceleration),
-            )
-        self._in_time, self._waited = (time, measured.stamp), 0
+            if tripped:
+                self._reset_after_fault(measured if fresh else None)
+            else:
+                self._slow_after_stall(missed, measured.twist if fresh else np.zeros(6))
+        if measured.stamp != self._package[1]:
+            self._package = time, measured.stamp
+        self._in_time, self._waited = time, 0
         return False
+
+    def _reset_after_fault(self, measured: Measured | None) -> None:
+        """The target brakes from where the arm is; None: nobody knows, and it stays. An older place would be a way
+        back."""
+        assert self.motion is not None
+        if measured is None:
+            self.motion, self._fault_braking = resting(self.motion.position, self.motion.rotation), self._hard
+            return
+        here, twist = measured.sensor, measured.twist
+        self.motion, self._sent = MotionState(here[:3, 3], here[:3, :3], twist[:3], twist[3:]), measured.joints
+        # It stands within half of the lookahead: the arm, which lags, must not be drawn on by a target ahead of it.
+        fast = 2.0 * np.linalg.norm(twist.reshape(2, 3), axis=1) / self.config.lookahead
+        self._fault_braking = max(self._hard[0], float(fast[0])), max(self._hard[1], float(fast[1]))
+
+    def _slow_after_stall(self, missed: float, twist: FloatArray) -> None:
+        """The target goes on with the speed that the arm has kept along its path: no faster than before and in no other
+        direction, so where it could stop is as safe as it was."""
+        assert self.motion is not None
+        kept = math.exp(-min(missed, PACKAGE_DELAY) / self.config.lookahead) * twist
+        lead = 0.5 * self.config.lookahead  # a target that speeds up at its limit is ahead of the arm by twice this
+        self.motion = replace(
+            self.motion,
+            velocity=_no_faster(self.motion.velocity, kept[:3], lead * self.config.acceleration),
+            spin=_no_faster(self.motion.spin, kept[3:], lead * self.config.turn_acceleration),
+        )
 
     def _was_moved(self, held: MotionState, measured: Measured) -> bool:
         """True if the arm rests away from its held pose (somebody moved it): the next target starts at the measured
@@ -268,9 +291,7 @@ class Servo:
             return None
         if self.motion.at_rest:
             return self._sent
-        limits = (
-            self._fault_braking if self.status.is_fault else (self.config.acceleration, self.config.turn_acceleration)
-        )
+        limits = self._fault_braking or (self.config.acceleration, self.config.turn_acceleration)
         slower = braking(self.motion, *limits)
         joints = self._joints(slower, measured)
         if joints is None:

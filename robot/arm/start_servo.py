@@ -29,7 +29,6 @@ OFF_WAY = 20e-3  # an arm with a joint farther than this from the way has left i
 LAG = 15e-3  # the target waits for an arm that is farther behind, such as one slowed down on its pendant [rad]
 SAMPLES = 100  # points of a way at which speeds are judged
 MARGIN = 0.95  # of the speeds there: they differ between the samples
-STALL = 1.5 * PERIOD  # a longer pause between two targets has let the arm run out [s]
 
 
 class WayRates(Rates, Protocol):
@@ -94,11 +93,15 @@ class StartServo(Servo):
         self._share_time = 0.0
         self._rate = np.zeros(6)  # of the target [rad/s]
         self._stop = np.zeros(3)  # where the sensor would come to rest if the target braked now [m]
-        self._last = -math.inf  # when the last target was made [s]
 
     def _check_place(self, measured: Measured) -> None:
         if distance_from_way(measured.joints, self._begin, self._end) > OFF_WAY:
-            self.trip(ArmStatus.OFF_WAY, measured)
+            self.trip(ArmStatus.OFF_WAY)
+
+    def check_faults(self, measured: Measured, partners: Sequence[Record | None]) -> None:
+        if self.status == ArmStatus.WAITING:  # what was asked meanwhile is forgotten
+            self._share = None
+        super().check_faults(measured, partners)
 
     def on_command(self, number: int, command: Record | None) -> None:
         """A target is rejected: only the way is open."""
@@ -113,10 +116,11 @@ class StartServo(Servo):
 
     def step(self, time: float, measured: Measured, partners: Sequence[Record | None]) -> FloatArray | None:
         """The joints (6,) to send in this period; None: send nothing, the controller holds."""
-        self._before = self.motion, self._sent
-        paused, self._last = time - self._last, time
         if self.status.is_fault:
-            return self._slow_down(measured)
+            return super().step(time, measured, partners)
+        self._before = self.motion, self._sent, self._fault_braking
+        if self._waits_for_package(time, measured):
+            return self._sent
         waits = self.status == ArmStatus.WAITING
         goes = not waits and self._share is not None and time - self._share_time <= self.config.action_timeout
         if not waits:
@@ -130,8 +134,6 @@ class StartServo(Servo):
                 return None if self._sent is None else self._sent
             self.motion, self._sent = resting(measured.sensor[:3, 3], measured.sensor[:3, :3]), measured.joints
             self._rate, self._stop = np.zeros(6), self.motion.position
-        if paused > STALL:  # as far as the arm has run out meanwhile, the target goes on more slowly
-            self._rate = self._rate * math.exp(-(paused - PERIOD) / self.config.lookahead)
         if goes and float(np.abs(measured.joints - self._sent).max()) < LAG:
             assert self._share is not None
             goal = self._begin + self._share * (self._end - self._begin)
@@ -141,6 +143,10 @@ class StartServo(Servo):
                 return self._follow(wanted)
         rate = slower(self._rate, self._acceleration * PERIOD)
         return self._follow(self._target(self._sent + rate * PERIOD, rate, measured))
+
+    def _slow_after_stall(self, missed: float, twist: FloatArray) -> None:
+        """As its base, in joints: those of the arm run out towards the target by the law of the controller."""
+        self._rate = self._rate * math.exp(-missed / self.config.lookahead)
 
     @property
     def stop(self) -> FloatArray | None:

@@ -210,10 +210,10 @@ class Worker:
             if stopped is None and self._refused > GRACE:
                 stopped = ArmStatus.PROGRAM_STOPPED
             if stopped is not None:
-                self.servo.trip(stopped, None)
+                self.servo.trip(stopped)
             command = self.channel.commands.newest()  # before the report: what was seen when it was decided counts
             self.servo.check_faults(self.state, partners)
-            self.servo.on_tactile(*self.channel.tactile.newest(), self.state)
+            self.servo.on_tactile(*self.channel.tactile.newest())
             if self.servo.status != before:
                 self._publish(self.servo.status)
                 if before == ArmStatus.CONNECTING:
@@ -223,7 +223,7 @@ class Worker:
             if ending is None and (orphan or self.servo.close_requested):
                 ending = now + (PARENTLESS if orphan else CLOSING)
                 if orphan:
-                    self.servo.trip(ArmStatus.CLOSED, self.state)
+                    self.servo.trip(ArmStatus.CLOSED)
             if stopped is not None or self.servo.status in _CONTROLLER_STOPS:
                 if ending is not None:
                     self._leave()

@@ -77,7 +77,7 @@ class Bench:
 
     def look(self, force: tuple[float, ...] = (0.0,) * 6) -> None:
         before = self.record["tcp_pose"].copy()
-        self.record["joints"] = self.q
+        self.record["stamp"], self.record["joints"] = self.time, self.q
         self.record["tcp_pose"] = pose(KINEMATICS.forward(self.q) @ self.calibration)
         if before.any():
             self.record["tcp_speed"][:3] = (self.record["tcp_pose"][:3] - before[:3]) / PERIOD
@@ -116,7 +116,8 @@ class OnController:
         self.servo = Servo(worker_config(**changes))
         self.arm = Arm("ur5e", HOME)
         self.joints: FloatArray | None = None  # of the newest servoj; the controller repeats it by itself
-        self.tick, self.number, self.partners = 0, 0, list[Record | None]()
+        self.tick, self.number = 0, 0
+        self.partners: list[Record | None] = [other([9.0, 9.0, 9.0])] * len(self.servo.config.partners)  # far away
         self.force, self.jump = 0.0, 0.0  # on the tool [N]; of the controller's clock [s]
         self.packages: list[Measured] = []
         self.twists: list[FloatArray] = []  # (6,) of the sensor itself, one a period

@@ -117,7 +117,7 @@ def test_a_fault_stays_and_only_a_stop_of_the_controller_replaces_it() -> None:
         (ArmStatus.EMERGENCY_STOP, ArmStatus.EMERGENCY_STOP),
         (ArmStatus.PROGRAM_STOPPED, ArmStatus.EMERGENCY_STOP),
     ):
-        bench.servo.trip(status, bench.now)
+        bench.servo.trip(status)
         assert bench.servo.status == kept
 
 
@@ -131,7 +131,7 @@ def test_a_gel_pressed_or_dragged_too_far_stops_the_arm() -> None:
         bench = Bench(action_timeout=60.0, depth=1e-3, shear=0.5e-3)
         bench.ask(shifted(bench.at, 0.0, 0.0, -0.05))
         bench.run(100)
-        bench.servo.on_tactile(1, tactile_record(bench.time, *shown), bench.now)
+        bench.servo.on_tactile(1, tactile_record(bench.time, *shown))
         here = bench.at.position[2]
         bench.run(100)
         assert (bench.servo.status == ArmStatus.GEL_LIMIT) == stops
@@ -143,7 +143,7 @@ def test_an_arm_is_not_called_well_before_it_was_looked_at() -> None:
     for changes, found in (({}, ArmStatus.HOLD), ({"lower": [2.0] * 3, "upper": [3.0] * 3}, ArmStatus.WORKSPACE_LIMIT)):
         bench = Bench(**changes)
         assert bench.servo.status == ArmStatus.CONNECTING
-        bench.servo.on_tactile(1, tactile_record(0.0, 0.0, 0.0), bench.now)
+        bench.servo.on_tactile(1, tactile_record(0.0, 0.0, 0.0))
         assert bench.servo.status == ArmStatus.CONNECTING
         bench.servo.check_faults(bench.now, bench.partners)
         assert bench.servo.status == found
@@ -151,12 +151,11 @@ def test_an_arm_is_not_called_well_before_it_was_looked_at() -> None:
 
 def test_what_was_shown_to_a_worker_before_is_not_held_against_this_one() -> None:
     servo = Servo(worker_config(depth=1e-3), tactile_read=7)
-    bench = Bench()
-    servo.on_tactile(7, tactile_record(0.0, 2e-3, 0.0), bench.now)
+    servo.on_tactile(7, tactile_record(0.0, 2e-3, 0.0))
     assert not servo.status.is_fault
-    servo.on_tactile(8, tactile_record(math.nan, 2e-3, 0.0), bench.now)  # nobody looks by now
+    servo.on_tactile(8, tactile_record(math.nan, 2e-3, 0.0))  # nobody looks by now
     assert not servo.status.is_fault
-    servo.on_tactile(9, tactile_record(0.0, 2e-3, 0.0), bench.now)
+    servo.on_tactile(9, tactile_record(0.0, 2e-3, 0.0))
     assert servo.status == ArmStatus.GEL_LIMIT
 
 
@@ -164,7 +163,7 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
     bench = Bench(action_timeout=60.0, observation_timeout=0.5)
     bench.ask(shifted(bench.at, 0.02))
     bench.run(20)
-    bench.servo.on_tactile(1, tactile_record(bench.time, math.nan, math.nan), bench.now)
+    bench.servo.on_tactile(1, tactile_record(bench.time, math.nan, math.nan))
     bench.run(200)
     assert bench.servo.status == ArmStatus.OK
     bench.run(100)  # 0.6 s without another picture
@@ -174,7 +173,7 @@ def test_no_action_is_followed_on_an_old_observation() -> None:
     bench.ask(shifted(bench.at, 0.02))
     bench.run(100)
     assert np.abs(bench.at.position - held).max() < 1e-5
-    bench.servo.on_tactile(2, tactile_record(bench.time, math.nan, math.nan), bench.now)
+    bench.servo.on_tactile(2, tactile_record(bench.time, math.nan, math.nan))
     bench.run(100)  # it sees again, and does nothing by itself: what was asked meanwhile was decided without seeing
     assert bench.servo.status == ArmStatus.HOLD
     assert np.abs(bench.at.position - held).max() < 1e-5
@@ -206,8 +205,8 @@ def test_the_first_cause_is_kept_when_the_other_arm_stops_over_it(moving: bool) 
 DROPS: dict[str, Callable[[Bench], None]] = {
     "a newer target": lambda bench: bench.ask(shifted(bench.at, 0.01)),
     "a stop": lambda bench: bench.ask(bench.at, CommandKind.HOLD),
-    "a fault": lambda bench: bench.servo.trip(ArmStatus.GEL_LIMIT, bench.now),
-    "a controller's stop": lambda bench: bench.servo.trip(ArmStatus.PROTECTIVE_STOP, None),
+    "a fault": lambda bench: bench.servo.trip(ArmStatus.GEL_LIMIT),
+    "a controller's stop": lambda bench: bench.servo.trip(ArmStatus.PROTECTIVE_STOP),
     "time": lambda bench: bench.run(round(ZERO_PATIENCE / PERIOD) + 1),
 }
 

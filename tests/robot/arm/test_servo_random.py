@@ -77,7 +77,7 @@ class Life:
             self.reports += 1
             self.exposed = math.nan if self.chance(0.2) else self.arm.time - float(self.random.uniform(0.0, 0.1))
             depth = 2e-3 if self.chance(0.005) else 0.0
-            self.arm.servo.on_tactile(self.reports, tactile_record(self.exposed, depth, 0.0), known)
+            self.arm.servo.on_tactile(self.reports, tactile_record(self.exposed, depth, 0.0))
 
     def _command(self) -> bool:
         """True for a target that may be followed, were it not for the arm's status."""

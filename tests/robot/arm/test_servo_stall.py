@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus
+from robot.arm.channel import ArmStatus, Partner
 from robot.arm.servo import STALL_PATIENCE
 from robot.arm.trajectory import PERIOD
+from robot.arm.worker import BLIND
 from robot.common.kinematics import rotation
 from tacsim import pose as se3
 from tests.robot.arm.servo_bench import OnController, shifted
@@ -81,7 +82,7 @@ def test_after_a_stall_the_arm_goes_on_within_its_limits(
 def test_without_the_restart_it_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """Guards the test above."""
     arm = moving()
-    monkeypatch.setattr(arm.servo, "_waits_after_stall", lambda time, measured: False)
+    monkeypatch.setattr(arm.servo, "_waits_for_package", lambda time, measured: False)
     arm.stall(40)
     for _ in range(50):
         arm.period()
@@ -106,8 +107,8 @@ def way_after_a_fault(speed: float, stalls: tuple[int, ...] = ()) -> tuple[float
     """How far the arm goes after a fault at `speed` [m/s], and its top speed once it has been braked [m/s]."""
     arm = moving(speed=speed, acceleration=3.0)
     begun, count = arm.at.position, len(arm.twists)
-    arm.servo.trip(ArmStatus.FORCE_LIMIT, arm.packages[-1])
-    arm.period()
+    arm.servo.trip(ArmStatus.FORCE_LIMIT)
+    arm.period(late=0)  # it begins to brake
     for length in stalls:
         arm.stall(length)
         arm.period()
@@ -131,6 +132,52 @@ def test_an_arm_in_a_fault_is_not_drawn_on(speed: float) -> None:
         stalled, later = way_after_a_fault(speed, stalls)
         assert stalled <= 1.02 * way
         assert later <= 0.25 * speed
+
+
+def way_back(arm: OnController, silent: int, fault: int, backlog: int = 0) -> float:
+    """How far the arm goes back [m] when no package comes for `silent` periods, but `backlog` old ones when it is over,
+    and in period number `fault` the other arm stops."""
+    old, begin = arm.packages[-2], len(arm.packages)
+    for k in range(silent + backlog):
+        if k == fault:
+            arm.partners = [None]
+        arm.servo.check_faults(old, arm.partners)
+        loop_goes_on = k < BLIND or k >= silent
+        arm.run(arm.servo.step(arm.time, old, arm.partners) if loop_goes_on else None)
+    arm.partners = [None]
+    for _ in range(300):
+        arm.period()
+    assert arm.servo.status == ArmStatus.PARTNER_STOPPED and arm.servo.resting
+    along = np.array([package.sensor[1, 3] for package in arm.packages[begin:]])
+    return float(along.max() - along[-1])
+
+
+@pytest.mark.promise(3)
+@pytest.mark.parametrize(("speed", "lookahead"), [(0.1, 0.03), (0.1, 0.1), (0.3, 0.03)])
+def test_a_fault_found_on_an_old_package_does_not_draw_the_arm_back(speed: float, lookahead: float) -> None:
+    """The arm has gone on since that package: to where it was then is a way back. (An arm that is stopped as hard as it
+    can swings back a little, with fresh packages too.)"""
+    changes = {"speed": speed, "lookahead": lookahead, "acceleration": 2.0, "partners": [Partner(-1, 0.05)]}
+    usual = way_back(moving(**changes), 0, 0)
+    for silent, fault, backlog in (
+        (3, 2, 0),
+        (20, 0, 0),
+        (20, 4, 0),
+        (20, 15, 0),
+        (20, 20, 2),
+        (45, 44, 0),
+        (45, 45, 3),
+    ):
+        back = way_back(moving(**changes), silent, fault, backlog)
+        assert back <= usual + 0.2e-3, (silent, fault, backlog)
+
+
+def test_after_a_fault_without_news_the_arm_is_led_nowhere() -> None:
+    """No package from after the missed periods comes at all."""
+    arm = moving(partners=[Partner(-1, 0.05)])
+    old = len(arm.packages) - 1
+    assert way_back(arm, 20, 10, backlog=300) == 0.0
+    assert arm.packages[-1].sensor[1, 3] > arm.packages[old].sensor[1, 3]
 
 
 def test_what_could_not_be_sent_is_taken_back() -> None:

@@ -8,7 +8,7 @@ import pytest
 from robot.arm.channel import STATE, ArmStatus, CommandKind, Partner, command_record
 from robot.arm.start_servo import JOINT_SPEED, OFF_WAY, distance_from_way
 from robot.arm.trajectory import PERIOD
-from tests.robot.arm.servo_bench import HOME, Bench, shifted
+from tests.robot.arm.servo_bench import HOME, Bench, other, shifted
 
 FAR = {"lower": [1.0, 1.0, 1.0], "upper": [1.1, 1.1, 1.1]}  # a box in which the arm does not stand
 END = HOME + [0.3, -0.1, 0.2, 0.0, 0.1, -0.2]
@@ -132,6 +132,44 @@ def test_it_waits_for_an_arm_that_lags() -> None:
             made.q = made.q + np.clip(joints - made.q, -1e-5, 1e-5)  # 5 mrad/s
             made.look()
     assert not made.servo.status.is_fault and made.q[0] - HOME[0] > 1e-3
+
+
+def test_what_was_asked_before_it_waited_is_forgotten() -> None:
+    made = bench(partners=[Partner(-1, 0.05)])
+    sound = other([9.0, 9.0, 9.0])
+    for asked_first in (True, False):
+        made.partners = [sound]
+        made.run(1)
+        made.partners = [None] if not asked_first else made.partners
+        made.run(1)
+        made.number += 1
+        made.servo.on_command(made.number, command_record(made.time, CommandKind.GO_ON, share=1.0))
+        made.partners = [None]
+        made.servo.check_faults(made.now, made.partners)
+        assert made.servo.status == ArmStatus.WAITING
+        made.partners = [sound]
+        made.run(50)
+        assert not made.sent and made.servo.status == ArmStatus.HOLD
+
+
+@pytest.mark.parametrize("status", [ArmStatus.PARTNER_STOPPED, ArmStatus.OFF_WAY])
+def test_a_fault_found_on_an_old_package_does_not_draw_it_back(status: ArmStatus) -> None:
+    made = bench(speed=0.1)
+    go(made, 1.0, 500)
+    old = made.now
+    for _ in range(20):  # no packages come; the arm runs out towards the last target
+        made.q = made.q + 0.2 * (made.sent[-1] - made.q)
+        made.time += PERIOD
+        made.look()
+    made.servo.trip(status)
+    there = made.q.copy()
+    for _ in range(3):
+        made.time += PERIOD
+        joints = made.servo.step(made.time, old, [])
+        assert joints is made.sent[-1]
+    made.look()
+    made.run(200)
+    assert made.servo.resting and (made.q - there) @ (END - HOME) > -1e-6
 
 
 def test_it_stops_before_the_other_arm() -> None:

@@ -41,7 +41,10 @@ class CommandedArm:
             time.sleep(1e-3)
         packages = max(8, math.ceil((time.monotonic() - at) / PERIOD) + 8)  # from before that moment to now
         max_gap = driver.config.link_timeout  # a longer gap is a lost link
-        state, self.alignment = state_at(at, driver.history(packages), driver.name, max_gap)
+        states = driver.history(packages)
+        if states and states[0].time > at:  # this process was held up meanwhile
+            states = driver.history()
+        state, self.alignment = state_at(at, states, driver.name, max_gap)
         return state
 
     def command(self, target: Pose | None) -> Pose | None:

@@ -201,6 +201,7 @@ clock: wall
 sensors:
   finger: {{ driver: camera, source: '{source}', width: {width}, height: {height}, fps: 30, max_age: 10 s }}
 """
+QUESTION = ("[y/N]:", "[Y/n]:")
 START = (sys.executable, "-c", "from robot.cli import main; main()")
 
 
@@ -225,17 +226,18 @@ def lead(
     """Runs the command and plays the person by what it says. answer: typed at its terminal; None: it has none; seen:
     how the camera shows the gel."""
     moves, lines, taken = iter(PRESSES), [], 0
-    theirs, ours = (pty.openpty()[::-1]) if answer is not None else (subprocess.DEVNULL, -1)
+    answers = iter([] if answer is None else answer.splitlines())
+    ours, theirs = pty.openpty() if answer is not None else os.pipe()
     with subprocess.Popen(
-        [*START, *words], stdin=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "COLUMNS": "200", "TERM": "dumb"},
+        [*START, *words], stdin=subprocess.DEVNULL if answer is None else theirs, stdout=subprocess.DEVNULL,
+        stderr=theirs, env={**os.environ, "COLUMNS": "200", "TERM": "dumb"},
     ) as process:  # fmt: skip
-        if answer is not None:
-            os.write(ours, answer.encode())
-        assert process.stderr is not None
-        for line in process.stderr:
+        os.close(theirs)
+        for line in said(ours):
             lines.append(line.strip())
-            if re.search(r"Press \d+ of", line):
+            if line.endswith(QUESTION):
+                os.write(ours, next(answers).encode() + b"\n")
+            elif re.search(r"Press \d+ of", line):
                 camera.push(seen(next(moves)))
             elif line.startswith("Taken"):
                 taken += 1
@@ -243,10 +245,25 @@ def lead(
                     process.send_signal(signal.SIGINT)
             elif line.startswith("Lift"):
                 camera.push(seen(EMPTY))
-    if answer is not None:
-        os.close(theirs)
-        os.close(ours)
+    os.close(ours)
     return process.returncode, lines
+
+
+def said(source: int) -> Iterator[str]:
+    """Lines from a pipe or a terminal, and questions, which end without one."""
+    text = ""
+    while True:
+        try:
+            more = os.read(source, 4096).decode()
+        except OSError:  # how a terminal ends
+            more = ""
+        if not more:
+            return
+        *lines, text = re.split(r"[\r\n]+", text + more)
+        yield from lines
+        if text.endswith(QUESTION):
+            yield text
+            text = ""
 
 
 @pytest.mark.deep

@@ -119,6 +119,19 @@ def test_a_gap_between_packages_is_a_lost_link_only_beyond_its_time_out(link_tim
         assert arm.alignment == pytest.approx(0.1)
 
 
+def test_a_process_held_up_while_it_asks_still_finds_its_moment() -> None:
+    """More packages come between the count of those that reach back to a moment and the copy of them."""
+    now, zero = time.monotonic(), np.zeros(6)
+    kept = [
+        ArmState(Pose(np.array([ago, 0.0, 0.0])), zero, zero, zero, now - ago) for ago in np.arange(1.0, 0.0, -2e-3)
+    ]
+    stub = SimpleNamespace(
+        name="left", config=SimpleNamespace(link_timeout=0.05), state=lambda: kept[-1],
+        history=lambda number=1023: kept[-max(1, number - 100) :] if number < 1023 else kept,
+    )  # fmt: skip
+    assert CommandedArm(stub).state(now - 0.5).pose.position[0] == pytest.approx(0.5)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("stop", "error", "words"),
     [

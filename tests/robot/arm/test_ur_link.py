@@ -90,7 +90,7 @@ def test_a_cut_link_is_lost_for_good_until_recover(mock: MockUR, ports: list[int
         assert clients <= {30020} | (set() if ports is None else {29999, 30003})
         # ur_rtde crashes in some of these resets: its process is gone then, and that is what is told
         assert arm.status() in (ArmStatus.LINK_LOST, ArmStatus.WORKER_DEAD)
-        with pytest.raises(DeviceError, match="sends no packages any more|lost its worker process"):
+        with pytest.raises(DeviceError, match=r"sends no packages any more|lost its worker process"):
             arm.command(start)
         arm.recover()
         go(arm, start)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.ndimage import gaussian_filter
 
 from tacsim.models.photometric import (
     PhotometricLight,
@@ -14,7 +15,7 @@ from tacsim.models.sensor import Lighting, SensorGeometry, SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import sample_surface
-from tests.tacsim.optics.surfaces import dent, flat
+from tests.tacsim.optics.surfaces import dent, flat, make_surface
 
 GEL = (20e-3, 20e-3)
 RNG = np.random.default_rng(3)
@@ -92,6 +93,39 @@ def test_the_picture_is_the_polynomial_at_every_pixel(width: int) -> None:
     assert np.abs(255.0 * base - wanted).max() > 20.0
     assert np.abs(seen - wanted).max() < 1.5
     assert np.abs(seen - wanted).mean() < 0.3  # rounding alone gives 0.25
+
+
+@pytest.mark.parametrize(("width", "spacing"), [(640, 1e-3), (640, 0.5e-3), (320, 0.5e-3), (160, 0.5e-3)])
+def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: float) -> None:
+    """Of the polynomial written out term by term at every pixel in double precision, then blurred."""
+    rows, blur = 3 * width // 4, 0.8
+    geometry = SensorGeometry(width=width, height=rows, pixel_pitch=20e-3 / width)
+    rng = np.random.default_rng(5)
+    weights = 0.05 * rng.normal(size=(term_count(5, 2), 3))
+    weights[:2] = [[0.8, -0.4, -0.4], [0.0, 0.7, -0.7]]  # of a light on the right, and of one below
+    calibrated = PhotometricModel(degree=5, position=2, weights=tuple(map(tuple, weights)), steepest=1.0, blur=blur)
+
+    def pressed_and_slid(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        r2 = (x - 2e-3) ** 2 + (y + 1e-3) ** 2
+        near = np.exp(-r2 / 4e-3**2)
+        return 0.3e-3 * near + 0.05 * (x - 2e-3) * near, -0.2e-3 * near, np.minimum(0.5 * r2 / 4e-3 - 0.8e-3, 0.0)
+
+    surface = make_surface(pressed_and_slid, spacing=spacing)
+    gx, gy = np.moveaxis(sample_surface(surface, image_grid(geometry)).gradient.astype(np.float64), -1, 0)
+    nz = 1.0 / np.sqrt(1.0 + gx**2 + gy**2)
+    nx, ny = -gx * nz, -gy * nz
+    powers = [(nx, ny, 1.0 - nz), *([nx ** (n - k) * ny**k for k in range(n + 1)] for n in range(2, 6))]
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, (np.arange(rows) + 0.5) / rows - 0.5)
+    terms = [place * term for place in (1.0, u, v, u * u, u * v, v * v) for order in powers for term in order]
+    change = sum(term[..., None] * weight for term, weight in zip(terms, weights, strict=True))
+    untouched = 255.0 * np.array([0.42, 0.44, 0.46])
+    wanted = np.clip(untouched + untouched * gaussian_filter(change, (blur, blur, 0), truncate=5.0), 0.0, 255.0)
+    render = Renderer(SensorModel(geometry=geometry, photometric=calibrated, texture=0.0), GEL)
+    error = np.abs(render(surface) - wanted)
+    assert render.beyond == 0.0
+    assert np.abs(wanted - untouched).max() > 30.0
+    assert error.max() < 0.5 + 0.5  # and half a level by rounding to whole ones
+    assert error.mean() < 0.26  # which alone gives 0.25 where the light varies
 
 
 def test_texture_shows_as_on_the_flat_gel() -> None:

@@ -96,6 +96,7 @@ class Rig:
         self._read_all, self._load_control, self._packages = read_all, load_control, packages
         self._on_tactile, self._on_close = on_tactile, on_close
         self._arm_states: Mapping[str, ArmState] = {}
+        self._closed = False
         self.frames = self.references = {}
         specs = {sensor: source.spec for sensor, source in sensors.items()}
         self.spec = RigSpec(sensors=specs, arms=tuple(arms), truth=truth is not None, period=clock.period)
@@ -138,8 +139,8 @@ class Rig:
         """One control period: commands the arms, lets the clock run, observes.
 
         Returns the observation and what each arm was really sent (None: nothing was executed).
-        Raises ActionError for an action that this rig cannot take, whatever observe raises, and SimulationDiverged. An
-        arm that cannot follow stops the others.
+        Raises ActionError for an action that this rig cannot take, RuntimeError once it is closed, whatever observe
+        raises, and SimulationDiverged. An arm that cannot follow stops the others.
         """
         check_action(action, self._addressable, self.name)
         if self._load_control is not None:
@@ -176,20 +177,28 @@ class Rig:
         _run_all([arm.stop for arm in self.arms.values()])
 
     def close(self) -> None:
-        """Stops all arms, then closes everything, each even when another fails."""
+        """Stops all arms, then closes everything, each even when another fails. A step in another thread ends."""
+        self._closed = True
         arms = [*(arm.stop for arm in self.arms.values()), *(arm.close for arm in self.arms.values())]
         others = [] if self._on_close is None else [self._on_close]
         _run_all([*arms, *(sensor.close for sensor in self.sensors.values()), *others])
 
     @contextmanager
     def _stopped_together(self) -> Iterator[None]:
-        """No arm goes on when something fails that concerns all of them."""
+        """No arm goes on when something fails that concerns all of them, or when the rig was closed meanwhile: what an
+        arm was asked after its stop is stopped here."""
         try:
+            self._require_open()
             yield
+            self._require_open()
         except BaseException:
             with suppress(Exception):  # what failed first is raised
                 self.stop()
             raise
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise RuntimeError(f"rig '{self.name}' is closed; open it again")
 
     def __enter__(self) -> Self:
         return self

@@ -81,6 +81,12 @@ _TEXTS = {
     ArmStatus.WORKER_DEAD: "lost its worker process; the controller stops by its watchdog; recover() starts another",
     ArmStatus.CLOSED: "is closed",
 }
+AT_CONNECTING = {  # what to do besides
+    ArmStatus.FORCE_LIMIT: ". If it touches nothing, its force sensor is off: `tacsim doctor --rig FILE` shows by how "
+    "much, `tacsim start FILE` zeroes it",
+    ArmStatus.WORKSPACE_LIMIT: ". `tacsim doctor --rig FILE` says how to jog it back, `tacsim start FILE` leads it to "
+    "its start",
+}
 _ERRORS: dict[ArmStatus, type[DeviceError]] = {
     ArmStatus.CONNECTING: DeviceNotConnectedError,
     ArmStatus.PROGRAM_STOPPED: ProtectiveStop,
@@ -204,14 +210,15 @@ class WorkerConfig:
 
 
 class Channel:
-    """The shared memory of one arm: states from its worker; commands and tactile reports from its driver."""
+    """The shared memory of one arm: states from its worker; commands and tactile reports from its driver. None: of a
+    closed arm; there is nothing in it."""
 
     _STATES = shared_ring.Ring.size(STATE, HISTORY)
     _BOTH = _STATES + shared_ring.Ring.size(COMMAND, COMMAND_SLOTS)
     SIZE = _BOTH + shared_ring.Ring.size(TACTILE, TACTILE_SLOTS)
 
-    def __init__(self, segment: shared_ring.Segment) -> None:
-        view = memoryview(segment.memory)
+    def __init__(self, segment: shared_ring.Segment | None) -> None:
+        view = memoryview(bytearray(self.SIZE) if segment is None else segment.memory)
         self.states = shared_ring.Ring(view[: self._STATES], STATE, HISTORY)
         self.commands = shared_ring.Ring(view[self._STATES : self._BOTH], COMMAND, COMMAND_SLOTS)
         self.tactile = shared_ring.Ring(view[self._BOTH :], TACTILE, TACTILE_SLOTS)

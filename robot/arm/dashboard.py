@@ -73,7 +73,7 @@ class Dashboard(Closing):
         """Raises EmergencyStop, ProtectiveStop or DeviceError unless the arm is powered, free and in remote control."""
         safety = self.safety()
         if safety == "PROTECTIVE_STOP":
-            raise ProtectiveStop(f"{who}: protective stop; look why, then recover() or unlock it on the pendant")
+            raise ProtectiveStop(f"{who}: protective stop; look why, then unlock it on the pendant")
         if safety not in ("NORMAL", "REDUCED"):
             raise EmergencyStop(f"{who}: {safety.lower().replace('_', ' ')}; a person must release it on the robot")
         mode = self.mode()

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from robot.arm.channel import (
+    AT_CONNECTING,
     HISTORY,
     ArmStatus,
     Channel,
@@ -34,7 +35,13 @@ from robot.common import Closing
 from robot.common.kinematics import Kinematics
 from robot.common.process import Child
 from robot.common.tcp import pose_of
-from robot.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleObservationError
+from robot.errors import (
+    DeviceAlreadyConnectedError,
+    DeviceError,
+    DeviceNotConnectedError,
+    ProtectiveStop,
+    StaleObservationError,
+)
 from tacsim import pose as se3
 from tacsim.control.gel_monitor import GelReading
 from tacsim.interface import Action, ArmState, FloatArray, Pose
@@ -93,6 +100,7 @@ class URArm(Closing):
         self._kinematics = Kinematics(config.model)
         self._lock = threading.RLock()
         self._closed = False
+        self._stop_told = False  # recover() found a protective stop: the next one unlocks it
         self._worker: Child | None = None
         # Those of the other arms are held, too: they may be opened, closed and opened again meanwhile.
         self._segments = [segment_of(arm) for arm in (name, *(keep_out or {}))]
@@ -117,7 +125,7 @@ class URArm(Closing):
         """What the arm is doing now; never raises."""
         if self._closed:
             return ArmStatus.CLOSED
-        ended = self._worker is None or not self._worker.running
+        ended = (worker := self._worker) is None or not worker.running  # another thread may close the arm meanwhile
         record = self._channel.states.latest()
         last = ArmStatus.WORKER_DEAD if record is None else ArmStatus(int(record["status"]))
         if ended:
@@ -232,7 +240,8 @@ class URArm(Closing):
 
     def recover(self) -> None:
         """After a stop, a fault or a lost link: unlocks a protective stop and starts a new worker, which begins at the
-        measured pose and moves nothing. Earlier commands are forgotten.
+        measured pose and moves nothing. Earlier commands are forgotten. A protective stop that nobody was told of, after
+        a lost link, raises ProtectiveStop first; the next call unlocks it.
 
         Raises EmergencyStop while one is engaged (a person must release it), and whatever connecting raises: the arm
         stays stopped while what stopped it lasts. Only a person decides to call it: nothing here does.
@@ -240,11 +249,16 @@ class URArm(Closing):
         with self._lock:
             if self._closed:
                 raise self._error(ArmStatus.CLOSED)
-            if self.status() in _DASHBOARD_FIRST:
+            told, self._stop_told = self._stop_told, False
+            if told or self.status() in _DASHBOARD_FIRST:
                 with Dashboard(self.config.host) as dashboard:
                     dashboard.unlock(f"arm '{self.name}'")
             self._end_worker()
-            self._start()
+            try:
+                self._start()
+            except ProtectiveStop as stop:
+                self._stop_told = True
+                raise ProtectiveStop(f"{stop}; the next recover() unlocks it") from stop
 
     def close(self) -> None:
         """Stops the arm and ends its worker; at most 1.5 s. A second call does nothing."""
@@ -253,7 +267,8 @@ class URArm(Closing):
                 return
             self._end_worker()
             self._closed = True
-            del self._channel, self._others, self._segments
+            self._channel = Channel(None)
+            del self._others, self._segments
             _open.discard(self.name)
 
     # -- the worker ----------------------------------------------------------------------------------------------
@@ -278,7 +293,7 @@ class URArm(Closing):
             ) from failure
         status = self.status()
         if status.is_fault and status not in self._bearable:
-            raise status.error(self._explain(status) + _AT_CONNECTING.get(status, ""))
+            raise status.error(self._explain(status) + AT_CONNECTING.get(status, ""))
 
     def _end_worker(self) -> None:
         """Asks the worker to brake and end, then kills it."""
@@ -371,18 +386,12 @@ class URArm(Closing):
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
                 text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
-        if status == ArmStatus.WORKER_DEAD and self._worker is not None:
-            late = self._worker.exit_status == -signal.SIGALRM
-            text += f" ({'a command took longer than link_timeout' if late else self._worker.last_words})"
+        if status == ArmStatus.WORKER_DEAD and (worker := self._worker) is not None:
+            late = worker.exit_status == -signal.SIGALRM
+            text += f" ({'a command took longer than link_timeout' if late else worker.last_words})"
         return text
 
 
-_AT_CONNECTING = {
-    ArmStatus.FORCE_LIMIT: ". If it touches nothing, its force sensor is off: `tacsim doctor --rig FILE` shows by how "
-    "much, `tacsim start FILE` zeroes it",
-    ArmStatus.WORKSPACE_LIMIT: ". `tacsim doctor --rig FILE` says how to jog it back, `tacsim start FILE` leads it to "
-    "its start",
-}
 _DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStatus.PROGRAM_STOPPED)
 
 

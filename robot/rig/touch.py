@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from robot.rig.commanded_arm import CommandedArm
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Normaliser, TactileObservation, TactileSource
@@ -60,7 +62,8 @@ class PictureTouch:
             if self._news.get(name, (-1, 0.0))[0] != frame.index:
                 self._news[name] = frame.index, time.monotonic()
                 self._seen[name] = self._normalisers[name](frame, frame.time)
-            pressed[arm] = max(pressed.get(arm, 0.0), contact_signal(self._seen[name]) / self._signal)
+            signal = contact_signal(self._seen[name]) / self._signal
+            pressed[arm] = float(np.maximum(pressed.get(arm, 0.0), signal))  # a NaN stays one: that arm goes no farther
         if guarded:
             self._monitor(self._seen)
         return Touch(pressed, min(when for _, when in self._news.values()))

@@ -248,6 +248,30 @@ def test_all_arms_are_stopped_before_any_is_closed(part: str, failure: BaseExcep
     assert log == ["left stop", "right stop", "left close", "right close", "close"]
 
 
+@pytest.mark.parametrize("when", ["left command move", "right command move"])
+def test_a_step_in_another_thread_leaves_no_arm_moving_when_the_rig_is_closed(when: str) -> None:
+    rig, log = two_hands()
+    rig.reset()
+    log.clear()
+
+    class Closing(list[str]):
+        def append(self, what: str) -> None:
+            super().append(what)
+            if what == when:
+                rig.close()
+
+    rig.arms["left"].log = rig.arms["right"].log = seen = Closing()  # type: ignore[attr-defined]
+    with pytest.raises(RuntimeError, match="rig 'two' is closed"):
+        rig.step(Action({"left": FORWARD, "right": FORWARD}))
+    last = max(k for k, what in enumerate(seen) if "command" in what)
+    assert {"left stop", "right stop"} <= set(seen[last:])
+    with pytest.raises(RuntimeError, match="rig 'two' is closed"):
+        rig.step(Action({"left": FORWARD, "right": FORWARD}))
+    with pytest.raises(RuntimeError, match="rig 'two' is closed"):
+        rig.reset()
+    assert not [what for what in seen[last + 1 :] if "command" in what]
+
+
 @pytest.mark.parametrize("failure", [OSError("gone"), KeyboardInterrupt()])
 def test_when_an_arm_refuses_its_part_of_a_step_all_are_stopped(failure: BaseException) -> None:
     rig, log = two_hands()

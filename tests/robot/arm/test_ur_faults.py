@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 
 import numpy as np
@@ -215,6 +217,19 @@ def test_a_protective_stop_is_told_and_only_recover_ends_it(arm: URArm, mock: Mo
 
 
 @pytest.mark.promise(7)
+def test_a_protective_stop_after_its_worker_died_is_told_before_it_is_unlocked(arm: URArm, mock: MockUR) -> None:
+    assert arm._worker is not None
+    os.kill(arm._worker.pid, signal.SIGKILL)
+    until(lambda: arm.status() == ArmStatus.WORKER_DEAD, "death")
+    mock.faults.protective_stop()
+    with pytest.raises(ProtectiveStop, match=r"protective stop.*next recover\(\) unlocks it"):
+        arm.recover()
+    assert mock.faults.state().safety == "PROTECTIVE_STOP"
+    arm.recover()
+    assert arm.status() == ArmStatus.HOLD
+
+
+@pytest.mark.promise(7)
 def test_an_emergency_stop_waits_for_a_person(arm: URArm, mock: MockUR) -> None:
     start = arm.state().pose
     in_motion(arm, moved(start, x=0.1))
@@ -252,8 +267,9 @@ def test_a_program_stopped_from_outside_is_told(arm: URArm, mock: MockUR) -> Non
 @pytest.mark.promise(7)
 def test_connecting_to_a_stopped_arm_says_so(mock: MockUR) -> None:
     mock.faults.protective_stop()
-    with pytest.raises(ProtectiveStop, match="arm 'left': protective stop"):
+    with pytest.raises(ProtectiveStop, match="arm 'left': protective stop") as caught:
         URArm(config(), "left").close()
+    assert "recover()" not in str(caught.value)  # there is no arm to call it of
     mock.faults.estop()
     with pytest.raises(EmergencyStop, match="person must release it"):
         URArm(config(), "left").close()

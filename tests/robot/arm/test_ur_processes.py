@@ -316,3 +316,19 @@ def test_close_while_it_connects(mock: MockUR, monkeypatch: pytest.MonkeyPatch) 
         signal.signal(signal.SIGINT, found)
     assert not workers[0].running
     assert leftovers() == 0
+
+
+def test_it_can_be_asked_while_another_thread_closes_it(mock: MockUR, monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = URArm(config(), "left")
+    runs, closing = Child.running.fget, iter([arm.close])
+
+    def closed_meanwhile(worker: Child) -> bool:
+        for close in closing:
+            close()
+        assert runs is not None
+        return bool(runs(worker))
+
+    monkeypatch.setattr(Child, "running", property(closed_meanwhile))
+    assert arm.status() == ArmStatus.WORKER_DEAD
+    assert arm.status() == ArmStatus.CLOSED
+    assert leftovers() == 0

@@ -240,8 +240,8 @@ class URArm(Closing):
 
     def recover(self) -> None:
         """After a stop, a fault or a lost link: unlocks a protective stop and starts a new worker, which begins at the
-        measured pose and moves nothing. Earlier commands are forgotten. A protective stop that nobody was told of, after
-        a lost link, raises ProtectiveStop first; the next call unlocks it.
+        measured pose and moves nothing. Earlier commands are forgotten. A stop that nobody was told of, after a lost
+        link, raises ProtectiveStop first; the next call unlocks it.
 
         Raises EmergencyStop while one is engaged (a person must release it), and whatever connecting raises: the arm
         stays stopped while what stopped it lasts. Only a person decides to call it: nothing here does.

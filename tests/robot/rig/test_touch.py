@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +18,9 @@ from robot.arm.channel import HISTORY
 from robot.arm.trajectory import PERIOD
 from robot.camera.camera import StaleFrame
 from robot.open import open_rig
+from robot.rig import touch
 from robot.rig.commanded_arm import CommandedArm
+from tacsim.interface import TactileSource
 from tacsim.rig import Rig
 from tests.robot.cli.lab import Lab, copy_of
 
@@ -109,3 +114,13 @@ def test_a_speed_that_would_press_a_gel_too_deep_is_refused_in_words(tmp_path: P
     said = "20 mm/s is too fast: .*140 ms late, with its gel 2.8 mm deep, and limits.depth.* is 1 mm. At most 7.1 mm/s"
     with pytest.raises(ValueError, match=said):
         open_rig(file)
+
+
+def test_a_signal_that_is_no_number_is_not_hidden_by_the_other_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    signals = iter([0.5, math.nan, 0.2])
+    monkeypatch.setattr(touch, "contact_signal", lambda seen: next(signals))
+    frame = SimpleNamespace(index=1, time=0.0)
+    sensor = SimpleNamespace(spec=SimpleNamespace(arm="arm"), read=lambda timeout: frame)
+    sensors = dict.fromkeys("abc", cast(TactileSource, sensor))
+    sense = touch.PictureTouch(sensors, dict.fromkeys("abc", lambda *_: None), lambda seen: None, 1.0, 0.1)  # type: ignore[arg-type]
+    assert math.isnan(sense.look(guarded=False).pressed["arm"])

@@ -15,7 +15,10 @@ from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.rig import Rig
 
 if TYPE_CHECKING:
+    from gymnasium.vector import AutoresetMode
+
     from tacsim.gym.env import TacsimEnv
+    from tacsim.gym.vector import TacsimVectorEnv
 
 # Which drivers go by which clock. A simulated sensor on hardware shows the gel as it would look at the arm's pose.
 ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
@@ -84,20 +87,72 @@ def make_env(
     rig: str | Path = "sim",
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
+    variants: Sequence[Sequence[str]] = (),
 ) -> TacsimEnv:
-    """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters."""
+    """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters.
+
+    variants: overrides of scene and task, on top of `overrides`; each reset draws one of them from its seed. The state
+    of first contact of each is computed once. The world of a simulated rig is made at the first reset.
+
+    Raises what open_rig raises, and ValueError for variants that change what must stay (`TacsimEnv.reset`).
+    """
+    configs = _rigs_of_episodes(task, rig, overrides, variants)
+    if configs[0].clock == "sim":
+        from robot.rig.sim_env import open_env
+
+        return open_env(configs, render_mode)
+    return _env_of_hardware(configs, render_mode)
+
+
+def make_vector_env(
+    num_envs: int = 1,
+    task: str = "squeeze",
+    rig: str | Path = "sim",
+    overrides: Sequence[str] = (),
+    render_mode: str | None = None,
+    variants: Sequence[Sequence[str]] = (),
+    autoreset_mode: str | AutoresetMode = "NextStep",
+) -> TacsimVectorEnv:
+    """`num_envs` of these environments, whose simulations share launches: what ``gymnasium.make_vec`` makes.
+
+    Raises as `make_env`, and CannotOpen for a rig that is not simulated, or by physics 'seed'.
+    """
+    configs = _rigs_of_episodes(task, rig, overrides, variants)
+    if configs[0].clock != "sim":
+        raise CannotOpen(
+            f"rig '{configs[0].name}' is not simulated: only simulations run many at once; use robot.make_env"
+        )
+    from robot.rig.sim_env import open_vector_env
+
+    return open_vector_env(configs, num_envs, render_mode, autoreset_mode)
+
+
+def _env_of_hardware(configs: Sequence[RigConfig], render_mode: str | None) -> TacsimEnv:
+    """Of a rig that tells the truth of its body without being a simulation of ours, if there is one."""
     from tacsim.gym.env import TacsimEnv
     from tacsim.tasks import make_task
 
-    config = load_rig(rig, task=task, overrides=overrides).config
-    if config.task is None:
-        raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
-    opened = open_rig(config)
+    if len(configs) > 1:
+        raise CannotOpen(f"rig '{configs[0].name}' is not simulated, so it has no variants")
+    opened, task = open_rig(configs[0]), configs[0].task
+    assert task is not None
     try:
-        return TacsimEnv(opened, make_task(config.task), render_mode)
+        return TacsimEnv(opened, make_task(task), render_mode)
     except BaseException:
         opened.close()
         raise
+
+
+def _rigs_of_episodes(
+    task: str, rig: str | Path, overrides: Sequence[str], variants: Sequence[Sequence[str]]
+) -> list[RigConfig]:
+    """The rig without a variant, then with each."""
+    found = [load_rig(rig, task=task, overrides=[*overrides, *more]).config for more in ((), *variants)]
+    for config in found:
+        if config.task is None:
+            raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
+        _check_parts(config)
+    return found
 
 
 def check_sensors(config: RigConfig) -> None:

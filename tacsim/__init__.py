@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tacsim.control.approach import NoTouch as NoTouch
     from tacsim.control.contact_signal import contact_signal as contact_signal
     from tacsim.gym.env import TacsimEnv as TacsimEnv
+    from tacsim.gym.vector import TacsimVectorEnv as TacsimVectorEnv
     from tacsim.interface import Action as Action
     from tacsim.interface import Arm as Arm
     from tacsim.interface import ArmState as ArmState

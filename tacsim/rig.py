@@ -142,6 +142,12 @@ class Rig:
         Raises ActionError for an action that this rig cannot take, RuntimeError once it is closed, whatever observe
         raises, and SimulationDiverged. An arm that cannot follow stops the others.
         """
+        sent = self.command(action)
+        self.tick()
+        return self.observe(), sent
+
+    def command(self, action: Action) -> Mapping[str, Pose | None]:
+        """The first part of a step: commands the arms; returns and raises as `step`."""
         check_action(action, self._addressable, self.name)
         if self._load_control is not None:
             action = self._load_control(action, self._arm_states)
@@ -149,8 +155,11 @@ class Rig:
             sent = {name: arm.command(action.tool.get(name)) for name, arm in self.arms.items()}
         if self._load_control is not None:
             self._load_control.sent(sent)
+        return sent
+
+    def tick(self) -> None:
+        """The second part of a step: lets the clock run one period. Raises SimulationDiverged."""
         self._clock.tick()
-        return self.observe(), sent
 
     def now(self) -> float:
         """The time on the rig's clock [s]."""

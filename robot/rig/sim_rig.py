@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 from calibration.normaliser import normaliser_for_simulation
 from robot.rig import CannotOpen
-from tacsim.compute.threads import map_parallel
+from tacsim.compute.threads import map_parallel, map_serial
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
 from tacsim.interface import Arm, SensorSpec
@@ -22,10 +23,38 @@ from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import SimReset
 from tacsim.sim.sensor import SimSensor
+from tacsim.sim.stage import Stage, StatePool
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """A simulated rig, and the parts of it that who simulates needs."""
+
+    rig: Rig
+    clock: SimClock
+    stage: Stage
 
 
 def open_sim(config: RigConfig) -> Rig:
     """One world seen as sensors, arms and a clock. Raises CannotOpen."""
+    simulation = simulate(config)
+    simulation.stage.world()
+    return simulation.rig
+
+
+def simulate(
+    config: RigConfig,
+    make: Callable[[Scene], World] | None = None,
+    pool: StatePool | None = None,
+    *,
+    parallel: bool = True,
+) -> Simulation:
+    """A simulated rig whose world is made when it is first needed.
+
+    make: a new world of a scene, `make_world` by default. pool: of touched states, to share them between rigs.
+    parallel: its sensors are read on threads of their own, if there are some; not where whole rigs are.
+    Raises CannotOpen.
+    """
     scene = config.scene
     if scene is None:
         raise CannotOpen(f"rig '{config.name}' simulates, but has no scene; give scene, or a task (which has one)")
@@ -36,7 +65,7 @@ def open_sim(config: RigConfig) -> Rig:
         )
     frames = _frame_of_arm(config, scene)
     models = {name: sensor for name, sensor in config.sensors.items() if isinstance(sensor, SimSensorConfig)}
-    world = make_world(scene)
+    world = Stage(scene, make_world if make is None else make)
     clock = SimClock(world, config.period, config.motion)
     sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
     arms: dict[str, Arm] = {}
@@ -48,7 +77,8 @@ def open_sim(config: RigConfig) -> Rig:
         apart = [(frames[other], distance) for other, distance in config.kept_out(name).items()]
         arms[name] = SimArm(world, clock, frames[name], speed * config.period, turn_rate * config.period, limits, apart)
     task = config.task
-    return Rig(
+    touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
+    rig = Rig(
         name=config.name,
         sensors=sensors,
         arms=arms,
@@ -57,13 +87,14 @@ def open_sim(config: RigConfig) -> Rig:
             name: normaliser_for_simulation(sensor.model, scene.gel.size[:2], config.canonical)
             for name, sensor in models.items()
         },
-        reset=SimReset(world, clock, sensors, *((None, 0.0) if task is None else (task.touch_force, task.placement))),
+        reset=SimReset(world, clock, sensors, touch_force, placement, pool),
         truth=None if scene.body is None else world.truth,
         diagnostics=clock.diagnostics,
-        read_all=map_parallel,
+        read_all=map_parallel if parallel else map_serial,
         on_tactile=_gel_monitor(config, sensors),
         load_control=load_controller(config.task),
     )
+    return Simulation(rig, clock, world)
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:

@@ -80,7 +80,11 @@ def launching() -> Iterator[None]:
 def _require_own_process() -> None:
     """Before any lock: in a forked child it may be held by a thread that is not there."""
     if _running not in (None, os.getpid()):
-        raise RuntimeError("Taichi does not survive a fork: start worker processes with the 'spawn' method")
+        raise RuntimeError(
+            "Taichi runs in the parent process and does not survive a fork: start workers by 'spawn' or 'forkserver' "
+            "(gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})), or before "
+            "anything is simulated in the parent"
+        )
 
 
 def available(device: str) -> bool:

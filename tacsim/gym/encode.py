@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, Observation, Pose, TactileObservation
 from tacsim.limits import ActionError
+from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.tasks.task import Axis
 
 Flat = dict[str, NDArray[Any]]
@@ -79,6 +80,28 @@ def space_of(flat: Flat) -> spaces.Space[Flat]:
     """The Gymnasium space that `flat` and everything flattened from the same rig lies in."""
     space: spaces.Space[Any] = spaces.Dict({key: _space(key, value) for key, value in flat.items()})
     return space
+
+
+def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
+    """The same of a simulated rig that is described, but need not be opened."""
+    grid = config.canonical
+    cells, pixels = (grid.rows, grid.columns), (grid.rows * grid.image_scale, grid.columns * grid.image_scale, 3)
+    flat: Flat = {}
+    for name, sensor in config.sensors.items():
+        assert isinstance(sensor, SimSensorConfig)
+        flat[f"tactile_{name}"] = np.zeros(pixels, np.uint8)
+        flat |= {f"{key}_{name}": np.zeros(cells, np.int8) for key in ("contact", "valid")}
+        flat[f"height_{name}"], flat[f"gradient_{name}"] = (
+            np.zeros(cells, np.float32),
+            np.zeros((*cells, 2), np.float32),
+        )
+        markers = sensor.model.markers
+        if markers is not None:
+            flat[f"flow_{name}"] = np.zeros((markers.rows, markers.columns, 2), np.float32)
+    for name in config.arms:
+        numbers = {"pose": 9, "twist": 6, "wrench": 6}
+        flat |= {f"{key}_{name}": np.zeros(count, np.float32) for key, count in numbers.items()}
+    return space_of(flat)
 
 
 def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:

@@ -6,7 +6,9 @@ tacsim.gym.plugin); from sources, ``gymnasium.make("tacsim.gym.env:tacsim/Squeez
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -17,9 +19,23 @@ from tacsim.gym import encode
 from tacsim.gym.plugin import register_envs
 from tacsim.interface import Needs, Pose, Truth
 from tacsim.limits import LimitExceeded
+from tacsim.models.rig import TaskConfig
+from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
+from tacsim.sim.stage import Stage
+from tacsim.tasks import make_task
 from tacsim.tasks.task import Task, judge
+
+Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """What differs from one episode to the next: the goal, and the body between the gels."""
+
+    task: TaskConfig
+    scene: Scene
 
 
 class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
@@ -29,30 +45,97 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     An episode terminates only when a limit of an arm is exceeded (info["limit"] says which). It is truncated after the
     task's steps, or when the simulation diverges (info["diverged"] says why; the observation is the last good one).
 
-    info: distance [m], success, score, body_height [m], and the rig's diagnostics.
-    Raises IncompatibleRig when the rig lacks what the task needs. Resets the rig once to learn the shapes.
+    info: distance [m], success, score, body_height [m], and the rig's diagnostics; with variants also `variant`, the
+    number of the one that is played.
+
+    Args:
+        space: of the observations; None: the rig is reset once to learn the shapes.
+        variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
+        stage: what the rig simulates, where a reset may exchange its scene.
+
+    Raises IncompatibleRig when the rig lacks what the task needs.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    def __init__(self, rig: Rig, task: Task, render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        task: Task,
+        render_mode: str | None = None,
+        *,
+        space: gymnasium.Space[encode.Flat] | None = None,
+        variants: Sequence[Variant] = (),
+        stage: Stage | None = None,
+    ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         rig.require(Needs(truth=True), "an environment")
         rig.require(task.needs, f"task '{task.config.kind}'")
         self.rig, self.task, self.render_mode = rig, task, render_mode
-        self._begin(seed=0)
-        self.observation_space = encode.space_of(self._flat)
+        self._variants, self._stage = tuple(variants), stage
+        self._played: int | None = None  # the variant
+        if space is None:
+            self._begin(seed=0)
+            space = encode.space_of(self._flat)
+        self.observation_space = space
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(task.axes),), np.float32)
-        self._finished = True  # until the user's own reset
+        self.phase: Literal["new", "running", "over"] = "new"  # of the episode; over: terminated or truncated
+        self._sent: Mapping[str, Pose | None] = {}  # by the last begin_step
+        self._failure: LimitExceeded | SimulationDiverged | None = None
+        self._done: Result | None = None  # a step that is done, but not taken yet
+
+    @property
+    def scene(self) -> Scene | None:
+        """Of the next reset, if none is chosen or drawn for it; None where it cannot be exchanged."""
+        return None if self._stage is None else self._stage.scene
+
+    # ------------------------------------------------------------------ reset
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[encode.Flat, dict[str, Any]]:
+        """The same seed gives the same episode.
+
+        options: `variant`, the number of one of the environment's variants, in place of a drawn one; or `task`
+        (SqueezeConfig, RepositionConfig) and `scene` (Scene), which hold until others are given. Raises ValueError for
+        others, and for what cannot change between episodes.
+        """
+        super().reset(seed=seed)
+        self._choose(dict(options or {}))
+        self._begin(seed=int(self.np_random.integers(2**31)))
+        return self._flat, self._judged()[1]
+
+    def _choose(self, options: dict[str, Any]) -> None:
+        """The task and the scene of the next episode."""
+        unknown = sorted(set(options) - {"variant", "task", "scene"})
+        if unknown:
+            raise ValueError(f"reset knows the options variant, task and scene, got {unknown}")
+        chosen: Mapping[str, Any] = options
+        if self._variants and not {"task", "scene"} & set(options):
+            number = options.get("variant")
+            self._played = int(self.np_random.integers(len(self._variants))) if number is None else int(number)
+            if not 0 <= self._played < len(self._variants):
+                raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
+            variant = self._variants[self._played]
+            chosen = {"task": variant.task, "scene": variant.scene}
+        elif "variant" in options:
+            raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
+        if "scene" in chosen:
+            if self._stage is None:
+                raise ValueError(f"rig '{self.rig.name}' has but one scene; make its environment by robot.make_env")
+            self._stage.use(chosen["scene"])
+        if "task" in chosen:
+            require_alike(self.task.config, chosen["task"])
+            self.task = make_task(chosen["task"])
 
     def _begin(self, seed: int) -> None:
+        self.phase, self._failure, self._done = "new", None, None
         observation = self.rig.reset(seed)
         self._start: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}
         self._targets = dict(self._start)  # where each arm was last sent
         self._truth_at_start = self._truth()
-        self._count = 0
-        self._finished = False
+        self._count, self.phase = 0, "running"
         self._flat: encode.Flat = encode.flatten(observation, self._start)
 
     def _truth(self) -> Truth:
@@ -61,34 +144,66 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             raise RuntimeError(f"rig '{self.rig.name}' promises ground truth in its spec, but delivers none")
         return truth
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[encode.Flat, dict[str, Any]]:
-        """The same seed gives the same episode. There are no options."""
-        super().reset(seed=seed)
-        if options:
-            raise ValueError(f"reset knows no options, got {sorted(options)}")
-        self._begin(seed=int(self.np_random.integers(2**31)))
-        return self._flat, self._judged()[1]
+    # ------------------------------------------------------------------- step
 
-    def step(self, action: NDArray[np.float32]) -> tuple[encode.Flat, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> Result:
         """One control period. Raises ActionError for an action outside the space, ResetNeeded after the end."""
-        if self._finished:
+        if self._done is None:
+            self.begin_step(action)
+            if self.commanded:
+                try:
+                    self.rig.tick()
+                except SimulationDiverged as failure:
+                    self.fail(failure)
+            self.end_step()
+        assert self._done is not None
+        result, self._done = self._done, None
+        return result
+
+    def begin_step(self, action: NDArray[np.float32]) -> None:
+        """The first part of a step: commands the arms. The rig's clock ticks next, if the arms are `commanded`; then
+        `end_step`. Raises as `step`."""
+        if self.phase != "running":
             raise ResetNeeded("call reset() before step(): no episode is running")
         asked = encode.action_from(action, self.task.axes, self.task.config.max_step, self._targets)
-        self._count += 1
+        self._failure = None
         try:
-            observation, sent = self.rig.step(asked)
-        except (LimitExceeded, SimulationDiverged) as failure:
-            self._finished = True
-            exceeded = isinstance(failure, LimitExceeded)
+            self._sent = self.rig.command(asked)
+        except LimitExceeded as failure:
+            self.fail(failure)
+
+    @property
+    def commanded(self) -> bool:
+        """The arms have taken what the last `begin_step` asked."""
+        return self._failure is None
+
+    def fail(self, failure: LimitExceeded | SimulationDiverged) -> None:
+        """The step that was begun comes to this end, and the episode with it."""
+        self._failure = failure
+
+    def end_step(self) -> None:
+        """The last part of a step: observes and judges. The next call of `step` returns it."""
+        self._count += 1
+        if self._failure is None:
+            try:
+                observation = self.rig.observe()
+            except LimitExceeded as failure:
+                self.fail(failure)
+        if self._failure is not None:
+            self.phase = "over"
+            exceeded = isinstance(self._failure, LimitExceeded)
             reward, info = self._judged()
             flat = {key: value.copy() for key, value in self._flat.items()}
-            return flat, reward, exceeded, not exceeded, info | {"limit" if exceeded else "diverged": str(failure)}
-        self._targets |= {name: pose for name, pose in sent.items() if pose is not None}
+            info |= {"limit" if exceeded else "diverged": str(self._failure)}
+            self._done = flat, reward, exceeded, not exceeded, info
+            return
+        self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
         self._flat = encode.flatten(observation, self._start)
+        truncated = self._count >= self.task.config.steps
+        if truncated:
+            self.phase = "over"
         reward, info = self._judged()
-        return self._flat, reward, False, self._count >= self.task.config.steps, info
+        self._done = self._flat, reward, False, truncated, info
 
     def _judged(self) -> tuple[float, dict[str, Any]]:
         truth = self._truth()
@@ -99,6 +214,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             "score": outcome.score,
             "body_height": truth.height,
         }
+        if self._played is not None:
+            info["variant"] = self._played
         return outcome.reward, info | dict(self.rig.diagnostics())
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -113,6 +230,15 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
 
     def close(self) -> None:
         self.rig.close()
+
+
+def require_alike(task: TaskConfig, other: TaskConfig) -> None:
+    """Raises ValueError where an environment cannot go from one task to the other: only its goal, its steps and how it
+    is judged may change."""
+    for what in ("kind", "touch_force", "placement", "loads"):
+        now, new = getattr(task, what, None), getattr(other, what, None)
+        if now != new:
+            raise ValueError(f"a new task must keep {what} of the environment's: {now}, got {new}")
 
 
 register_envs()

@@ -25,9 +25,18 @@ ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposit
 
 def make_env(**options: Any) -> Any:
     """An environment by robot.open.make_env. Raises ImportError where Python finds another `robot` first."""
+    return _opener().make_env(**options)
+
+
+def make_vector_env(**options: Any) -> Any:
+    """The same of robot.open.make_vector_env."""
+    return _opener().make_vector_env(**options)
+
+
+def _opener() -> ModuleType:
     name = "robot.open"  # not an import statement: tacsim stays below robot
     try:
-        return import_module(name).make_env(**options)
+        return import_module(name)
     except ModuleNotFoundError as failure:
         if failure.name != name:
             raise
@@ -43,7 +52,12 @@ def register_envs() -> None:
 
     for name, task in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=f"{__name__}:make_env", kwargs={"task": task})
+            gymnasium.register(
+                name,
+                entry_point=f"{__name__}:make_env",
+                vector_entry_point=f"{__name__}:make_vector_env",
+                kwargs={"task": task},
+            )
 
 
 def install() -> None:

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.rig import SimMotion
-from tacsim.physics.move import MoveStats
+from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.world import World
 
 
@@ -27,6 +27,7 @@ class SimClock:
         self._motion = motion
         self._targets: dict[str, Pose] = {}
         self._limited: dict[str, bool] = {}  # by frame: a guard changed the last command
+        self._before: dict[str, Pose] = {}  # where the frames were that move in this period
         self._time = 0.0
         self.version = 0
         self.stats: MoveStats | None = None  # of the last motion
@@ -51,16 +52,30 @@ class SimClock:
 
     def tick(self) -> None:
         """One period. A world at rest without commands is left as it is. Raises SimulationDiverged."""
+        command = self.begin()
+        self.finish(
+            None if command is None else self._world.move(command.targets, duration=command.duration, flow=command.flow)
+        )
+
+    def begin(self) -> MoveCommand | None:
+        """Takes the commands of this period; returns the motion that they ask for, None for a world that rests. Who
+        carries it out says so by `finish`, as `tick` does; if it fails, the period does not pass."""
         targets, self._targets = self._targets, {}
-        before = {frame: self._world.pose(frame) for frame in targets}
+        self._before = {frame: self._world.pose(frame) for frame in targets}
         if self._motion == "dynamic":
-            self.stats = self._world.move(targets, duration=self.period)
-        elif targets or (self.stats is not None and not self.stats.settled):
-            self.stats = self._world.move(targets, flow=self._motion == "flowing")
+            return MoveCommand(targets, duration=self.period)
+        if targets or (self.stats is not None and not self.stats.settled):
+            return MoveCommand(targets, flow=self._motion == "flowing")
+        return None
+
+    def finish(self, stats: MoveStats | None) -> None:
+        """The period is over: its motion went like `stats`, or there was none."""
+        if stats is not None:
+            self.stats = stats
         elif self.stats is not None:
             self.stats = replace(self.stats, substeps=0, hold=0)
         self.velocities = {
-            frame: se3.difference(old, self._world.pose(frame)) / self.period for frame, old in before.items()
+            frame: se3.difference(old, self._world.pose(frame)) / self.period for frame, old in self._before.items()
         }
         self._time += self.period
         self.version += 1

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.control.approach import NoTouch
-from tacsim.interface import FloatArray, Pose, TactileFrame, Truth
+from tacsim.interface import Pose, TactileFrame, Truth
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
 from tacsim.sim.clock import SimClock
 from tacsim.sim.sensor import SimSensor
+from tacsim.sim.stage import Stage, StatePool
 
 CLEARANCE = 0.05e-3  # gap that the first, fast part of an approach leaves [m]
 FIRST_STEP = 0.1e-3  # of the slow part [m]
@@ -25,35 +24,37 @@ SMALLEST_STEP = 1e-8  # an approach that needs finer steps has met something tha
 
 
 class SimReset:
-    """Starts a simulated episode: restores the world's initial state, then approaches until gentle contact.
+    """Starts a simulated episode: the world as it was made, then an approach until gentle contact. An approach that was
+    made before, in the same scene and from the same place, is not made again.
 
     Args:
         touch_force: normal force that ends the approach [N]; None leaves the gels clear.
         placement: the gels start at most this far beside the body in world x and y, drawn from the seed [m].
+        pool: of touched states; of this reset alone, or of several.
     """
 
     def __init__(
         self,
-        world: World,
+        stage: Stage,
         clock: SimClock,
         sensors: Mapping[str, SimSensor],
         touch_force: float | None,
         placement: float = 0.0,
+        pool: StatePool | None = None,
     ) -> None:
-        self._world, self._clock, self._sensors = world, clock, sensors
+        self._stage, self._clock, self._sensors = stage, clock, sensors
         self._touch_force, self._placement = touch_force, placement
-        self._initial = world.snapshot()
+        self._pool = StatePool() if pool is None else pool
         self._offset = np.zeros(2)
-        # The last approach: its offset, the state and the move it ended with. The same start gives the same end.
-        self._touched: tuple[FloatArray, Mapping[str, NDArray[Any]], MoveStats | None] | None = None
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
-        self._world.restore(self._initial)
+        stage = self._stage
+        stage.rewind()
         self._offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
         if self._offset.any():
             shift = np.append(self._offset, 0.0)
-            poses = {name: self._world.pose(name) for name in self._world.sensors}
-            self._world.move({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
+            poses = {name: stage.pose(name) for name in stage.sensors}
+            stage.move({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
         self._clock.restart()
         for sensor in self._sensors.values():
             sensor.restart(seed)
@@ -63,12 +64,15 @@ class SimReset:
         """Raises NoTouch when no gentle contact is found."""
         if self._touch_force is None:
             return
-        if self._touched is None or not np.array_equal(self._touched[0], self._offset):
-            stats = approach_force(self._world, self._touch_force)
-            self._touched = (self._offset, self._world.snapshot(), stats)
+        start = (self._stage.scene.model_dump_json(), self._offset.tobytes(), self._touch_force)
+        touched = self._pool.find(start)
+        if touched is None:
+            stats = approach_force(self._stage, self._touch_force)
+            self._pool.keep(start, self._stage.snapshot(), stats)
         else:
-            self._world.restore(self._touched[1])
-        self._clock.restart(self._touched[2])
+            self._stage.restore(touched[0])
+            stats = touched[1]
+        self._clock.restart(stats)
 
 
 def approach_force(world: World, touch_force: float) -> MoveStats | None:

@@ -55,7 +55,9 @@ class SpringWorld:
     def pose(self, name: str) -> Pose:
         return self.poses[name]
 
-    def move(self, targets: Mapping[str, Pose], duration: float | None = None, *, flow: bool = False) -> MoveStats:
+    def move(
+        self, targets: Mapping[str, Pose], loads: None = None, duration: float | None = None, *, flow: bool = False
+    ) -> MoveStats:
         self.durations.append(duration)
         self.flows.append(flow)
         self.moves.append(dict(targets))

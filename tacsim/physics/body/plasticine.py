@@ -80,6 +80,17 @@ class BodyState:
         self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
         self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
 
+    def place(self, environment: int, points: np.ndarray, planes: np.ndarray) -> None:
+        """Another body in one environment, at rest, see __init__. Rows of all grow if this one has more particles."""
+        count, room = len(points), self.rows.shape[2]
+        if row_length(count) > room:
+            rows = aligned_zeros(*self.rows.shape[:2], row_length(count))
+            rows[..., :room] = self.rows
+            self.rows = rows
+        self.counts[environment] = count
+        self.rows[environment] = 0.0
+        self.x(environment)[...], self.plane(environment)[...] = points, planes
+
     def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
         return self.rows[environment, first : first + count, : self.counts[environment]]
 

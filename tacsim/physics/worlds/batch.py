@@ -44,6 +44,18 @@ class Batch(NotCopyable):
             self._state = press = PressState(scenes)
             self.worlds = tuple(PressWorld(scene, press, index) for index, scene in enumerate(scenes))
 
+    def replace(self, index: int, scene: Scene) -> None:
+        """Makes one environment a new world of another scene; the world that it was must not be used any more.
+
+        Raises ValueError for a scene that cannot share a launch with the others, or has an indenter.
+        """
+        if not isinstance(self._state, HybridState) or scene.indenter is not None:
+            raise ValueError("only worlds with a body can be replaced in a batch; make a new Batch for indenters")
+        _require_one_kind([scene])
+        self._state.place(index, scene)
+        world = HybridWorld(scene, self._state, index)
+        self.worlds = (*self.worlds[:index], world, *self.worlds[index + 1 :])
+
     def move(
         self,
         targets: Sequence[Mapping[str, Pose] | None],

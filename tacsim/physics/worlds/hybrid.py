@@ -87,6 +87,21 @@ class HybridState:
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
         self._device_arrays = DeviceArrays()
 
+    def place(self, index: int, scene: Scene) -> None:
+        """One environment as it is at the construction of another scene. Raises ValueError for gels cut otherwise."""
+        gel = gel_params(scene.gel, scene.element)
+        common_lattice([*self.gel, gel])
+        body, points, planes = _body_at_start(scene)
+        self.gel[index], self.body[index] = gel, body
+        self.gels.u[index], self.gels.v[index] = 0.0, 0.0
+        self.particles.place(index, points, planes)
+        missing = max(self.particles.counts) - self.contact_history.shape[2]
+        if missing > 0:
+            self.contact_history = np.pad(self.contact_history, ((0, 0), (0, 0), (0, missing), (0, 0)))
+        self.contact_history[index], self.params[index], self.partial[index] = 0.0, 0.0, 0.0
+        self.counts[index] = 0
+        self.counts[index, ELEMENTS : ELEMENTS + 3] = gel.elements
+
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
         """One launch; drives: (n, 2, 6, 3) of the environments that move, each with its own n."""
         drive = stack_drives(drives, self.counts)

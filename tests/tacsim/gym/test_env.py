@@ -116,7 +116,7 @@ def test_divergence_truncates_and_says_why(open_springs: Any, monkeypatch: pytes
     last = env.step(np.array([0.5, -0.5], np.float32))
     world = env.rig.world  # type: ignore[attr-defined]
 
-    def diverge(targets: Any, *, flow: bool = False) -> None:
+    def diverge(*targets: Any, flow: bool = False) -> None:
         raise SimulationDiverged("NaN", "substep 3", "move less")
 
     monkeypatch.setattr(world, "move", diverge)

@@ -16,6 +16,7 @@ from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import TOUCH_TOLERANCE, SimReset, approach_force
 from tacsim.sim.sensor import SimSensor
+from tacsim.sim.stage import Stage
 
 
 def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
@@ -200,7 +201,7 @@ def test_placement_follows_the_seed(open_springs: Any) -> None:
 
 def test_without_touch_force_the_gels_stay_clear(spring_world: Any) -> None:
     clock = SimClock(spring_world, 0.1)
-    SimReset(spring_world, clock, {}, None).touch()
+    SimReset(Stage(spring_world.scene, lambda scene: spring_world), clock, {}, None).touch()
     assert spring_world.moves == []
 
 

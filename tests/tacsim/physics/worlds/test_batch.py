@@ -127,6 +127,26 @@ def test_one_that_rests_does_not_change_and_moves_alone_later(fresh: Batch) -> N
     assert [state(fresh.worlds[index]) for index in (0, 2)] == others
 
 
+@pytest.mark.cpu
+def test_one_that_is_replaced_is_a_new_world_to_the_bit() -> None:
+    """Also by more particles than the batch had room for, and by fewer; the others notice nothing."""
+    batch, alone = Batch([SCENES[0], SCENES[1]]), HybridWorld(SCENES[1])
+    batch.move([closed(batch.worlds[0], 1.5e-3), closed(batch.worlds[1], 0.6e-3)])
+    alone.move(closed(alone, 0.6e-3))
+    for scene in (with_body(Box(size=(5e-3, 5e-3, 3e-3)), BodyMaterial()), SCENES[2], SCENES[0]):
+        batch.replace(0, scene)
+        new = HybridWorld(scene)
+        assert_same(batch.worlds, [new, alone])
+        ends = batch.move([closed(new, 0.7e-3), closed(alone, 0.1e-3)])
+        assert ends == [new.move(closed(new, 0.7e-3)), alone.move(closed(alone, 0.1e-3))]
+        assert_same(batch.worlds, [new, alone])
+    with pytest.raises(ValueError, match="give both the same gel"):
+        batch.replace(0, with_body(Box(), gel=Gel(size=(9e-3, 8e-3, 4e-3))))
+    assert_same(batch.worlds, [new, alone])
+    with pytest.raises(ValueError, match="make a new Batch for indenters"):
+        batch.replace(0, Scene(body=None, indenter=Indenter(), gel=GEL))
+
+
 def test_nobody_moves(fresh: Batch) -> None:
     before = [state(world) for world in fresh.worlds]
     assert fresh.move([None] * 3) == [None] * 3

@@ -1,0 +1,67 @@
+"""Gymnasium environments of simulated rigs: one, and many whose worlds share launches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+from gymnasium.vector import AutoresetMode
+
+from robot.rig import CannotOpen
+from robot.rig.sim_rig import Simulation, simulate
+from tacsim.gym import encode
+from tacsim.gym.env import TacsimEnv, Variant, require_alike
+from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
+from tacsim.models.rig import RigConfig
+from tacsim.sim.stage import StatePool, require_same_gels
+from tacsim.tasks import make_task
+
+
+def open_env(configs: Sequence[RigConfig], render_mode: str | None) -> TacsimEnv:
+    """An environment of the first of `configs`; the others are its variants. Raises CannotOpen, ValueError."""
+    variants = _variants(configs)
+    return _env(simulate(configs[0]), configs[0], variants, render_mode)
+
+
+def open_vector_env(
+    configs: Sequence[RigConfig], number: int, render_mode: str | None, autoreset_mode: str | AutoresetMode
+) -> TacsimVectorEnv:
+    """`number` of these environments in one batch. Raises CannotOpen, ValueError."""
+    config, variants = configs[0], _variants(configs)
+    if number < 1:
+        raise ValueError(f"a vector environment needs at least one environment, got {number}")
+    if config.scene is None or config.scene.physics == "seed":
+        raise CannotOpen(
+            f"rig '{config.name}': physics 'seed' does not run in a batch; use physics 'hybrid', or "
+            "gymnasium.make_vec(..., vectorization_mode='sync')"
+        )
+    batch, pool = SharedBatch([config.scene] * number), StatePool()
+    members = []
+    for index in range(number):
+        simulation = simulate(config, partial(batch.world, index), pool, parallel=False)
+        members.append(Member(_env(simulation, config, variants, render_mode), simulation.clock))
+    return TacsimVectorEnv(members, batch, autoreset_mode)
+
+
+def _env(simulation: Simulation, config: RigConfig, variants: Sequence[Variant], render_mode: str | None) -> TacsimEnv:
+    assert config.task is not None
+    task, space = make_task(config.task), encode.space_of_rig(config)
+    return TacsimEnv(simulation.rig, task, render_mode, space=space, variants=variants, stage=simulation.stage)
+
+
+def _variants(configs: Sequence[RigConfig]) -> list[Variant]:
+    """All but the first. Raises ValueError for one that changes what an environment cannot change at a reset."""
+    first, variants = configs[0], []
+    for number, config in enumerate(configs[1:]):
+        same = {"scene": None, "task": None}
+        if config.model_copy(update=same) != first.model_copy(update=same):
+            raise ValueError(f"variant {number} may change nothing but scene and task; make another environment for it")
+        assert first.scene is not None and first.task is not None and config.scene is not None
+        assert config.task is not None
+        try:
+            require_same_gels(first.scene, config.scene)
+            require_alike(first.task, config.task)
+        except ValueError as error:
+            raise ValueError(f"variant {number}: {error}") from None
+        variants.append(Variant(config.task, config.scene))
+    return variants

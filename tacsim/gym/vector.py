@@ -1,0 +1,132 @@
+"""Many environments whose worlds move together, in the same launches of kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import iterate
+from numpy.typing import NDArray
+
+from tacsim.compute.threads import map_parallel
+from tacsim.gym.env import TacsimEnv
+from tacsim.models.scene import Scene
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.move import MoveCommand
+from tacsim.physics.world import World
+from tacsim.physics.worlds.batch import Batch
+from tacsim.sim.clock import SimClock
+
+
+class SharedBatch:
+    """A batch that is made when the first of its worlds is needed."""
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        self._scenes = tuple(scenes)
+        self._batch: Batch | None = None
+
+    def world(self, index: int, scene: Scene) -> World:
+        """Number `index` as a world of `scene`, as newly made."""
+        if self._batch is None:
+            self._batch = Batch(self._scenes)
+            self._made = [False] * len(self._scenes)
+        if self._made[index] or scene != self._scenes[index]:
+            self._batch.replace(index, scene)
+        self._made[index] = True
+        return self._batch.worlds[index]
+
+    def move(self, commands: Sequence[MoveCommand | None]) -> list[Any]:
+        """`Batch.move`; the rigs of one file ask for motions of one kind."""
+        asked = [command for command in commands if command is not None]
+        if not asked or self._batch is None:
+            return [None] * len(commands)
+        targets = [None if command is None else command.targets for command in commands]
+        return list(self._batch.move(targets, duration=asked[0].duration, flow=asked[0].flow))
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One environment, and the clock of its rig."""
+
+    env: TacsimEnv
+    clock: SimClock
+
+
+class TacsimVectorEnv(SyncVectorEnv):
+    """Environments that share launches: `gymnasium.make_vec("tacsim/Squeeze-v0", n)`.
+
+    It is gymnasium's SyncVectorEnv, and each environment gives the results that it would give alone, bit for bit. What
+    ends one episode (a limit, a simulation that diverges) leaves the others alone.
+
+    Args:
+        batch: of the members' worlds, in their order.
+        autoreset_mode: what happens to an environment whose episode has ended: it is reset in the next step
+            (NEXT_STEP), in the same (SAME_STEP), or by the user (DISABLED), with options={"reset_mask": ...}.
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Member],
+        batch: SharedBatch,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        self._members, self._batch = tuple(members), batch
+        super().__init__([partial(getattr, member, "env") for member in members], autoreset_mode=autoreset_mode)
+        self.metadata["reset_mask"] = True  # reset(options={"reset_mask": ...}) is understood
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """As SyncVectorEnv.reset; options: `reset_mask`, and those of `TacsimEnv.reset`. Raises ResetNeeded for a mask
+        that leaves out an environment that has never been reset."""
+        options = dict(options or {})  # gymnasium takes the mask out of what it is given
+        mask = options.get("reset_mask")
+        if isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,):
+            new = [i for i, member in enumerate(self._members) if member.env.phase == "new" and not mask[i]]
+            if new:
+                raise ResetNeeded(f"environment {_listed(new)} has no episode yet: reset it, too")
+        return super().reset(seed=seed, options=options)
+
+    def step(self, actions: Any) -> tuple[Any, ...]:
+        """One control period of all. Raises what `TacsimEnv.step` raises for one of the actions, before anything
+        moves."""
+        self._advance(list(iterate(self.action_space, actions)))
+        return super().step(actions)  # takes what is done now, resets what is to be reset, and puts it together
+
+    def _advance(self, actions: Sequence[NDArray[np.float32]]) -> None:
+        """The step of all environments but those that are to be reset; their `step` then returns its result."""
+        if len(actions) != self.num_envs:
+            raise ValueError(f"{len(actions)} actions for {self.num_envs} environments; give one each")
+        resets = self.autoreset_mode == AutoresetMode.NEXT_STEP
+        phases = [member.env.phase for member in self._members]
+        over = [i for i, phase in enumerate(phases) if phase == "new" or (phase == "over" and not resets)]
+        if over:
+            raise ResetNeeded(f"no episode runs in environment {_listed(over)}: call reset(), or with a reset_mask")
+        stepping = {i: m for i, m in enumerate(self._members) if phases[i] == "running"}
+        commands: list[MoveCommand | None] = [None] * self.num_envs
+        try:
+            for index, member in stepping.items():
+                member.env.begin_step(actions[index])
+            for index, member in stepping.items():
+                if member.env.commanded:
+                    commands[index] = member.clock.begin()
+            ends = self._batch.move(commands)
+        except BaseException:
+            for member in stepping.values():
+                member.env.rig.stop()  # nothing of this step is left
+            raise
+        for index, member in stepping.items():
+            if isinstance(ends[index], SimulationDiverged):
+                member.env.fail(ends[index])
+            elif member.env.commanded:
+                member.clock.finish(ends[index])
+        map_parallel([member.env.end_step for member in stepping.values()])
+
+
+def _listed(indices: Sequence[int]) -> str:
+    return ", ".join(map(str, indices))

@@ -1,0 +1,121 @@
+"""What a rig simulates: the world of its present scene."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.interface import Pose, Truth
+from tacsim.models.scene import GelSurface, Scene
+from tacsim.physics.move import MoveStats
+from tacsim.physics.world import World, make_world
+
+State = Mapping[str, NDArray[Any]]
+MOST_BYTES = 256_000_000  # of kept states
+
+
+class Stage:
+    """The world of the present scene, to be used as that world. It is made when it is first needed: until then nothing
+    of a simulation runs, so a process may fork. `use` exchanges the scene between episodes.
+
+    Args:
+        make: a new world of a scene.
+    """
+
+    def __init__(self, scene: Scene, make: Callable[[Scene], World] = make_world) -> None:
+        self.scene, self._make = scene, make
+        self._world: World | None = None
+        self._begin: State = {}
+
+    def use(self, scene: Scene) -> None:
+        """From the next `rewind` on. Raises ValueError for a scene whose gels are cut otherwise."""
+        if scene != self.scene:
+            require_same_gels(self.scene, scene)
+            self.scene, self._world = scene, None
+
+    def rewind(self) -> None:
+        """The world as it was made: gels undeformed, nothing touches."""
+        if self._world is None:
+            self.world()
+        else:
+            self._world.restore(self._begin)
+
+    def world(self) -> World:
+        if self._world is None:
+            self._world = self._make(self.scene)
+            self._begin = self._world.snapshot()
+        return self._world
+
+    # ------------------------------------------------------------------ as a World
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        return self.scene.sensors
+
+    def pose(self, name: str) -> Pose:
+        return self.world().pose(name)
+
+    def move(
+        self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
+        *, flow: bool = False,
+    ) -> MoveStats:  # fmt: skip
+        return self.world().move(targets, loads, duration, flow=flow)
+
+    def wrench(self, name: str) -> NDArray[np.float64]:
+        return self.world().wrench(name)
+
+    def surface(self, name: str) -> GelSurface:
+        return self.world().surface(name)
+
+    def truth(self) -> Truth | None:
+        return self.world().truth()
+
+    def snapshot(self) -> State:
+        return self.world().snapshot()
+
+    def restore(self, state: State) -> None:
+        self.world().restore(state)
+
+
+def require_same_gels(scene: Scene, other: Scene) -> None:
+    """Raises ValueError where a rig cannot go from one scene to the other: sensors see one gel, and a batch has one
+    lattice."""
+    kept = {
+        "physics": (scene.physics, other.physics),
+        "gel.size [m]": (scene.gel.size, other.gel.size),
+        "the size of gel elements [m]": (scene.element, other.element),
+        "a body": (scene.body is not None, other.body is not None),
+    }
+    for what, (now, new) in kept.items():
+        if now != new:
+            raise ValueError(f"a new scene must keep {what} of the rig's: {now}, got {new}; open another rig for it")
+
+
+class StatePool:
+    """States that motions from a known start ended in, so that the same motion need not be computed again. A state is a
+    function of its key alone, so results do not depend on what is kept: the states used last, MOST_BYTES of them."""
+
+    def __init__(self, most: int = MOST_BYTES) -> None:
+        self._most, self._bytes = most, 0
+        self._kept: OrderedDict[object, tuple[State, MoveStats | None]] = OrderedDict()
+
+    def find(self, key: object) -> tuple[State, MoveStats | None] | None:
+        """The state and how its last motion went; None for a key that is not kept."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        return self._kept.get(key)
+
+    def keep(self, key: object, state: State, stats: MoveStats | None) -> None:
+        self._kept[key] = state, stats
+        self._bytes += _size(state)
+        while self._bytes > self._most and len(self._kept) > 1:
+            _, (oldest, _) = self._kept.popitem(last=False)
+            self._bytes -= _size(oldest)
+
+
+def _size(state: State) -> int:
+    return sum(a.nbytes for a in state.values())

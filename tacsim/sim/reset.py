@@ -64,7 +64,7 @@ class SimReset:
         """Raises NoTouch when no gentle contact is found."""
         if self._touch_force is None:
             return
-        start = (self._stage.scene.model_dump_json(), self._offset.tobytes(), self._touch_force)
+        start = (self._stage.scene.model_dump_json(), *self._offset.tolist(), self._touch_force)  # numbers: -0.0 is 0.0
         touched = self._pool.find(start)
         if touched is None:
             stats = approach_force(self._stage, self._touch_force)

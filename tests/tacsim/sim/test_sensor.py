@@ -16,7 +16,7 @@ from tacsim.sim.arm import SimArm
 from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import TOUCH_TOLERANCE, SimReset, approach_force
 from tacsim.sim.sensor import SimSensor
-from tacsim.sim.stage import Stage
+from tacsim.sim.stage import Stage, StatePool
 
 
 def shifted(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
@@ -300,3 +300,24 @@ def test_noise_is_another_in_each_sensor_frame_and_episode_and_the_same_again(op
         assert (seen[3][0][name] - still[name]).std() == pytest.approx(2.0, rel=0.1)
     lower, upper = ((seen[3][0][name] - still[name]).ravel() for name in ("lower", "upper"))
     assert abs(np.corrcoef(lower, upper)[0, 1]) < 0.2
+
+
+def test_a_start_that_comes_again_is_not_approached_again(open_springs: Any) -> None:
+    """Whatever the seed, where it makes no difference; a state is kept, so none of the moves is repeated."""
+    rig = open_springs("squeeze")
+    first = rig.reset(0)
+    moved = len(rig.world.moves)
+    for seed in range(1, 9):
+        again = rig.reset(seed)
+        assert again.arms["upper"].pose.position.tobytes() == first.arms["upper"].pose.position.tobytes()
+    assert len(rig.world.moves) == moved
+
+
+def test_a_pool_keeps_the_states_used_last() -> None:
+    state = {"x": np.zeros(100)}  # 800 bytes
+    pool = StatePool(most=2000)
+    for key in ("a", "b"):
+        pool.keep(key, state, None)
+    assert pool.find("a") == (state, None)
+    pool.keep("c", state, None)
+    assert pool.find("b") is None and pool.find("a") is not None and pool.find("c") is not None

@@ -11,6 +11,7 @@ import os
 import threading
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 from tacsim.compute.front_end import quicken
 
@@ -25,7 +26,7 @@ with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the st
 
 quicken(kernel_impl, ASTTransformerContext)
 
-DEVICES = ("cpu", "cuda", "vulkan", "metal")
+DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what a device computes, without one
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.
 DEVICE = os.environ.get("TACSIM_DEVICE") or "cpu"
 
@@ -62,7 +63,7 @@ def _initialise() -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         # Without Taichi's own control-flow optimisation kernels compile in half the time and run as fast.
         ti.init(
-            arch=getattr(ti, DEVICE), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
+            arch=_architecture(DEVICE), default_fp=ti.f32, offline_cache=True, cfg_optimization=False,
             log_level=ti.ERROR, enable_fallback=False,
         )  # fmt: skip
     ti.sync()  # completes the start, which only this thread may do; kernels may then be compiled in any
@@ -89,4 +90,8 @@ def _require_own_process() -> None:
 
 def available(device: str) -> bool:
     """Whether Taichi can start on this one of DEVICES here."""
-    return bool(ti.lang.misc.is_arch_supported(getattr(ti, device)))
+    return bool(ti.lang.misc.is_arch_supported(_architecture(device)))
+
+
+def _architecture(device: str) -> Any:
+    return getattr(ti, device.removesuffix("-as-device"))

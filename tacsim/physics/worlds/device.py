@@ -8,6 +8,8 @@ Arrays stay on the device for a launch. Before it they are copied there (distanc
 changed), after it what has changed is copied back, so everybody else is_active on working with NumPy.
 """
 
+import inspect
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -33,13 +35,23 @@ from tacsim.physics.gel.kernels import (
 )
 from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, gel_contact, grid_update
 
+Clock = ti.types.ndarray(dtype=ti.i32, ndim=1)  # (1,) substeps of this launch that are done
+Sums = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, 3, BLOCKS) of the particles' velocities
+BLOCKS = 256  # of a body's particles, for their sum
+MANY = 20  # substeps in a call: those of most launches
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
 
 
 @ti.func
-def is_active(env: ti.template(), it):
+def is_active(env: ti.template(), clock: ti.template()):
     """Whether an environment takes part in this substep."""
-    return it < env.count(layout.STEPS)
+    return clock[0] < env.count(layout.STEPS)
+
+
+@ti.func
+def tick(clock: ti.template()):
+    for _ in range(1):
+        clock[0] += 1
 
 
 @ti.func
@@ -89,28 +101,29 @@ def column(env: ti.template(), gels: ti.template(), g, block):
 
 @ti.kernel
 def press_substep(
-    it: ti.i32, drive: Drive,
+    clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     slip: Slip, pressure: Pressure, values: Values, params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
     for e, slot in ti.ndrange(counts.shape[0], PARTS):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             clear_sums(env, slot)
     for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, k, n)
     for e, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indent(env, cell, it, drive, gels, ti.static(Indenter(slip, pressure, values)))
+            indent(env, cell, clock[0], drive, gels, ti.static(Indenter(slip, pressure, values)))
     for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             column(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, n)
+    tick(clock)
 
 
 # One kernel may have local arrays in one of its loops only: Taichi 1.7 mixes up the constants of several (IR broken:
@@ -119,7 +132,7 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    it: ti.i32,
+    clock: Clock,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice, masses: Strips,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
@@ -128,14 +141,14 @@ def elements_of_hybrid(
     most_nodes: of the largest grid."""
     for e, slot in ti.ndrange(counts.shape[0], PARTS):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             clear_sums(env, slot)
     for e, g in ti.ndrange(counts.shape[0], 2):
-        if it < counts[e, layout.STEPS]:
+        if clock[0] < counts[e, layout.STEPS]:
             ceiling[e, g] = 0.0
     for e, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
             i, j = n // (gels.ny + 1), n % (gels.ny + 1)
             height = surface[surface_at(gels, surface_row(env, gels, g) + i + 1, j + 1) + 2]
@@ -143,17 +156,17 @@ def elements_of_hybrid(
                 ti.atomic_max(ceiling[e, g], height)
     for e, node in ti.ndrange(counts.shape[0], most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it) and node < grid_nodes(env):
+        if is_active(env, clock) and node < grid_nodes(env):
             masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
     for e, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, k, n)
 
 
 @ti.kernel
 def scatter_of_hybrid(
-    it: ti.i32, drive: Drive,
+    clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
     particles: Floats, masses: Strips, velocities: Strips, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, most_particles: ti.i32, most_nodes: ti.i32,
@@ -164,38 +177,87 @@ def scatter_of_hybrid(
     """
     for e, p in ti.ndrange(counts.shape[0], most_particles):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it) and p < env.count(layout.PARTICLES):
+        if is_active(env, clock) and p < env.count(layout.PARTICLES):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
             body = ti.static(Body(particles, masses, velocities))
             for g in range(2):
-                gel_contact(env, p, g, it, drive, body, histories, gels, ceiling[e, g])
+                gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g])
     for e, p in ti.ndrange(counts.shape[0], most_particles):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it) and p < env.count(layout.PARTICLES):
+        if is_active(env, clock) and p < env.count(layout.PARTICLES):
             particles_to_grid(env, p, ti.static(Body(particles, masses, velocities)))
     for e, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it):
+        if is_active(env, clock):
             column(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, n)
     for e, node in ti.ndrange(counts.shape[0], most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it) and node < grid_nodes(env):
-            grid_update(env, node, it, drive, ti.static(Body(particles, masses, velocities)))
-    for e, slot, d in ti.ndrange(counts.shape[0], PARTS, 3):
-        if it < counts[e, layout.STEPS]:
-            partial[e, slot, layout.VELOCITY_SUM + d] = 0.0
+        if is_active(env, clock) and node < grid_nodes(env):
+            grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities)))
 
 
 @ti.kernel
 def gather_of_hybrid(
-    it: ti.i32, particles: Floats, masses: Strips, velocities: Strips,
-    params: Params, counts: Counts, partial: Partial, most_particles: ti.i32,
+    clock: Clock, particles: Floats, masses: Strips, velocities: Strips,
+    params: Params, counts: Counts, partial: Partial, sums: Sums, most_particles: ti.i32,
 ):  # fmt: skip
-    """Last third: the grid back to the particles."""
+    """Last third: the grid back to the particles, and the sum of their velocities, block by block: an atomic addition a
+    particle would queue for a few addresses, and in another order each time."""
     for e, p in ti.ndrange(counts.shape[0], most_particles):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, it) and p < env.count(layout.PARTICLES):
+        if is_active(env, clock) and p < env.count(layout.PARTICLES):
             grid_to_particles(env, p, ti.static(Body(particles, masses, velocities)))
+    for e, d, block in ti.ndrange(counts.shape[0], 3, BLOCKS):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock):
+            row = (e * layout.PARTICLE_ROWS + layout.VELOCITY + d) * env.count(layout.STRIDE)
+            total = 0.0
+            for n in range((env.count(layout.PARTICLES) - block + BLOCKS - 1) // BLOCKS):
+                total += particles[row + n * BLOCKS + block]  # neighbouring threads read neighbours
+            sums[e, d, block] = total
+    for e, slot, d in ti.ndrange(counts.shape[0], PARTS, 3):
+        if clock[0] < counts[e, layout.STEPS]:
+            total = 0.0
+            for block in range(slot * BLOCKS // PARTS, (slot + 1) * BLOCKS // PARTS):
+                total += sums[e, d, block]
+            partial[e, slot, layout.VELOCITY_SUM + d] = total
+    tick(clock)
+
+
+class Substeps:
+    """Kernels that make one substep, called many times by one call: Python's share of a call is longer than a GPU's."""
+
+    def __init__(self, *kernels: Any) -> None:
+        self._kernels = kernels
+        self._graphs: dict[int, Any] = {}  # by the number of substeps in a call
+
+    def run(self, count: int, arguments: Mapping[str, Any]) -> None:
+        """`count` substeps; arguments: arrays of the device and numbers, by the names of the kernels' parameters."""
+        for each, times in ((MANY, count // MANY), (1, count % MANY)):
+            for _ in range(times):
+                if each not in self._graphs:
+                    self._graphs[each] = self._graph(each)
+                self._graphs[each].run(arguments)
+
+    def _graph(self, count: int) -> Any:
+        builder = ti.graph.GraphBuilder()
+        substep = builder.create_sequential()
+        for kernel in self._kernels:
+            parameters = inspect.signature(kernel).parameters.values()
+            substep.dispatch(kernel, *(_graph_argument(each.name, each.annotation) for each in parameters))
+        for _ in range(count):
+            builder.append(substep)
+        return builder.compile()
+
+
+def _graph_argument(name: str, declared: Any) -> Any:
+    if declared is ti.i32:
+        return ti.graph.Arg(ti.graph.ArgKind.SCALAR, name, ti.i32)
+    return ti.graph.Arg(ti.graph.ArgKind.NDARRAY, name, declared.dtype, declared.ndim)
+
+
+press_substeps = Substeps(press_substep)
+hybrid_substeps = Substeps(elements_of_hybrid, scatter_of_hybrid, gather_of_hybrid)
 
 
 class DeviceArrays:
@@ -231,20 +293,25 @@ class DeviceArrays:
         for name, host in hosts.items():
             host[...] = self._there[name].to_numpy().reshape(host.shape)
 
-    def upload_gels(self, gels: GelState) -> tuple[Any, ...]:
+    def upload_gels(self, gels: GelState) -> dict[str, Any]:
         """What every kernel with gels takes."""
         nodes, surface, contact_force, corners, lattice = gels.arguments()
-        return (
-            self.upload("nodes", nodes, ti.f32), self.upload("surface", surface, ti.f32),
-            self.allocate("contact_force", ti.f32, contact_force.shape),
-            self.allocate("corners", ti.f32, corners.shape), self.upload("lattice", lattice, lanes),
-        )  # fmt: skip
+        return {
+            "nodes": self.upload("nodes", nodes, ti.f32), "surface": self.upload("surface", surface, ti.f32),
+            "contact_force": self.allocate("contact_force", ti.f32, contact_force.shape),
+            "corners": self.allocate("corners", ti.f32, corners.shape),
+            "lattice": self.upload_if_changed("lattice", lattice, lanes, 0), "layers": gels.nodes.shape[4] - 1,
+        }  # fmt: skip
 
-    def upload_numbers(self, params: np.ndarray, counts: np.ndarray, partial: np.ndarray) -> tuple[Any, ...]:
-        return (
-            self.upload("params", params, ti.f32), self.upload("counts", counts, ti.i32),
-            self.upload("partial", partial, ti.f32),
-        )  # fmt: skip
+    def upload_numbers(self, numbers: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
+        """params, counts, partial; and a clock that says 0."""
+        params, counts, partial = numbers
+        clock = self.allocate("clock", ti.i32, (1,))
+        clock.fill(0)
+        return {
+            "params": self.upload("params", params, ti.f32), "counts": self.upload("counts", counts, ti.i32),
+            "partial": self.upload("partial", partial, ti.f32), "clock": clock,
+        }  # fmt: skip
 
 
 @launching()
@@ -254,13 +321,13 @@ def run_press(
 ) -> None:  # fmt: skip
     """One launch; the arrays are those of `PressState`. version: another whenever `values` has changed; numbers:
     params, counts, partial."""
-    arguments = (
-        arrays.upload("drive", drive, ti.f32), *arrays.upload_gels(gels), arrays.upload("slip", slip, vec3),
-        arrays.upload("pressure", pressure, ti.f32), arrays.upload_if_changed("values", values, ti.f32, version),
-        *arrays.upload_numbers(*numbers),
-    )  # fmt: skip
-    for it in range(drive.shape[1]):
-        press_substep(it, *arguments, gels.nodes.shape[4] - 1)
+    arguments = {
+        "drive": arrays.upload("drive", drive, ti.f32), "slip": arrays.upload("slip", slip, vec3),
+        "pressure": arrays.upload("pressure", pressure, ti.f32),
+        "values": arrays.upload_if_changed("values", values, ti.f32, version),
+        **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
+    }  # fmt: skip
+    press_substeps.run(drive.shape[1], arguments)
     arrays.download(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=numbers[2])
 
 
@@ -271,19 +338,16 @@ def run_hybrid(
 ) -> None:  # fmt: skip
     """One launch; the arrays are those of `HybridState`. numbers: params, counts, partial."""
     rows, masses, velocities = body.arguments()
-    drives, gel_arrays = arrays.upload("drive", drive, ti.f32), arrays.upload_gels(gels)
-    bodies = (
-        arrays.upload("rows", rows, ti.f32), arrays.allocate("masses", strip, masses.shape[:-1]),
-        arrays.allocate("velocities", strip, velocities.shape[:-1]),
-    )  # fmt: skip
-    histories = arrays.upload("contact_history", contact_history, ContactHistory)
-    small = arrays.upload_numbers(*numbers)
     counts = numbers[1]
-    ceiling = arrays.allocate("ceiling", ti.f32, (len(counts), 2))
-    layers, most_particles = gels.nodes.shape[4] - 1, max(body.counts)
-    most_nodes = int(counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max())
-    for it in range(drive.shape[1]):
-        elements_of_hybrid(it, *gel_arrays, bodies[1], *small, ceiling, layers, most_nodes)
-        scatter_of_hybrid(it, drives, *gel_arrays, *bodies, histories, *small, ceiling, most_particles, most_nodes)
-        gather_of_hybrid(it, *bodies, *small, most_particles)
-    arrays.download(nodes=gels.arguments()[0], rows=rows, contact_history=contact_history, partial=numbers[2])
+    arguments = {
+        "drive": arrays.upload("drive", drive, ti.f32), "particles": arrays.upload("particles", rows, ti.f32),
+        "masses": arrays.allocate("masses", strip, masses.shape[:-1]),
+        "velocities": arrays.allocate("velocities", strip, velocities.shape[:-1]),
+        "histories": arrays.upload("histories", contact_history, ContactHistory),
+        "ceiling": arrays.allocate("ceiling", ti.f32, (len(counts), 2)),
+        "sums": arrays.allocate("sums", ti.f32, (len(counts), 3, BLOCKS)), "most_particles": max(body.counts),
+        "most_nodes": int(counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max()),
+        **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
+    }  # fmt: skip
+    hybrid_substeps.run(drive.shape[1], arguments)
+    arrays.download(nodes=gels.arguments()[0], particles=rows, histories=contact_history, partial=numbers[2])

@@ -35,23 +35,19 @@ from tacsim.physics.gel.kernels import (
 )
 from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, gel_contact, grid_update
 
-Clock = ti.types.ndarray(dtype=ti.i32, ndim=1)  # (1,) substeps of this launch that are done
+# (2,) number of this substep, for all loops but the last, which counts it on; the same for the last.
+Clock = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Sums = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, 3, BLOCKS) of the particles' velocities
 BLOCKS = 256  # of a body's particles, for their sum
 MANY = 20  # substeps in a call: those of most launches
-Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=2)  # (environments, gels) height of the highest surface node [mm]
+# (environments, gels, 2) height of the highest surface node [mm], at least 0, in even substeps and in odd ones.
+Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=3)
 
 
 @ti.func
 def is_active(env: ti.template(), clock: ti.template()):
     """Whether an environment takes part in this substep."""
     return clock[0] < env.count(layout.STEPS)
-
-
-@ti.func
-def tick(clock: ti.template()):
-    for _ in range(1):
-        clock[0] += 1
 
 
 @ti.func
@@ -106,14 +102,14 @@ def press_substep(
     slip: Slip, pressure: Pressure, values: Values, params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
-    for e, slot in ti.ndrange(counts.shape[0], PARTS):
-        env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock):
-            clear_sums(env, slot)
     for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, k, n)
+            if k == 0 and n < PARTS:
+                clear_sums(env, n)
+        if e + k + n == 0:
+            clock[1] = clock[0]
     for e, cell in ti.ndrange(counts.shape[0], slip.shape[1] * slip.shape[2] // (POINTS * POINTS)):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
@@ -121,9 +117,10 @@ def press_substep(
             indent(env, cell, clock[0], drive, gels, ti.static(Indenter(slip, pressure, values)))
     for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock):
+        if clock[1] < counts[e, layout.STEPS]:
             column(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, n)
-    tick(clock)
+        if e + n == 0:
+            clock[0] += 1
 
 
 # One kernel may have local arrays in one of its loops only: Taichi 1.7 mixes up the constants of several (IR broken:
@@ -132,36 +129,22 @@ def press_substep(
 
 @ti.kernel
 def elements_of_hybrid(
-    clock: Clock,
-    nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice, masses: Strips,
-    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32, most_nodes: ti.i32,
+    clock: Clock, nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
+    params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, layers: ti.i32,
 ):  # fmt: skip
     """First third of a substep of every environment's two gels and body
-    (`tacsim.physics.worlds.hybrid_kernels.substeps`): what is summed starts from zero; elements pull at their corners.
-    most_nodes: of the largest grid."""
-    for e, slot in ti.ndrange(counts.shape[0], PARTS):
-        env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock):
-            clear_sums(env, slot)
-    for e, g in ti.ndrange(counts.shape[0], 2):
-        if clock[0] < counts[e, layout.STEPS]:
-            ceiling[e, g] = 0.0
-    for e, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
-        env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock):
-            gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
-            i, j = n // (gels.ny + 1), n % (gels.ny + 1)
-            height = surface[surface_at(gels, surface_row(env, gels, g) + i + 1, j + 1) + 2]
-            if height > ceiling[e, g]:
-                ti.atomic_max(ceiling[e, g], height)
-    for e, node in ti.ndrange(counts.shape[0], most_nodes):
-        env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock) and node < grid_nodes(env):
-            masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
+    (`tacsim.physics.worlds.hybrid_kernels.substeps`): elements pull at their corners; what is summed starts from
+    zero."""
     for e, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, k, n)
+            if g + k == 0 and n < PARTS:
+                clear_sums(env, n)
+            if k + n == 0:
+                ceiling[e, g, (clock[0] + 1) % 2] = 0.0
+        if e + g + k + n == 0:
+            clock[1] = clock[0]
 
 
 @ti.kernel
@@ -171,7 +154,8 @@ def scatter_of_hybrid(
     particles: Floats, masses: Strips, velocities: Strips, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, most_particles: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
-    """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes.
+    """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes, whose masses are zero
+    again afterwards.
 
     most_particles, most_nodes: of the largest body and grid.
     """
@@ -181,19 +165,24 @@ def scatter_of_hybrid(
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
             body = ti.static(Body(particles, masses, velocities))
             for g in range(2):
-                gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g])
-    for e, p in ti.ndrange(counts.shape[0], most_particles):
-        env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock) and p < env.count(layout.PARTICLES):
-            particles_to_grid(env, p, ti.static(Body(particles, masses, velocities)))
-    for e, g, n in ti.ndrange(counts.shape[0], 2, lattice.shape[0] // 2):
+                gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g, clock[0] % 2])
+            particles_to_grid(env, p, body)
+    columns = lattice.shape[0] // 2
+    for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
-            column(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, n)
-    for e, node in ti.ndrange(counts.shape[0], most_nodes):
-        env = ti.static(Environment(e, params, counts, partial))
-        if is_active(env, clock) and node < grid_nodes(env):
-            grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities)))
+            if n < 2 * columns:
+                gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+                g, at = n // columns, n % columns
+                column(env, gels, g, at)
+                i, j = at // (gels.ny + 1), at % (gels.ny + 1)
+                height = surface[surface_at(gels, surface_row(env, gels, g) + i + 1, j + 1) + 2]
+                if height > ceiling[e, g, (clock[0] + 1) % 2]:
+                    ti.atomic_max(ceiling[e, g, (clock[0] + 1) % 2], height)
+            elif n - 2 * columns < grid_nodes(env):
+                node = n - 2 * columns
+                grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities)))
+                masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
 
 
 @ti.kernel
@@ -216,12 +205,13 @@ def gather_of_hybrid(
                 total += particles[row + n * BLOCKS + block]  # neighbouring threads read neighbours
             sums[e, d, block] = total
     for e, slot, d in ti.ndrange(counts.shape[0], PARTS, 3):
-        if clock[0] < counts[e, layout.STEPS]:
+        if clock[1] < counts[e, layout.STEPS]:
             total = 0.0
             for block in range(slot * BLOCKS // PARTS, (slot + 1) * BLOCKS // PARTS):
                 total += sums[e, d, block]
             partial[e, slot, layout.VELOCITY_SUM + d] = total
-    tick(clock)
+        if e + slot + d == 0:
+            clock[0] += 1
 
 
 class Substeps:
@@ -306,7 +296,7 @@ class DeviceArrays:
     def upload_numbers(self, numbers: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
         """params, counts, partial; and a clock that says 0."""
         params, counts, partial = numbers
-        clock = self.allocate("clock", ti.i32, (1,))
+        clock = self.allocate("clock", ti.i32, (2,))
         clock.fill(0)
         return {
             "params": self.upload("params", params, ti.f32), "counts": self.upload("counts", counts, ti.i32),
@@ -339,12 +329,15 @@ def run_hybrid(
     """One launch; the arrays are those of `HybridState`. numbers: params, counts, partial."""
     rows, masses, velocities = body.arguments()
     counts = numbers[1]
+    highest = np.maximum(gels.surface[:, :, 0, :, :, 2].max(axis=(2, 3)), 0.0)  # surfaces before the first substep
+    grid = arrays.allocate("masses", strip, masses.shape[:-1])
+    grid.fill(0)  # also where particles that left the grid have been added
     arguments = {
         "drive": arrays.upload("drive", drive, ti.f32), "particles": arrays.upload("particles", rows, ti.f32),
-        "masses": arrays.allocate("masses", strip, masses.shape[:-1]),
+        "masses": grid,
         "velocities": arrays.allocate("velocities", strip, velocities.shape[:-1]),
         "histories": arrays.upload("histories", contact_history, ContactHistory),
-        "ceiling": arrays.allocate("ceiling", ti.f32, (len(counts), 2)),
+        "ceiling": arrays.upload("ceiling", np.stack([highest, 0.0 * highest], axis=-1), ti.f32),
         "sums": arrays.allocate("sums", ti.f32, (len(counts), 3, BLOCKS)), "most_particles": max(body.counts),
         "most_nodes": int(counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max()),
         **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),

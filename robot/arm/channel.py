@@ -69,7 +69,8 @@ _TEXTS = {
     ArmStatus.FORCE_LIMIT: "felt more than limits.force or limits.torque and stopped; look why, then recover()",
     ArmStatus.WORKSPACE_LIMIT: "is outside its workspace and stopped; bring it back with the pendant, then recover()",
     ArmStatus.KEEP_OUT: "came too near to the other arm and stopped; look why, then recover()",
-    ArmStatus.PARTNER_STOPPED: "stopped because the other arm did; recover() that one, then this",
+    ArmStatus.PARTNER_STOPPED: "stopped because the other arm did, or was not heard of in time; recover() that "
+    "one, then this",
     ArmStatus.GEL_LIMIT: "pressed or dragged its gel farther than limits.depth or limits.shear and stopped; move it "
     "away, then recover()",
     ArmStatus.OFF_WAY: "left its way to the start and stopped; look why, then begin anew",

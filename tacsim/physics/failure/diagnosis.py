@@ -22,11 +22,12 @@ Quantity = Literal["corner", "element length", "node speed", "particle speed", "
 def not_finite(state: State) -> str | None:
     """The first entry that is not finite, in words, and how many of its array are not; None when all are finite."""
     for name, a in state.items():
+        if np.isfinite(a).all():
+            continue
         bad = np.argwhere(~np.isfinite(a))
-        if len(bad):
-            index = tuple(map(int, bad[0]))
-            more = f", with {len(bad) - 1} more of {a.size}" if len(bad) > 1 else ""
-            return f"{name}{list(index)} is {a[index]}{more}"
+        index = tuple(map(int, bad[0]))
+        more = f", with {len(bad) - 1} more of {a.size}" if len(bad) > 1 else ""
+        return f"{name}{list(index)} is {a[index]}{more}"
     return None
 
 
@@ -34,14 +35,27 @@ def particle_volumes(state: State) -> Floats | None:
     """(n,) elastic volume ratio of the particles: sqrt(det b_e), or det F; NaN where b_e is not positive."""
     with np.errstate(all="ignore"):
         if "strain" in state:
-            xx, yy, zz, xy, xz, yz = state["strain"].T.astype(np.float64)
-            xx, yy, zz = xx + 1, yy + 1, zz + 1
-            det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-            root: Floats = np.sqrt(det)
+            root: Floats = np.sqrt(_squared_volumes(state["strain"].T.astype(np.float64)))
             return root
         if "deformation_gradient" in state:
             return _determinant(*np.moveaxis(state["deformation_gradient"].astype(np.float64), 0, -1))
     return None
+
+
+def clearly_uncrushed(state: State, limit: float) -> bool:
+    """Whether all elastic volume ratios are above twice `limit` in single precision, which takes a quarter of the time
+    of `particle_volumes`. False where strains are not known."""
+    return "strain" in state and bool(_squared_volumes(state["strain"].T).min() > (2.0 * limit) ** 2)
+
+
+def _squared_volumes(strain: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """(n,) det b_e of b_e - I (6, n)."""
+    xx, yy, zz, xy, xz, yz = strain
+    xx, yy, zz = xx + 1, yy + 1, zz + 1
+    det: NDArray[np.floating[Any]] = (
+        xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    )  # fmt: skip
+    return det
 
 
 def element_volumes(state: State, thickness: float) -> Floats | None:

@@ -130,6 +130,8 @@ def _fault(arrays: State, health: Health) -> tuple[str, diagnosis.Quantity] | No
     node = float(np.abs(arrays["gel_velocity"]).max()) if "gel_velocity" in arrays else 0.0
     if node > FASTEST:
         return f"a gel node moves at {node:.3g} of the wave speed (limit {FASTEST})", "node speed"
+    if diagnosis.clearly_uncrushed(arrays, SMALLEST_VOLUME_RATIO):
+        return None
     volumes = diagnosis.particle_volumes(arrays)
     if volumes is not None and not volumes.min() > SMALLEST_VOLUME_RATIO:
         return f"a particle is crushed (elastic volume ratio {volumes.min():.3g})", "particle volume"

@@ -20,7 +20,7 @@ from tacsim.physics.move import MoveStats
 from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM
 
-SUBSTEPS_PER_LAUNCH = 20  # while frames are driven
+SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
 FORCE_FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,17 +75,17 @@ class Path:
         Rows: the rotation matrix, position [mm], velocity, angular velocity; all in world.
         """
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
-        out = np.empty((len(knots) - 1, len(self.start), 6, 3))
+        out = np.zeros((len(knots) - 1, len(self.start), 6, 3))
         for index, a in enumerate(self.start):
             moved = self._displacements(index, knots)
-            turned, spin = Rotation.from_quat(a.quaternion), np.zeros(3)
             if moved[:, 3:].any():
-                turned = Rotation.from_rotvec(moved[:, 3:]) * turned
-                turned, spin = turned[1:], (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
-            out[:, index, :3] = turned.as_matrix()
+                turned = Rotation.from_rotvec(moved[:, 3:]) * Rotation.from_quat(a.quaternion)
+                out[:, index, :3] = turned[1:].as_matrix()
+                out[:, index, 5] = (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
+            else:
+                out[:, index, :3] = _matrix(*a.quaternion.tolist())
             out[:, index, 3] = a.position * MM + moved[1:, :3]
             out[:, index, 4] = np.diff(moved[:, :3], axis=0) / self.step
-            out[:, index, 5] = spin
         return np.ascontiguousarray(out, np.float32)
 
     def _displacements(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,6 +109,13 @@ class Path:
                 quaternion = (Rotation.from_rotvec(moved[3:]) * Rotation.from_quat(quaternion)).as_quat()
             poses[name] = Pose(a.position + moved[:3] / MM, quaternion)
         return LaunchSpan(words if self.substeps else "in the hold after the motion", poses)
+
+
+@lru_cache(maxsize=64)
+def _matrix(*quaternion: float) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) of a frame that does not turn: most never do."""
+    matrix: NDArray[np.float64] = Rotation.from_quat(quaternion).as_matrix()
+    return matrix
 
 
 def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:

@@ -269,14 +269,9 @@ class HybridWorld(FemWorld):
         arms = x.T - centre[:, None]
         second = arms @ arms.T * float(params[BODY_MASS])
         inertia = np.trace(second) * np.eye(3) - second
-        inverse = np.linalg.pinv(inertia, rcond=1e-6, hermitian=True)  # particles on a line have none about it
+        inverse = _pseudo_inverse(inertia)
         params[CENTRE : CENTRE + 3] = centre
-        params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = [
-            *np.diagonal(inverse),
-            inverse[0, 1],
-            inverse[0, 2],
-            inverse[1, 2],
-        ]
+        params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
@@ -312,3 +307,12 @@ class HybridWorld(FemWorld):
                 good=prepared.before, failed=self.arrays(),
             )  # fmt: skip
         return found
+
+
+def _pseudo_inverse(inertia: np.ndarray) -> np.ndarray:
+    """Of a moment of inertia (3, 3). Particles on a line have none about it, and do not turn about it."""
+    moments, axes = np.linalg.eigh(inertia)
+    moments, axes = moments[::-1], np.ascontiguousarray(axes[:, ::-1])
+    inverse = np.divide(1.0, moments, out=np.zeros(3), where=moments > 1e-6 * moments[0])
+    turns: np.ndarray = axes @ (inverse[:, None] * axes.T)
+    return turns

@@ -14,16 +14,15 @@ from typing import Any
 def quicken(kernel_impl: Any, context: Any) -> None:
     """Puts quicker functions in the place of Taichi's own; to be called before any of our kernels is defined.
 
-    kernel_impl: module taichi.lang.kernel_impl; context: class ASTTransformerContext. Raises AttributeError for a
-    Taichi in which they are not: another version, for which this has not been measured.
+    kernel_impl: module taichi.lang.kernel_impl; context: class ASTTransformerContext. What another version of Taichi
+    does not have stays as it is: slower, not broken.
     """
-    for home, name, quicker in (
-        (kernel_impl, "_inside_class", _inside_class),
-        (kernel_impl, "getsourcelines", lru_cache(maxsize=None)(kernel_impl.getsourcelines)),
-        (context, "get_pos_info", _place),
-    ):
-        getattr(home, name)
-        setattr(home, name, quicker)
+    if hasattr(kernel_impl, "_inside_class"):
+        kernel_impl._inside_class = _inside_class
+    if hasattr(kernel_impl, "getsourcelines"):
+        kernel_impl.getsourcelines = lru_cache(maxsize=None)(kernel_impl.getsourcelines)
+    if hasattr(context, "get_pos_info"):
+        context.get_pos_info = _place
 
 
 def _place(context: Any, node: Any) -> str:

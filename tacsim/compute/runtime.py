@@ -21,10 +21,12 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
     warnings.simplefilter("ignore")
     import taichi as ti
+
+with contextlib.suppress(ImportError):  # private parts of Taichi, which another version may not have
     from taichi.lang import kernel_impl
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-quicken(kernel_impl, ASTTransformerContext)
+    quicken(kernel_impl, ASTTransformerContext)
 
 DEVICES = ("cpu", "cuda", "vulkan", "metal", "cpu-as-device")  # the last: what a device computes, without one
 # Where worlds are computed, by TACSIM_DEVICE. Read once: kernels are written for it when their modules are imported.

@@ -6,8 +6,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from tacsim.compute.front_end import quicken
 
 KERNELS = """
 import sys
@@ -76,3 +79,9 @@ def test_a_mistake_in_a_kernel_is_told_with_its_place(tmp_path: Path) -> None:
     line = KERNELS.splitlines().index("    a[0] = nowhere") + 1
     assert f'kernels.py", line {line}, in wrong:' in printed
     assert "    a[0] = nowhere\n" in printed and '"nowhere" is not defined' in printed
+
+
+def test_another_taichi_stays_as_it_is() -> None:
+    module, context = SimpleNamespace(renamed=1), SimpleNamespace()
+    quicken(module, context)
+    assert vars(module) == {"renamed": 1} and vars(context) == {}

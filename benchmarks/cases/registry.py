@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from benchmarks.cases import incline, large_strain, materials, presets, press, scenes, squeeze
+from benchmarks.cases import environments, incline, large_strain, materials, presets, press, scenes, squeeze
 from benchmarks.cases.real import (
     ball_touch,
     balls,
@@ -32,6 +32,7 @@ CASES: tuple[Case, ...] = (
     *incline.CASES,
     *materials.CASES,
     *scenes.CASES,
+    *environments.CASES,
 )
 
 CPU_ONLY = "it runs on the CPU only"

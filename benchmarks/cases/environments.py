@@ -1,0 +1,148 @@
+"""Environments to learn in: steps a second with random actions, what a reset costs, and what a policy found in coarse
+physics loses in fine."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cases.squeeze import PRESETS
+from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.runner import Case
+from tacsim import pose as se3
+from tacsim.interface import Action, Pose
+from tacsim.models.rig import SqueezeConfig
+from tacsim.rig import Rig
+from tacsim.tasks import Squeeze
+
+NUMBER = 16  # environments of a batch
+STEPS = 10  # of all, that are timed together
+ROUNDS = 10  # resets of each environment
+PICTURES = tuple(
+    f"sensors.{name}.model.geometry.{what}"
+    for name in ("lower", "upper")
+    for what in ("width=160", "height=120", "pixel_pitch=0.125 mm")
+)
+BODIES = tuple(
+    (f"scene.body.material.yield_stress={20 + 2 * k} kPa", f"scene.body.geometry.size=[{9 + 0.1 * k} mm, 9 mm, 10 mm]",
+     f"task.goal={7 + 0.1 * k} mm")
+    for k in range(8)
+)  # fmt: skip
+GOAL = 7e-3  # height of the body [m]
+CLOSING = 0.2e-3  # of each sensor in a control step [m]
+
+
+def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
+    """Sixteen squeezes in one batch under random actions, with two pictures of 160 x 120; then their resets, each with
+    a material, a size and a goal that are drawn from eight."""
+    import gymnasium
+
+    import tacsim.gym.env  # noqa: F401  registers
+
+    options: dict[str, Any] = {
+        "overrides": [f"scene.preset={preset}", f"motion={motion}", "task.steps=1000", *PICTURES]
+    }
+    options["variants"] = list(BODIES)
+    many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options)
+    alone = gymnasium.make("tacsim/Squeeze-v0", **options).unwrapped
+    rng = np.random.default_rng(0)
+
+    def steps(count: int = STEPS) -> None:
+        for _ in range(count):
+            many.step(rng.uniform(-1.0, 1.0, (NUMBER, 2)).astype(np.float32))
+
+    began = time.perf_counter()
+    many.reset(seed=1)
+    first = time.perf_counter() - began
+    alone.reset(seed=1)
+    difference = 0.0
+    for _ in range(3):
+        actions = rng.uniform(-1.0, 1.0, (NUMBER, 2)).astype(np.float32)
+        felt, felt_alone = (flats["wrench_upper"] for flats in (many.step(actions)[0], alone.step(actions[0])[0]))
+        difference = max(difference, float(np.abs(felt[0] - felt_alone).max()))
+    timing, _ = timed(steps, repeat)
+    share = timing.median / STEPS / NUMBER  # of one environment in a step
+    resets, _ = timed(lambda: [many.reset() for _ in range(ROUNDS - 1)], repeat, warm=lambda: None)
+    many.close()
+    kept = resets.median / (ROUNDS - 1) / NUMBER
+    mean = (first / NUMBER + (ROUNDS - 1) * kept) / ROUNDS
+    of_step = Timing(tuple(each / STEPS for each in timing.samples), timing.processor / STEPS)
+    words = f"{NUMBER} environments, {motion}"
+    return [
+        Measurement(
+            of_step, difference, "N difference", "the first of them alone", f"{words}: a step of all",
+            figures={"env_steps_per_s": 1 / share, "cpu_ms_per_env_step": of_step.processor / NUMBER * 1e3},
+        ),
+        Measurement(
+            Timing((mean,), resets.processor / (ROUNDS - 1) / NUMBER), mean / share, "control steps",
+            "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds, the first included",
+            figures={"kept_ms": kept * 1e3, "first_ms": first / NUMBER * 1e3},
+        ),
+    ]  # fmt: skip
+
+
+def transfer(preset: str, repeat: int) -> list[Measurement]:
+    """What a policy found at `learn` loses elsewhere: squeezing to 7 mm by a closing distance that was right at learn,
+    and by touch (the scripted policy), which looks at heights."""
+    with _open(preset) as rig, _open("learn") as coarse:
+        found = 0.0
+        low, high = 3e-3, 5e-3  # closed, both sensors together, that leave the body too high and too low [m]
+        for _ in range(8):
+            found = (low + high) / 2
+            low, high = (found, high) if _closed(coarse, found)[1] > GOAL else (low, found)
+        rows = []
+        for what, closing in (("a closing distance found at learn", found), ("by touch, as shipped", None)):
+            _, at_learn = _closed(coarse, closing)
+            seconds, height = _closed(rig, closing)
+            figures = {"reward": -abs(height - GOAL) * 1e3, "reward_at_learn": -abs(at_learn - GOAL) * 1e3}
+            error = abs(height - GOAL) * 1e3
+            rows.append(
+                Measurement(Timing((seconds,), seconds), error, "mm from the goal", "7 mm", what, figures=figures)
+            )
+    return rows
+
+
+def _open(preset: str) -> Rig:
+    from robot.open import open_rig
+
+    return open_rig("sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *PICTURES])
+
+
+def _closed(rig: Rig, closing: float | None) -> tuple[float, float]:
+    """Seconds that an episode takes, and the body's height at its end [m]: closed by `closing`, or by touch."""
+    policy = Squeeze(SqueezeConfig(kind="squeeze", goal=GOAL)).scripted()
+    observation = rig.reset(0)
+    began, gone = time.perf_counter(), 0.0
+    start = {name: arm.pose for name, arm in observation.arms.items()}
+    while True:
+        if closing is None:
+            action = policy(observation)
+        else:
+            gone = min(gone + CLOSING, closing / 2)
+            action = Action({name: se3.along_z(pose, gone) for name, pose in start.items()})
+        before = observation
+        observation, _ = rig.step(action)
+        if all(_same(before.arms[name].pose, arm.pose) for name, arm in observation.arms.items()):
+            break
+    truth = rig.truth()
+    assert truth is not None
+    return time.perf_counter() - began, truth.height
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    return bool(np.array_equal(a.position, b.position))
+
+
+CASES = (
+    *(
+        Case("scenes", "random_actions", "tacsim", f"16 x {PRESETS[preset]}", partial(random_actions, preset, motion))
+        for preset, motion in (("learn", "flowing"), ("learn", "settled"), ("draft", "flowing"), ("draft", "settled"))
+    ),
+    *(
+        Case("scenes", "transfer", "tacsim", PRESETS[preset], partial(transfer, preset), long=preset == "standard")
+        for preset in ("learn", "draft", "standard")
+    ),
+)

@@ -4,8 +4,8 @@ Threads of a device cannot meet inside a loop, so each phase of a substep is a l
 substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only
 the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
 
-Arrays stay on the device for a launch. Before it they are copied there (distances from meshes only once they have
-changed), after it what has changed is copied back, so everybody else is_active on working with NumPy.
+Arrays stay on the device. What has changed is brought back after a launch, so everybody else works on with NumPy,
+and before the next one only what differs from it is sent there (distances from meshes once they have another version).
 """
 
 import inspect
@@ -255,20 +255,26 @@ class DeviceArrays:
 
     def __init__(self) -> None:
         self._there: dict[str, Any] = {}
+        self._known: dict[str, np.ndarray] = {}  # what these hold, where that has been sent or brought back last
         self._versions: dict[str, int] = {}
 
     def allocate(self, name: str, dtype: Any, shape: tuple[int, ...]) -> Any:
         """An array that only the device uses; zeros at first."""
-        known = self._there.get(name)
-        if known is None or known.shape != shape:
-            self._there[name] = known = ti.ndarray(dtype, shape)
-            known.fill(0)
-        return known
+        there = self._there.get(name)
+        if there is None or there.shape != shape:
+            self._there[name] = there = ti.ndarray(dtype, shape)
+            there.fill(0)
+            self._known.pop(name, None)
+        return there
 
     def upload(self, name: str, host: np.ndarray, dtype: Any) -> Any:
-        """A copy of `host`, whose last axis is the vector if dtype is one."""
+        """A copy of `host`, whose last axis is the vector if dtype is one. Sent only where a bit of it differs from
+        what the device holds: anybody may write to it between launches, few do, and to compare takes a twentieth."""
         there = self.allocate(name, dtype, host.shape[:-1] if isinstance(dtype, type(vec4)) else host.shape)
-        there.from_numpy(np.ascontiguousarray(host))
+        known = self._known.get(name)
+        if known is None or not np.array_equal(known.view(np.int32), host.view(np.int32)):  # as bits: NaN equals NaN
+            self._known[name] = host.copy()
+            there.from_numpy(self._known[name])
         return there
 
     def upload_if_changed(self, name: str, host: np.ndarray, dtype: Any, version: int) -> Any:
@@ -281,7 +287,13 @@ class DeviceArrays:
     def download(self, **hosts: np.ndarray) -> None:
         """Copies back into these arrays what the device has by their names."""
         for name, host in hosts.items():
-            host[...] = self._there[name].to_numpy().reshape(host.shape)
+            self._known[name] = self._there[name].to_numpy().reshape(host.shape)
+            host[...] = self._known[name]
+
+    def forget(self, *names: str) -> None:
+        """Of arrays that kernels have changed and nobody brings back: they are sent again in any case."""
+        for name in names:
+            self._known.pop(name, None)
 
     def upload_gels(self, gels: GelState) -> dict[str, Any]:
         """What every kernel with gels takes."""
@@ -290,7 +302,7 @@ class DeviceArrays:
             "nodes": self.upload("nodes", nodes, ti.f32), "surface": self.upload("surface", surface, ti.f32),
             "contact_force": self.allocate("contact_force", ti.f32, contact_force.shape),
             "corners": self.allocate("corners", ti.f32, corners.shape),
-            "lattice": self.upload_if_changed("lattice", lattice, lanes, 0), "layers": gels.nodes.shape[4] - 1,
+            "lattice": self.upload("lattice", lattice, lanes), "layers": gels.nodes.shape[4] - 1,
         }  # fmt: skip
 
     def upload_numbers(self, numbers: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
@@ -318,6 +330,7 @@ def run_press(
         **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
     }  # fmt: skip
     press_substeps.run(drive.shape[1], arguments)
+    arrays.forget("surface")
     arrays.download(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=numbers[2])
 
 
@@ -343,4 +356,5 @@ def run_hybrid(
         **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
     }  # fmt: skip
     hybrid_substeps.run(drive.shape[1], arguments)
+    arrays.forget("surface", "ceiling")
     arrays.download(nodes=gels.arguments()[0], particles=rows, histories=contact_history, partial=numbers[2])

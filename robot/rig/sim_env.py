@@ -30,6 +30,9 @@ def open_vector_env(
     config, variants = configs[0], _variants(configs)
     if number < 1:
         raise ValueError(f"a vector environment needs at least one environment, got {number}")
+    modes = [mode.value for mode in AutoresetMode]
+    if autoreset_mode not in (*AutoresetMode, *modes):
+        raise ValueError(f"autoreset_mode must be one of {', '.join(modes)}, got {autoreset_mode!r}")
     if config.scene is None or config.scene.physics == "seed":
         raise CannotOpen(
             f"rig '{config.name}': physics 'seed' does not run in a batch; use physics 'hybrid', or "

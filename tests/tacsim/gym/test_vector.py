@@ -187,6 +187,10 @@ def test_what_it_declares(mode: str) -> None:
 def test_what_cannot_be_a_batch_says_so() -> None:
     with pytest.raises(ValueError, match="physics 'seed' does not run in a batch"):
         make_native(2, overrides=["scene.physics=seed"], variants=())
+    with pytest.raises(ValueError, match="rig 'mock' is not simulated"):
+        make_native(2, rig="mock", overrides=(), variants=())
+    with pytest.raises(ValueError, match="one of NextStep, SameStep, Disabled, got 'Sometimes'"):
+        make_native(2, "Sometimes")
     with pytest.raises(ValueError, match="at least one"):
         make_native(0)
     with pytest.raises(ValueError, match=r"variant 0: a new scene must keep gel\.size"):

@@ -291,7 +291,7 @@ class DeviceArrays:
             host[...] = self._known[name]
 
     def forget(self, *names: str) -> None:
-        """Of arrays that kernels have changed and nobody brings back: they are sent again in any case."""
+        """Of arrays that kernels will change: unless brought back, also by an interruption, they are sent again."""
         for name in names:
             self._known.pop(name, None)
 
@@ -329,8 +329,8 @@ def run_press(
         "values": arrays.upload_if_changed("values", values, ti.f32, version),
         **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
     }  # fmt: skip
+    arrays.forget("nodes", "surface", "slip", "pressure", "partial")
     press_substeps.run(drive.shape[1], arguments)
-    arrays.forget("surface")
     arrays.download(nodes=gels.arguments()[0], slip=slip, pressure=pressure, partial=numbers[2])
 
 
@@ -355,6 +355,6 @@ def run_hybrid(
         "most_nodes": int(counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max()),
         **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
     }  # fmt: skip
+    arrays.forget("nodes", "surface", "particles", "histories", "ceiling", "partial")
     hybrid_substeps.run(drive.shape[1], arguments)
-    arrays.forget("surface", "ceiling")
     arrays.download(nodes=gels.arguments()[0], particles=rows, histories=contact_history, partial=numbers[2])

@@ -6,6 +6,7 @@ without a GPU. Runs as a program for one device: `test_device.py OUT.npz`.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from tacsim.physics.motion.controller import Launch
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
 from tacsim.physics.worlds.batch import Batch
+from tacsim.physics.worlds.device import DeviceArrays
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
 
@@ -79,6 +81,15 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
 
     pressed = PressWorld(press(Sphere(radius=3e-3)))
     note("press", outcome(pressed, pressed.move(closer(pressed, 0.35e-3, 0.1e-3))))
+    interrupted = PressWorld(press(Sphere(radius=3e-3)))
+    interrupted.move(closer(interrupted, 0.05e-3))
+    here = interrupted.snapshot()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DeviceArrays, "download", lambda self, **hosts: (_ for _ in ()).throw(KeyboardInterrupt))
+        with contextlib.suppress(KeyboardInterrupt):
+            interrupted.move(closer(interrupted, 0.1e-3))  # on a device its launch ends, and is never brought back
+    interrupted.restore(here)
+    note("interrupted", outcome(interrupted, interrupted.move(closer(interrupted, 0.2e-3))))
     meshed = PressWorld(press(egg(folder)))
     meshed.move(closer(meshed, 0.3e-3))
     tiles = meshed._state.counts[0, SHAPE_FIRST]
@@ -152,7 +163,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict
 def test_both_go_the_same_way(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     cpu, there = pair
     assert cpu.keys() == there.keys()
-    for name in ("press", "mesh", "one", "other"):
+    for name in ("press", "interrupted", "mesh", "one", "other"):
         assert there[f"{name}.stats"] == pytest.approx(cpu[f"{name}.stats"], abs=1e-7)
         assert cpu[f"{name}.stats"][2] == 1, "not settled: compares nothing"
         largest = np.abs(cpu[f"{name}.wrench"][:, :3]).max()

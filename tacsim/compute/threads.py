@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
@@ -31,18 +32,42 @@ def map_serial(calls: Sequence[Callable[[], Result]]) -> list[Result]:
 
 
 def map_parallel(calls: Sequence[Callable[[], Result]]) -> list[Result]:
-    """What the calls return, each called on a thread of its own as far as there are some: for long calculations that
+    """What the calls return, as many at once as there are threads, this one among them: for long calculations that
     release the interpreter's lock. None of them may call this itself: it could wait for its own thread for ever. When
-    one fails the others are waited for, then the first failure, in their order, is raised."""
-    if len(calls) < 2 or threads() < 2:
+    some fail, all are done before the first failure, in their order, is raised; an interruption leaves out what has
+    not begun."""
+    count = min(threads(), len(calls))
+    if count < 2:
         return map_serial(calls)
+    waiting = deque(range(len(calls)))  # threads take the next one from it
+    found: dict[int, Result] = {}
+    failures: dict[int, Exception] = {}
+
+    def work() -> None:
+        while True:
+            try:
+                index = waiting.popleft()
+            except IndexError:
+                return
+            try:
+                found[index] = calls[index]()
+            except Exception as failure:
+                failures[index] = failure
+            except BaseException:
+                waiting.clear()
+                raise
+
     pool = _pool(os.getpid())
-    others = [pool.submit(call) for call in calls[1:]]
+    others = [pool.submit(work) for _ in range(count - 1)]
     try:
-        first = calls[0]()
+        work()
     finally:
         wait(others)
-    return [first, *(other.result() for other in others)]
+    for other in others:
+        other.result()  # raises an interruption of its thread
+    if failures:
+        raise failures[min(failures)]
+    return [found[index] for index in range(len(calls))]
 
 
 @lru_cache(maxsize=1)

@@ -40,6 +40,23 @@ def test_as_many_run_at_once_as_may(allowed: int) -> None:
     map_parallel([together.wait] * allowed)  # a barrier is passed by all of them or by none
 
 
+def test_as_many_run_at_once_as_may_to_the_last_of_many(allowed: int) -> None:
+    """Also the calling thread goes on to a next one."""
+    together = threading.Barrier(allowed, timeout=2.0)
+    map_parallel([together.wait] * (3 * allowed))
+
+
+def test_an_interruption_ends_what_has_not_begun(allowed: int) -> None:
+    done = []
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        map_parallel([interrupt, *[partial(lambda: done.append(time.sleep(0.02)))] * 40])
+    assert len(done) < 20
+
+
 def test_the_first_failure_is_raised_when_all_are_done(allowed: int) -> None:
     done = []
 

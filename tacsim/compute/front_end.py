@@ -6,9 +6,24 @@ function had the file of its caller looked for among all modules, and its own te
 Nothing here changes what is compiled: cached kernels are found as before (tests/tacsim/compute/test_front_end.py).
 """
 
+import inspect
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
+
+
+@contextmanager
+def without_module_search() -> Iterator[None]:
+    """For the import of Taichi: where each of its own functions is decorated, it has the caller's module looked for
+    among all that are loaded, and finds the caller's file without it."""
+    search = inspect.getmodule
+    inspect.getmodule = lambda *_: None
+    try:
+        yield
+    finally:
+        inspect.getmodule = search
 
 
 def quicken(kernel_impl: Any, context: Any) -> None:

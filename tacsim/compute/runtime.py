@@ -13,12 +13,15 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
-from tacsim.compute.front_end import quicken
+from tacsim.compute.front_end import quicken, without_module_search
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
-with warnings.catch_warnings():  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
+with (
+    warnings.catch_warnings(),
+    without_module_search(),
+):  # Taichi 1.7 imports deprecated parts of the standard library and of NumPy
     warnings.simplefilter("ignore")
     import taichi as ti
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tacsim.compute.relaunch import launch
 from tacsim.compute.runtime import launching, ti
 from tacsim.compute.threads import threads
 from tacsim.physics.exec.lanes import PARTS
@@ -83,4 +84,4 @@ def run_team(kernel: Any, drive: np.ndarray, *arguments: Any, active: Sequence[i
     flat = [a for group in arguments for a in (group if isinstance(group, tuple) else (group,))]
     sync = np.zeros((len(active), 16), np.int32)
     sync[:, ENVIRONMENT] = active
-    kernel(team_size(len(active)), drive, *flat, sync)
+    launch(kernel, team_size(len(active)), drive, *flat, sync)

@@ -21,11 +21,15 @@ from tacsim.tasks import Squeeze
 NUMBER = 16  # environments of a batch
 STEPS = 10  # of all, that are timed together
 ROUNDS = 10  # resets of each environment
-PICTURES = tuple(
-    f"sensors.{name}.model.geometry.{what}"
-    for name in ("lower", "upper")
-    for what in ("width=160", "height=120", "pixel_pitch=0.125 mm")
-)
+SMALLEST = ("width=16", "height=16", "pixel_pitch=1 mm")  # pictures for who does not look at them
+SMALL = ("width=160", "height=120", "pixel_pitch=0.125 mm")
+
+
+def pictures(size: tuple[str, ...]) -> list[str]:
+    """Overrides: of both sensors."""
+    return [f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in size]
+
+
 BODIES = tuple(
     (f"scene.body.material.yield_stress={20 + 2 * k} kPa", f"scene.body.geometry.size=[{9 + 0.1 * k} mm, 9 mm, 10 mm]",
      f"task.goal={7 + 0.1 * k} mm")
@@ -36,16 +40,23 @@ CLOSING = 0.2e-3  # of each sensor in a control step [m]
 
 
 def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
-    """Sixteen squeezes in one batch under random actions, with two pictures of 160 x 120; then their resets, each with
-    a material, a size and a goal that are drawn from eight."""
+    """Sixteen squeezes in one batch under random actions: heights and forces, and with two pictures of 160 x 120; then
+    their resets, each with a material, a size and a goal that are drawn from eight."""
+    look = "two pictures of 160 x 120"
+    return [
+        _random_actions(preset, [f"motion={motion}", *pictures(SMALLEST)], f"{motion}, heights and forces", repeat)[0],
+        *_random_actions(preset, [f"motion={motion}", *pictures(SMALL)], f"{motion}, {look}", repeat),
+    ]
+
+
+def _random_actions(preset: str, more: list[str], words: str, repeat: int) -> list[Measurement]:
+    """Rows of a step and of a reset."""
     import gymnasium
 
     import tacsim.gym.env  # noqa: F401  registers
 
-    options: dict[str, Any] = {
-        "overrides": [f"scene.preset={preset}", f"motion={motion}", "task.steps=1000", *PICTURES]
-    }
-    options["variants"] = list(BODIES)
+    overrides = [f"scene.preset={preset}", "task.steps=1000", *more]
+    options: dict[str, Any] = {"overrides": overrides, "variants": list(BODIES)}
     many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options)
     alone = gymnasium.make("tacsim/Squeeze-v0", **options).unwrapped
     rng = np.random.default_rng(0)
@@ -70,15 +81,14 @@ def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     kept = resets.median / (ROUNDS - 1) / NUMBER
     mean = (first / NUMBER + (ROUNDS - 1) * kept) / ROUNDS
     of_step = Timing(tuple(each / STEPS for each in timing.samples), timing.processor / STEPS)
-    words = f"{NUMBER} environments, {motion}"
     return [
         Measurement(
-            of_step, difference, "N difference", "the first of them alone", f"{words}: a step of all",
+            of_step, difference, "N difference", "the first of them alone", f"{words}: a step of {NUMBER}",
             figures={"env_steps_per_s": 1 / share, "cpu_ms_per_env_step": of_step.processor / NUMBER * 1e3},
         ),
         Measurement(
             Timing((mean,), resets.processor / (ROUNDS - 1) / NUMBER), mean / share, "control steps",
-            "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds, the first included",
+            "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds with the first",
             figures={"kept_ms": kept * 1e3, "first_ms": first / NUMBER * 1e3},
         ),
     ]  # fmt: skip
@@ -108,7 +118,9 @@ def transfer(preset: str, repeat: int) -> list[Measurement]:
 def _open(preset: str) -> Rig:
     from robot.open import open_rig
 
-    return open_rig("sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *PICTURES])
+    return open_rig(
+        "sim", task="squeeze", overrides=[f"scene.preset={preset}", f"task.goal={GOAL} m", *pictures(SMALL)]
+    )
 
 
 def _closed(rig: Rig, closing: float | None) -> tuple[float, float]:

@@ -10,8 +10,8 @@ from benchmarks.cases import environments
 def test_random_actions_are_those_of_one_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"NUMBER": 2, "STEPS": 1, "ROUNDS": 2, "BODIES": environments.BODIES[:2]}.items():
         monkeypatch.setattr(environments, name, value)
-    step, reset = environments.random_actions("learn", "flowing", 1)
-    assert step.error == 0.0  # to the bit
+    blind, step, reset = environments.random_actions("learn", "flowing", 1)
+    assert blind.error == step.error == 0.0  # to the bit
     assert step.figures["env_steps_per_s"] == pytest.approx(2 / step.timing.median)
     assert reset.figures["kept_ms"] < reset.figures["first_ms"]
 

@@ -99,8 +99,11 @@ def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
 def difference(before: Pose, after: Pose) -> FloatArray:
     """(6,) motion from one pose to another, in the axes of the frame both are given in: shift of the origin [m], and
     rotation vector [rad], the shorter rotation."""
+    shift = after.position - before.position
+    if np.array_equal(before.quaternion, after.quaternion):  # most motions turn nothing, and that is seen at once
+        return np.concatenate([shift, np.zeros(3)])
     turn = rotation(after) * rotation(before).inv()
-    return np.concatenate([after.position - before.position, turn.as_rotvec()])
+    return np.concatenate([shift, turn.as_rotvec()])
 
 
 def distance(a: Pose, b: Pose) -> tuple[float, float]:

@@ -25,8 +25,9 @@ PRESETS: dict[Preset, tuple[float, float]] = {
     "learn": (1.0e-3, 2.0e-3), "draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3),
 }  # fmt: skip
 # Peak Mach number of motions between states of rest: what a tolerance asks for and what the elastic strain at yield
-# allows, within bounds (docs/decisions/0002).
+# allows, within bounds; where nothing yields, a share of the speed of the gel's shear wave (docs/decisions/0002).
 MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST_MACH, FASTEST_MACH = 3.0, 1.5, 0.001, 0.03
+MACH_BY_SHEAR = 0.1
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
@@ -216,14 +217,16 @@ class Scene(Config):
 
         A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
         tolerance, and with the body's elastic strain at yield: its density is scaled with its stiffness, and so is what
-        a motion costs in stress. Elastic scenes come to the same rest from any speed.
+        a motion costs in stress. What is elastic comes to the same rest from any speed, but for friction: it sticks where
+        a stop finds the gel, which follows a drag with its shear wave.
         """
         settling = self.settling
         if settling.mach is not None:
             return settling.mach
         limit = math.inf if self.body is None else self.body.material.elastic_limit
         if not math.isfinite(limit):
-            return FASTEST_MACH
+            mu, lam = lame(self.gel.material)
+            return min(FASTEST_MACH, MACH_BY_SHEAR * math.sqrt(mu / (lam + 2 * mu)))
         return min(max(min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRAIN * limit), SLOWEST_MACH), FASTEST_MACH)
 
     @property

@@ -3,7 +3,8 @@
 The gel surface is the C1 quadratic B-spline over its top nodes; the renderer draws the same surface. The normal force
 is a penalty plus a multiplier that remembers (augmented Lagrangian, Simo & Laursen 1992), so that nothing overlaps at
 rest. Coulomb friction acts by an elastic slip with memory (Cundall & Strack 1979): without it, friction creeps and
-holds nothing.
+holds nothing. Its limit follows the remembered normal force (Prakash & Clifton 1993): that of the instant makes sliding
+flutter.
 """
 
 from tacsim.compute.runtime import ti
@@ -16,7 +17,7 @@ ContactHistory = ti.types.vector(6, ti.f32)  # what contact remembers of a parti
 
 CONTACT_DAMPING = 0.3  # c = 0.3 k dt = 0.3 m / dt, for normal and tangential motion
 TANGENT_STIFFNESS = 0.5  # k_t / k_n
-MULTIPLIER_RATE = 0.05  # share of the penalty force that the multiplier takes over each substep
+MEMORY_RATE = 0.05  # share of a change of the normal force that its memory follows each substep
 SMALLEST_AREA = 0.1  # of the surface seen from above, over its unmoved one; below that it counts as folded
 
 
@@ -96,12 +97,26 @@ def newton_step(t1, t2, miss):
 
 
 @ti.func
-def friction(slip, n, vt, fn, k_t, c_t, mu, dt):
-    """Coulomb with stick memory. Returns the tangential force on the particle and the new elastic slip."""
+def normal_force(spring, memory, drag, compliance):
+    """Normal force of a contact and its new memory, which is the force at rest; all forces, or all pressures.
+
+    spring: of the overlap; drag: of the dashpot, away from the contact. compliance: share of the force that the overlap
+    still carries at rest; the memory carries the others.
+    """
+    force = ti.max(spring + (1.0 - compliance) * memory - drag, 0.0)
+    return force, ti.max(memory + MEMORY_RATE * (spring - compliance * memory), 0.0)
+
+
+@ti.func
+def friction(slip, n, vt, limit, k_t, c_t, dt):
+    """Coulomb with stick memory. Returns the tangential force on the particle and the new elastic slip.
+
+    limit: of the force, the coefficient times the remembered normal force.
+    """
     slip -= slip.dot(n) * n
     slip += dt * vt
     ft = -k_t * slip - c_t * vt
-    size, limit = ft.norm(), mu * fn
+    size = ft.norm()
     if size > limit:
         ft *= limit / size
         length = slip.norm()
@@ -144,8 +159,8 @@ def contact_ceiling(env: ti.template(), gels: ti.template(), g):
 def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: ti.template(), row, forces):
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
-    x, v: position, and velocity relative to the moving sensor. history: elastic slip, and the multiplier as the overlap
-    whose penalty it equals [mm]. row: the gel's first in `surface`; forces: where those on its nodes begin. Returns
+    x, v: position, and velocity relative to the moving sensor. history: elastic slip, and the remembered normal force as
+    the overlap whose penalty it equals [mm]. row: the gel's first in `surface`; forces: where those on its nodes begin. Returns
     whether it touches, whether it touches the housing, the force, and the new history.
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
@@ -155,7 +170,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
     in_contact, housed = False, False
     force = vec3(0.0)
     slip = vec3(history[0], history[1], history[2])
-    multiplier = history[3]
+    pressed = k_n * history[3]
     moved = vec2(0.0)
     overlap = 0.0
     reach = 2.2 * 0.5 * h
@@ -175,7 +190,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
         inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
         if inside:
             depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
-            if depth + multiplier > 0.0:
+            if k_n * depth + pressed > 0.0:
                 vs = surface_sum(gels, row + nx + 3, i, j, wx, wy)
                 n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
                 gap = depth * n[2]  # overlap; negative where they have parted
@@ -184,9 +199,8 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     record_more(env, slot_of(part), layout.CAPPED, 1.0)
                 vr = v - vec3(vs[0], vs[1], vs[2])
                 vn = vr.dot(n)
-                fn = ti.max(k_n * (gap + multiplier) - c_n * vn, 0.0)
-                multiplier = ti.max(multiplier + MULTIPLIER_RATE * gap, 0.0)
-                ft, slip = friction(slip, n, vr - vn * n, fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
+                fn, pressed = normal_force(k_n * gap, pressed, c_n * vn, 0.0)
+                ft, slip = friction(slip, n, vr - vn * n, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
                 force = fn * n + ft
                 in_contact = True
                 overlap = gap
@@ -196,19 +210,19 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     add_four(gels.contact_force, forces + 4 * node, -(wx[p] * wy[q]) * back)
         elif housing >= 0.0:
             gap = radius - housing - x[2]
-            if gap + multiplier > 0.0:
+            if k_n * gap + pressed > 0.0:
                 if gap > deepest:
                     gap = deepest
                     record_more(env, slot_of(part), layout.CAPPED, 1.0)
                 n = vec3(0.0, 0.0, 1.0)
-                fn = ti.max(k_n * (gap + multiplier) - c_n * v[2], 0.0)
-                multiplier = ti.max(multiplier + MULTIPLIER_RATE * gap, 0.0)
-                ft, slip = friction(slip, n, vec3(v[0], v[1], 0.0), fn, TANGENT_STIFFNESS * k_n, c_n, mu, dt)
+                fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2], 0.0)
+                along = vec3(v[0], v[1], 0.0)
+                ft, slip = friction(slip, n, along, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
                 force = fn * n + ft
                 in_contact, housed = True, True
                 overlap = gap
     remembered = ContactHistory([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
     if in_contact:
-        remembered = ContactHistory([slip[0], slip[1], slip[2], multiplier, moved[0], moved[1]])
+        remembered = ContactHistory([slip[0], slip[1], slip[2], pressed / k_n, moved[0], moved[1]])
         record_most(env, slot_of(part), layout.OVERLAP, overlap)
     return in_contact, housed, force, remembered

@@ -1,7 +1,7 @@
 """A rigid indenter on the gel surface: signed distance, and contact by area-weighted quadrature on the surface.
 
 Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penalty plus a multiplier that remembers
-(augmented Lagrangian, Simo & Laursen 1992), so that at rest nothing overlaps; friction remembers its elastic slip.
+(augmented Lagrangian, Simo & Laursen 1992), so that at rest hardly anything overlaps; friction remembers its elastic slip.
 Everything is in the sensor frame [mm, MPa].
 """
 
@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 from tacsim.compute.runtime import ti
 from tacsim.physics.contact.contact import (
     CONTACT_DAMPING,
-    MULTIPLIER_RATE,
     TANGENT_STIFFNESS,
     friction,
+    normal_force,
     spline,
     surface_node,
     surface_sum,
@@ -28,6 +28,9 @@ Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
+# Share of the pressure that the overlap carries at rest. With none of it, nine points on a surface cell share a pressure
+# in any way, it wanders among them, and what loses it lets go of its shear.
+COMPLIANCE = 0.1
 UNKNOWN = 1e9  # distance where none is known
 CELL_REACH = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
 
@@ -187,16 +190,16 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                         n = rotate @ n_local  # out of the indenter: pushes the gel
                         moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
                         closing = moving.dot(n)
-                        normal = indenter.pressure[e, i, j] - k_n * phi + c_n * closing
+                        spring, memory = -k_n * phi, indenter.pressure[e, i, j]
+                        normal, memory = normal_force(spring, memory, -c_n * closing, COMPLIANCE)
                         if normal > 0.0:
                             touching = True
                             sliding = moving - closing * n
                             ft, slip = friction(
-                                indenter.slip[e, i, j], n, sliding, normal, TANGENT_STIFFNESS * k_n, c_n, mu, dt
+                                indenter.slip[e, i, j], n, sliding, mu * memory, TANGENT_STIFFNESS * k_n, c_n, dt
                             )
                             indenter.slip[e, i, j] = slip
-                            multiplier = indenter.pressure[e, i, j] - MULTIPLIER_RATE * k_n * phi
-                            indenter.pressure[e, i, j] = ti.max(multiplier, 0.0)
+                            indenter.pressure[e, i, j] = memory
                             force = area * (normal * n - ft)
                             total += force
                             moment += x.cross(force)

@@ -25,7 +25,7 @@ PEAK_SLOPE = 1.875  # of the ramp, over its mean
 # Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, which takes
 # longer by as much as its speed changes; time of the hold between two readings of the forces
 SHORTEST_RAMP, SHORTEST_FLOW, READING_INTERVAL = 2.0, 1.25, 1.0
-SHORT_PATH = 0.5  # gel thicknesses: on shorter paths, frames go slower than they may, if what is pressed yields
+SHORT_PATH = 0.5  # gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace
 ROUNDING = 1e-6  # of a number of substeps
 MOST_SUBSTEPS = 1_000_000  # of one motion: hours, and no motion that anybody means
 
@@ -139,15 +139,24 @@ def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> flo
     return of_fastest_point(np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)]), lever)
 
 
+def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
+    """What of it goes along the surface of the first frame, a sensor, turns included [mm]."""
+    displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
+    normal = Rotation.from_quat(start[0].quaternion).apply([0.0, 0.0, 1.0])
+    displacements[:, :3] -= np.outer(displacements[:, :3] @ normal, normal)
+    return of_fastest_point(displacements, lever)
+
+
 def plan(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
-    yields: bool = False,
+    remembered: float = 0.0,
 ) -> Path:  # fmt: skip
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
 
-    What the stop writes into a body that `yields` grows with how hard it brakes, so short paths go slower: with the
-    root of their length, which is the same braking for all.
+    remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what goes
+    along the surface, for contact sticks where the stop finds the gel. That trace grows with how hard it brakes, so
+    short paths go slower: with the root of their length, which is the same braking for all.
 
     Raises ValueError for a path that takes more than MOST_SUBSTEPS.
     """
@@ -155,9 +164,8 @@ def plan(
     length = path_length(start, end, lever)
     if length == 0:
         return Path(start, end, 0, dt, interval=interval)
-    if yields:
-        mach *= min(1.0, math.sqrt(length / (SHORT_PATH * thickness)))
-    lasting = max(PEAK_SLOPE * length / mach, SHORTEST_RAMP * thickness)
+    braked = math.sqrt(remembered * max(remembered, SHORT_PATH * thickness))
+    lasting = max(PEAK_SLOPE * max(length, braked) / mach, SHORTEST_RAMP * thickness)
     rise = SHORTEST_RAMP * thickness / 2 / lasting
     return Path(start, end, _substeps(lasting / dt, length, mach), dt, interval=interval, rise=rise)
 

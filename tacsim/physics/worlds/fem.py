@@ -29,13 +29,15 @@ from tacsim.physics.motion.controller import (
 )
 from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
-from tacsim.physics.motion.path import Path, plan, plan_flow, resolve_targets
+from tacsim.physics.motion.path import Path, path_along, path_length, plan, plan_flow, resolve_targets
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
 
-ZETA_GEL_HELD = 1.0  # zeta in alpha = zeta c / thickness, the damping of a gel while nothing is driven
+# zeta in alpha = zeta c / thickness, the damping of a gel: while anything is driven, when it makes the gel lag, and
+# what yields or slides remembers that; while held
+ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0
 
 
 class FemState(Protocol):
@@ -185,8 +187,9 @@ class FemWorld(BaseWorld):
 
     def plan(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         """The path between two poses of all driven frames, at the scene's speed."""
-        mach, gel = self.scene.peak_mach, self._gel
-        return plan(start, end, mach, self._scaled.step, max(gel.half), gel.thickness, yields=self.yields)
+        mach, gel, lever = self.scene.peak_mach, self._gel, max(self._gel.half)
+        remembered = (path_length if self.yields else path_along)(start, end, lever)
+        return plan(start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered)
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.settling.flow_mach, self._gel

@@ -52,14 +52,13 @@ from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.snapshot import copies
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.device import DeviceArrays, run_hybrid
-from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
+from tacsim.physics.worlds.fem import ZETA_GEL, ZETA_GEL_HELD, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
 from tacsim.pose import HALF_TURN_X
 
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
 COURANT = 0.5
 # Damping of a driven motion falsifies its path, since gels yield and the body spreads; damping of the hold does not.
-ZETA_GEL = 0.5  # zeta in alpha = zeta c / thickness, while anything is driven; while held: ZETA_GEL_HELD
 ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]

@@ -66,7 +66,7 @@ from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.snapshot import copies
 from tacsim.physics.units import MM, MPA
 from tacsim.physics.worlds.device import DeviceArrays, run_press
-from tacsim.physics.worlds.fem import ZETA_GEL_HELD, FemWorld, stack_drives
+from tacsim.physics.worlds.fem import ZETA_GEL, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
@@ -134,7 +134,7 @@ class PressState:
         self.gels = GelState(lattice, len(scenes), 1)
         nx, ny, _ = lattice.elements
         self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
-        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # multiplier of the normal contact [MPa]
+        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # that normal contact remembers [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
@@ -217,8 +217,7 @@ class PressWorld(FemWorld):
         self._index = index
         self._gel = self._state.gel[index]
         step = COURANT * self._gel.spacing
-        # An elastic gel has no memory of its path, so the damping on it is that of the hold.
-        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness}, step)
+        self._scaled = Inertia({GEL_DAMPING: ZETA_GEL / self._gel.thickness}, step)
         self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         params = {

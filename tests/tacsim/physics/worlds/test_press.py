@@ -9,7 +9,8 @@ import pytest
 from tacsim.geometry import tiles
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
-from tacsim.physics.contact.indenter import POINTS
+from tacsim.physics.contact.indenter import COMPLIANCE, POINTS
+from tacsim.physics.exec.layout import STIFFNESS
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.oracle.layer import layer_contact
@@ -65,15 +66,21 @@ def test_a_nearly_incompressible_gel_does_not_lock() -> None:
     assert -w.wrench("lower")[2] == pytest.approx(layer_force(4e-3, 0.3e-3, 0.49), rel=0.05)
 
 
-def test_nothing_overlaps_at_rest_and_backing_balances_contact() -> None:
+def left_over(w: PressWorld) -> float:
+    """The overlap [m] that carries the share COMPLIANCE of the largest pressure."""
+    stiffness = float(w._state.params[0, STIFFNESS])
+    return COMPLIANCE * float(w._state.pressure.max()) / stiffness * 1e-3
+
+
+def test_hardly_anything_overlaps_at_rest_and_backing_balances_contact() -> None:
     w = world(Sphere(radius=4e-3))
     pose = w.pose("indenter")
     stats = w.move({"indenter": Pose(pose.position + [0, 0, -1.1e-3], pose.quaternion)})
     assert stats.settled and stats.residual <= 1e-3
     assert stats.substeps > stats.hold > 0
-    for _ in range(5):
+    for _ in range(10):
         stats = w.move({})
-    assert stats.overlap < 5e-6  # the multiplier goes on taking over from the penalty
+    assert stats.overlap < 1.1 * left_over(w) < 12e-6  # the memory goes on taking over from the penalty
 
 
 def test_an_off_centre_press_shows_where_it_is() -> None:
@@ -95,6 +102,50 @@ def test_moving_the_sensor_is_moving_the_indenter() -> None:
     a.move({"indenter": Pose(a.pose("indenter").position + [0.2e-3, 0, -0.6e-3])})
     b.move({"lower": Pose(np.array([-0.2e-3, 0, 0.6e-3]))})
     assert a.wrench("lower") == pytest.approx(b.wrench("lower"), abs=1e-5)
+
+
+def slide(w: PressWorld, by: float) -> float:
+    """Drags the indenter by `by` [m]; the ratio of the forces then. It has settled with fewer than 1,300 substeps."""
+    pose = w.pose("indenter")
+    stats = w.move({"indenter": Pose(pose.position + [by, 0, 0], pose.quaternion)})
+    assert stats.settled and stats.substeps < 1300, stats
+    force = w.wrench("lower")
+    return float(force[0] / -force[2])
+
+
+def pressed_ball(friction: float, preset: str, deep: float = 0.5e-3) -> PressWorld:
+    """A ball of 4 mm radius pressed into the default gel at the default speed and tolerance."""
+    w = world(Sphere(radius=4e-3), friction, 1e-2, preset=preset, gel=Gel())
+    move(w, (0, 0, -deep - 0.1e-3))
+    return w
+
+
+@pytest.mark.parametrize("preset", ["draft", "standard"])
+@pytest.mark.parametrize(("friction", "ratio"), [(0.3, 0.32), (0.6, 0.647), (1.0, 1.098)])
+def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
+    preset: str, friction: float, ratio: float
+) -> None:
+    """Ratios: of the shape that an axisymmetric finite-element solver (second order, neo-Hookean, 0.2 mm elements) gives
+    the contact under this ball, 0.5 mm deep, where it slides everywhere."""
+    assert slide(pressed_ball(friction, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
+
+
+def test_a_short_slide_ends_as_a_slow_one() -> None:
+    """0.3 and 0.6 mm at draft, where a part of the contact still sticks: the same mesh at Mach 0.001."""
+    for friction, ratios in ((0.3, (0.313, 0.319)), (0.6, (0.409, 0.639)), (1.0, (0.420, 0.791))):
+        w = pressed_ball(friction, "draft")
+        assert [slide(w, 0.3e-3), slide(w, 0.3e-3)] == pytest.approx(ratios, rel=0.02)
+
+
+def test_a_slid_ball_keeps_its_drag_while_it_is_held() -> None:
+    """Pressure that wandered among contact points would lose it: 3 % in 1,000 substeps."""
+    w = pressed_ball(1.0, "draft")
+    drag = slide(w, 2e-3)
+    held = 0
+    while held < 1000:
+        held += w.move({}).hold
+    force = w.wrench("lower")
+    assert force[0] / -force[2] == pytest.approx(drag, rel=0.01)
 
 
 def test_a_slid_plate_reaches_coulomb_friction_and_stuck_contact_keeps_its_shear() -> None:
@@ -149,10 +200,13 @@ def brick(folder: Path, size: tuple[float, float, float]) -> tuple[Box, Mesh]:
 
 
 def test_a_mesh_wider_than_the_gel_is_there_wherever_it_is_moved(tmp_path: Path) -> None:
-    """Its far ends, brought over the gel after it was pressed, and by a turn, press as those of the closed form."""
+    """Its far ends, brought over the gel after it was pressed, and by a turn, press as those of the closed form.
+
+    Little friction: what an edge that ploughs drags depends on which contact point it meets first.
+    """
     forces = []
     for shape in brick(tmp_path, (18, 5, 2)):
-        w = world(shape, 0.2, preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+        w = world(shape, 0.1, preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
         found = []
         for by, turn in (((0, 0, -0.4e-3), 0.0), ((7e-3, 0, 0), 0.0), ((0, 0, 0), 0.5)):
             move(w, by, turn)

@@ -72,9 +72,7 @@ def press(scene: Scene, depth: float) -> tuple[PressWorld, MoveStats]:
     return world, stats
 
 
-DEFAULT_MACH = (
-    FASTEST_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
-)
+DEFAULT_MACH = FASTEST_MACH  # the controller's default at nu 0.45, a tenth of the shear wave's speed
 # Half of it; more; and a third of the shear wave's speed, where contact sticks and slips by inertia.
 OTHER_MACHS = (0.015, 0.05, 0.1)
 

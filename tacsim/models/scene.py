@@ -217,8 +217,8 @@ class Scene(Config):
 
         A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
         tolerance, and with the body's elastic strain at yield: its density is scaled with its stiffness, and so is what
-        a motion costs in stress. What is elastic comes to the same rest from any speed, but for friction: it sticks where
-        a stop finds the gel, which follows a drag with its shear wave.
+        a motion costs in stress. What is elastic comes to the same rest from any speed, but for friction: it
+        sticks where a stop finds the gel, which follows a drag with its shear wave.
         """
         settling = self.settling
         if settling.mach is not None:

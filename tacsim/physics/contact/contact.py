@@ -159,9 +159,9 @@ def contact_ceiling(env: ti.template(), gels: ti.template(), g):
 def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: ti.template(), row, forces):
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
-    x, v: position, and velocity relative to the moving sensor. history: elastic slip, and the remembered normal force as
-    the overlap whose penalty it equals [mm]. row: the gel's first in `surface`; forces: where those on its nodes begin. Returns
-    whether it touches, whether it touches the housing, the force, and the new history.
+    x, v: position, and velocity relative to the moving sensor. history: elastic slip, and the remembered normal force
+    as the overlap whose penalty it equals [mm]. row: the gel's first in `surface`; forces: where those on its nodes
+    begin. Returns whether it touches, whether it touches the housing, the force, and the new history.
     """
     h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
     mu, housing = env.param(layout.FRICTION + g), env.param(layout.HOUSING)

@@ -1,8 +1,8 @@
 """A rigid indenter on the gel surface: signed distance, and contact by area-weighted quadrature on the surface.
 
 Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penalty plus a multiplier that remembers
-(augmented Lagrangian, Simo & Laursen 1992), so that at rest hardly anything overlaps; friction remembers its elastic slip.
-Everything is in the sensor frame [mm, MPa].
+(augmented Lagrangian, Simo & Laursen 1992), so that at rest hardly anything overlaps; friction remembers its elastic
+slip. Everything is in the sensor frame [mm, MPa].
 """
 
 from typing import Any, NamedTuple
@@ -28,8 +28,8 @@ Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
-# Share of the pressure that the overlap carries at rest. With none of it, nine points on a surface cell share a pressure
-# in any way, it wanders among them, and what loses it lets go of its shear.
+# Share of the pressure that the overlap carries at rest. With none of it, nine points on a surface cell share a
+# pressure in any way, it wanders among them, and what loses it lets go of its shear.
 COMPLIANCE = 0.1
 UNKNOWN = 1e9  # distance where none is known
 CELL_REACH = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing

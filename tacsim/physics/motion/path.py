@@ -155,8 +155,8 @@ def plan(
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
 
     remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what goes
-    along the surface, for contact sticks where the stop finds the gel. That trace grows with how hard it brakes, so
-    short paths go slower: with the root of their length, which is the same braking for all.
+    along the surface, since it sticks where the stop finds the gel. The trace grows with how hard the path brakes, so
+    short ones go slower: with the root of their length, which is the same braking for all.
 
     Raises ValueError for a path that takes more than MOST_SUBSTEPS.
     """

@@ -45,7 +45,9 @@ def test_short_ways_of_what_yields_brake_no_harder_than_long_ones() -> None:
 
     def braking(millimetres: float, yields: bool) -> float:
         end = Pose(np.array([0, 0, millimetres * 1e-3]))
-        path = plan([Pose()], [end], mach=0.05, dt=0.01, lever=10.0, thickness=4.0, remembered=millimetres if yields else 0.0)
+        path = plan(
+            [Pose()], [end], mach=0.05, dt=0.01, lever=10.0, thickness=4.0, remembered=millimetres if yields else 0.0
+        )
         speed = path.drive(0, path.substeps)[:, 0, 4, 2].astype(float)
         assert speed.max() <= 0.05 * 1.001
         return speed.max() / (path.substeps * path.dt)

@@ -80,7 +80,7 @@ def test_hardly_anything_overlaps_at_rest_and_backing_balances_contact() -> None
     assert stats.substeps > stats.hold > 0
     for _ in range(10):
         stats = w.move({})
-    assert stats.overlap < 1.1 * left_over(w) < 12e-6  # the memory goes on taking over from the penalty
+    assert stats.overlap < 1.1 * left_over(w) < 13e-6  # the memory goes on taking over from the penalty
 
 
 def test_an_off_centre_press_shows_where_it_is() -> None:
@@ -125,8 +125,8 @@ def pressed_ball(friction: float, preset: str, deep: float = 0.5e-3) -> PressWor
 def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
     preset: str, friction: float, ratio: float
 ) -> None:
-    """Ratios: of the shape that an axisymmetric finite-element solver (second order, neo-Hookean, 0.2 mm elements) gives
-    the contact under this ball, 0.5 mm deep, where it slides everywhere."""
+    """Ratios: of the contact that an axisymmetric finite-element solver (second order, neo-Hookean, 0.2 mm elements)
+    finds under this ball, 0.5 mm deep, where it slides everywhere."""
     assert slide(pressed_ball(friction, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
 
 

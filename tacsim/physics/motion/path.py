@@ -154,8 +154,8 @@ def plan(
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
 
-    remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what of it
-    goes along the surface, where the stop finds the gel. The trace grows with how hard the path brakes, so
+    remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what
+    of it goes along the surface, where the stop finds the gel. The trace grows with how hard the path brakes, so
     short ones go slower: with the root of their length, which is the same braking for all.
 
     Raises ValueError for a path that takes more than MOST_SUBSTEPS.

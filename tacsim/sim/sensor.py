@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,25 +37,33 @@ class SimSensor:
         self._world, self._clock, self._frame, self.spec = world, clock, frame, spec
         self._render, self._sample, self._noise = render, sample, noise
         self._newest: TactileFrame | None = None
+        self._untouched: tuple[NDArray[np.uint8], SurfaceMap] | None = None
         self._version = -1  # of the world in the newest frame
         self._index = self._episode = 0
 
     def read(self, timeout: float) -> TactileFrame:
         """The picture of the world now; `timeout` makes no difference."""
         if self._newest is None or self._version != self._clock.version:
-            surface = self._world.surface(self._frame)
-            image = self._render(surface)
+            image, seen = self._look(self._world.surface(self._frame))
             if self._noise is not None:
                 image = self._noise(image, self._index, self._episode)
             self._newest = TactileFrame(
                 image=image,
                 time=self._clock.now(),
                 index=self._index,
-                surface=self._sample(surface),
+                surface=seen,
                 stats=self._clock.diagnostics(),
             )
             self._version, self._index = self._clock.version, self._index + 1
         return self._newest
+
+    def _look(self, surface: GelSurface) -> tuple[NDArray[np.uint8], SurfaceMap]:
+        """Picture without noise, and heights. Those of an untouched gel, with which each episode begins, are kept."""
+        if surface.displacement.any():
+            return self._render(surface), self._sample(surface)
+        if self._untouched is None:
+            self._untouched = self._render(surface), self._sample(surface)
+        return deepcopy(self._untouched)  # nobody writes into what is kept
 
     def restart(self, episode: int = 0) -> None:
         """Counts frames from zero again; `episode` seeds the noise."""

@@ -142,6 +142,7 @@ def test_a_motion_beyond_the_limit_is_shortened_told_and_counted(spring_world: A
 
 def test_a_picture_is_rendered_once_a_state_and_only_when_read(spring_world: Any) -> None:
     clock, lower, _ = make_arms(spring_world)
+    approach_force(spring_world, 1.0)  # untouched, all states look alike
     rendered: list[float] = []
 
     def render(surface: Any) -> np.ndarray:
@@ -160,6 +161,26 @@ def test_a_picture_is_rendered_once_a_state_and_only_when_read(spring_world: Any
     assert rendered == pytest.approx([0.1, 0.2])
     assert (first.index, second.index) == (0, 1)
     assert second.time == pytest.approx(0.2)
+
+
+def test_an_untouched_gel_is_drawn_once(spring_world: Any) -> None:
+    """Each episode begins with its picture; who writes into one does not change the next."""
+    clock, *_ = make_arms(spring_world)
+    rendered: list[None] = []
+
+    def render(surface: Any) -> np.ndarray:
+        rendered.append(None)
+        return np.full((4, 6, 3), 7, np.uint8)
+
+    spec = SensorSpec((4, 6), height=True, flow=False, arm="lower")
+    sensor = SimSensor(spring_world, clock, "lower", spec, render, lambda surface: None)  # type: ignore[arg-type, return-value]
+    for episode in range(3):
+        clock.restart()
+        sensor.restart(episode)
+        image = sensor.read(0.0).image
+        assert (image == 7).all()
+        image[...] = 0
+    assert len(rendered) == 1
 
 
 def test_second_episode_equals_the_first_bit_for_bit(open_springs: Any) -> None:

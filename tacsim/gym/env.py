@@ -111,23 +111,24 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         unknown = sorted(set(options) - {"variant", "task", "scene"})
         if unknown:
             raise ValueError(f"reset knows the options variant, task and scene, got {unknown}")
-        chosen: Mapping[str, Any] = options
+        chosen, played = options, None
         if self._variants and not {"task", "scene"} & set(options):
             number = options.get("variant")
-            self._played = int(self.np_random.integers(len(self._variants))) if number is None else int(number)
-            if not 0 <= self._played < len(self._variants):
+            played = int(self.np_random.integers(len(self._variants))) if number is None else int(number)
+            if not 0 <= played < len(self._variants):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
-            variant = self._variants[self._played]
-            chosen = {"task": variant.task, "scene": variant.scene}
+            chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
+        if "task" in chosen:
+            require_alike(self.task.config, chosen["task"])
         if "scene" in chosen:
             if self._stage is None:
                 raise ValueError(f"rig '{self.rig.name}' has but one scene; make its environment by robot.make_env")
             self._stage.use(chosen["scene"])
         if "task" in chosen:
-            require_alike(self.task.config, chosen["task"])
             self.task = make_task(chosen["task"])
+        self._played = played
 
     def _begin(self, seed: int) -> None:
         self.phase, self._failure, self._done = "new", None, None

@@ -210,6 +210,7 @@ def test_variants_are_drawn_by_the_seed_or_chosen() -> None:
     drawn = [env.reset(seed=seed)[1]["variant"] for seed in range(12)]
     assert set(drawn) == {0, 1, 2} and drawn == [env.reset(seed=seed)[1]["variant"] for seed in range(12)]
     assert env.reset(options={"variant": 1})[1]["body_height"] == pytest.approx(5e-3, rel=0.02)
+    assert "variant" not in env.reset(options={"scene": env.scene})[1]
     with pytest.raises(ValueError, match=f"variants 0 to {len(VARIANTS) - 1}, got 3"):
         env.reset(options={"variant": 3})
     env.close()
@@ -231,6 +232,10 @@ def test_a_reset_with_a_new_body_and_goal() -> None:
         env.reset(
             options={"scene": scene.model_copy(update={"gel": scene.gel.model_copy(update={"size": (9e-3,) * 3})})}
         )
+    with pytest.raises(ValueError, match="must keep touch_force"):  # and the scene stays, too
+        env.reset(options={"scene": env.scene.model_copy(update={"body": body}),
+                           "task": task.model_copy(update={"touch_force": 0.1})})  # fmt: skip
+    assert env.scene == scene
     with pytest.raises(ValueError, match="has some"):
         env.reset(options={"variant": 0})
     env.close()

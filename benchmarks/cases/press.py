@@ -41,6 +41,9 @@ LAYER = "FFT elastic layer"
 FORCE_DEPTHS = (0.1e-3, 0.3e-3)
 FORCE_RATIOS = (0.45, 0.49)  # Poisson
 SLIDE, SLIDES = 0.5e-3, 20  # a plate slides so far at a time [m], and so often at most
+SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed plays no part
+DRAG = {0.3: 0.32, 0.6: 0.647, 1.0: 1.098}  # by friction: drag over normal force of the ball that slides everywhere
+DRAG_TRUTH = "axisymmetric finite elements of second order"
 STAYS = 1e-3  # relative change of the force ratio in one slide
 
 
@@ -174,6 +177,44 @@ def sliding_force(element: float, repeat: int) -> list[Measurement]:
     ]  # fmt: skip
 
 
+def slid_ball(preset: str, repeat: int) -> list[Measurement]:
+    """A ball R 4 mm, 0.5 mm deep in the shipped gel, dragged along it: drag over normal force where it slides
+    everywhere, and where a part of the contact still sticks."""
+    settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
+    rows = []
+    for friction, ratio in DRAG.items():
+        timing, (found, stats) = timed(partial(_drag, preset, friction, 2e-3), repeat)
+        rows.append(_drag_row(timing, found, stats, ratio, DRAG_TRUTH, f"2 mm, friction {friction:g}"))
+    for friction in (0.3, 0.6, 1.0, 1.5):
+        timing, (found, stats) = timed(partial(_drag, preset, friction, SLIDE), 1, warm=lambda: None)
+        truth, _ = _drag(preset, friction, SLIDE, **settled)
+        what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
+        rows.append(_drag_row(timing, found, stats, truth, what, f"0.5 mm, friction {friction:g}"))
+    return rows
+
+
+def _drag(preset: str, friction: float, length: float, **settling: float) -> tuple[float, MoveStats]:
+    """Drag over normal force after a slide of so much [m]."""
+    scene = Scene.model_validate(
+        {
+            "body": None,
+            "preset": preset,
+            "indenter": Indenter(geometry=Sphere(radius=RADIUS), friction=friction),
+            "settling": settling,
+        }
+    )
+    world, _ = press(scene, 0.5e-3)
+    pose = world.pose("indenter")
+    stats = world.move({"indenter": Pose(pose.position + [length, 0, 0], pose.quaternion)})
+    force = world.wrench("lower")
+    return float(force[0] / -force[2]), stats
+
+
+def _drag_row(timing: Timing, found: float, stats: MoveStats, truth: float, what: str, variant: str) -> Measurement:
+    figures, note = {"ratio": found, "truth": truth}, "" if stats.settled else "not settled"
+    return Measurement(timing, _percent(found, truth), "% of the drag", what, variant, stats.substeps, figures, note)
+
+
 def renew(say: Callable[[str], None], folder: Path = FOLDER) -> Limit:
     """Computes the limit anew and writes it to `folder`: three meshes, the finest takes many minutes."""
     profiles, forces, substeps = [], [], []
@@ -270,4 +311,5 @@ CASES = (
     Case("press", "sphere_force", "tacsim", "h 0.25 mm", partial(sphere_force, 0.25e-3), long=True),
     Case("press", "flat_punch", "tacsim", "h 0.5 mm", partial(flat_punch, 0.5e-3)),
     Case("press", "sliding_force", "tacsim", "h 1 mm", partial(sliding_force, 1e-3)),
+    *(Case("press", "slid_ball", "tacsim", preset, partial(slid_ball, preset)) for preset in ("draft", "standard")),
 )  # fmt: skip

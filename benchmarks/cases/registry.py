@@ -7,7 +7,17 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from benchmarks.cases import environments, incline, large_strain, materials, presets, press, scenes, squeeze
+from benchmarks.cases import (
+    environments,
+    incline,
+    large_strain,
+    materials,
+    presets,
+    press,
+    random_steps,
+    scenes,
+    squeeze,
+)
 from benchmarks.cases.real import (
     ball_touch,
     balls,
@@ -27,6 +37,7 @@ from benchmarks.harness.schema import Group
 CASES: tuple[Case, ...] = (
     *press.CASES,
     *squeeze.CASES,
+    *random_steps.CASES,
     *presets.CASES,
     *large_strain.CASES,
     *incline.CASES,

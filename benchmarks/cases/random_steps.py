@@ -1,0 +1,87 @@
+"""Random actions of the squeeze: what a step costs and how wrong its force is, settled and flowing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cases.squeeze import SLOW, normal_forces, squeeze_scene, world_in_contact
+from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.runner import Case
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.scene import Settling
+from tacsim.physics.world import World, make_world
+
+START, ACTIONS, LARGEST = 1.5e-3, 20, 0.2e-3  # squeezed so far from touch; steps; of one sensor, as in the squeeze task
+FLOW_MACHS = (0.5, 1.0, 2.0)  # times the default
+
+
+def random_steps(preset: str, repeat: int) -> list[Measurement]:
+    """Twenty steps in a row, each sensor along its z by up to 0.2 mm either way, at random: force after each against
+    the slow limit through the same poses, as a share of the mean force; settled, and flowing at three speeds."""
+    begin, truth = _slow(preset)
+    usual = Settling().flow_mach
+    rows = [_row(preset, begin, truth, "settled", flow=False)]
+    for share in FLOW_MACHS:
+        what = f"flowing at Mach {share * usual:g}" + (", the default" if share == 1.0 else "")
+        rows.append(_row(preset, begin, truth, what, flow=True, flow_mach=share * usual))
+    return rows
+
+
+def _steps() -> FloatArray:
+    return np.random.default_rng(0).uniform(-LARGEST, LARGEST, (ACTIONS, 2))
+
+
+def _slow(preset: str) -> tuple[Mapping[str, NDArray[Any]], FloatArray]:
+    """The squeezed state, and the mean force of both sensors [N] after each step, so slow that speed plays no part."""
+    world = world_in_contact(squeeze_scene(preset, "hybrid", **SLOW))
+    _move(world, np.full(2, START / 2), flow=False)
+    begin = world.snapshot()
+    return begin, np.array([_force(world, step, flow=False) for step in _steps()])
+
+
+def _move(world: World, by: FloatArray, *, flow: bool) -> int:
+    """Both sensors along their z, which points into the body, by so much [m]; returns the substeps."""
+    targets = {}
+    for name, sign, length in zip(("lower", "upper"), (1.0, -1.0), by, strict=True):
+        pose = world.pose(name)
+        targets[name] = Pose(pose.position + [0.0, 0.0, sign * length], pose.quaternion)
+    return world.move(targets, flow=flow).substeps
+
+
+def _force(world: World, by: FloatArray, *, flow: bool) -> float:
+    _move(world, by, flow=flow)
+    return float(normal_forces(world).mean())
+
+
+def _row(
+    preset: str, begin: Mapping[str, NDArray[Any]], truth: FloatArray, what: str, *, flow: bool, **settling: float
+) -> Measurement:
+    world, steps = make_world(squeeze_scene(preset, "hybrid", **settling)), _steps()
+
+    def run() -> tuple[FloatArray, int]:
+        world.restore(begin)
+        forces, substeps = [], 0
+        for step in steps:
+            substeps += _move(world, step, flow=flow)
+            forces.append(float(normal_forces(world).mean()))
+        return np.array(forces), substeps
+
+    timing, (forces, substeps) = timed(run, 1)
+    errors = np.abs(forces - truth) / truth.mean() * 100
+    each = Timing(tuple(sample / ACTIONS for sample in timing.samples), timing.processor / ACTIONS)
+    return Measurement(
+        each, float(np.sqrt(np.mean(errors**2))), "% of the mean force, rms", "the same poses, settled at Mach 0.003",
+        what, round(substeps / ACTIONS), {"worst_percent": float(errors.max()), "first_step_percent": float(errors[0])},
+        "a step: its seconds and substeps",
+    )  # fmt: skip
+
+
+CASES = (
+    Case("squeeze", "random_steps", "tacsim", "draft", partial(random_steps, "draft")),
+    Case("squeeze", "random_steps", "tacsim", "standard", partial(random_steps, "standard"), long=True),
+)

@@ -104,11 +104,11 @@ def test_moving_the_sensor_is_moving_the_indenter() -> None:
     assert a.wrench("lower") == pytest.approx(b.wrench("lower"), abs=1e-5)
 
 
-def slide(w: PressWorld, by: float) -> float:
-    """Drags the indenter by `by` [m]; the ratio of the forces then. It has settled with fewer than 1,300 substeps."""
+def slide(w: PressWorld, by: float, most: int = 1000) -> float:
+    """Drags the indenter by `by` [m]; the ratio of the forces then. It has settled with at most so many substeps."""
     pose = w.pose("indenter")
     stats = w.move({"indenter": Pose(pose.position + [by, 0, 0], pose.quaternion)})
-    assert stats.settled and stats.substeps < 1300, stats
+    assert stats.settled and stats.substeps <= most, stats
     force = w.wrench("lower")
     return float(force[0] / -force[2])
 
@@ -135,6 +135,31 @@ def test_a_short_slide_ends_as_a_slow_one() -> None:
     for friction, ratios in ((0.3, (0.313, 0.319)), (0.6, (0.409, 0.639)), (1.0, (0.420, 0.791))):
         w = pressed_ball(friction, "draft")
         assert [slide(w, 0.3e-3), slide(w, 0.3e-3)] == pytest.approx(ratios, rel=0.02)
+
+
+SHARP = pytest.mark.xfail(
+    strict=True, reason="0.525 instead of 0.632: a sharp edge goes over whole contact points, which jump to its side"
+)
+
+
+@pytest.mark.parametrize(
+    ("shape", "friction"),
+    [
+        (Box(size=(4e-3, 4e-3, 4e-3)), 0.3),
+        (Box(size=(4e-3, 4e-3, 4e-3)), 0.6),
+        (Box(size=(4e-3, 4e-3, 4e-3)), 1.0),
+        (Cylinder(radius=2e-3, height=4e-3), 1.0),
+        pytest.param(Cylinder(radius=2e-3, height=4e-3), 0.6, marks=SHARP),
+    ],
+)
+def test_what_has_edges_ends_a_slide_as_a_slow_one(shape: Shape, friction: float) -> None:
+    """0.5 mm at draft, against the same mesh at a sixth of the speed."""
+    ratios = []
+    for settling in ({}, {"mach": 0.003, "tolerance": 1e-3, "max_substeps": 500}):
+        w = world(shape, friction, preset="draft", gel=Gel(), settling=settling)
+        w.move({"indenter": Pose(w.pose("indenter").position - [0, 0, 0.4e-3])})
+        ratios.append(slide(w, 0.5e-3, 3000))
+    assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
 
 
 def test_a_slid_ball_keeps_its_drag_while_it_is_held() -> None:

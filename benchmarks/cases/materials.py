@@ -297,7 +297,7 @@ def momentum(repeat: int) -> list[Measurement]:
         return body
 
     timing, body = timed(run, 1, warm=partial(run, 1))
-    before, after = (momenta(b.x(), b.v(), b.c(), config.cell) for b in (initial().state, body.state))
+    before, after = (momenta(b.x(), b.v(), b.spin(), config.cell) for b in (initial().state, body.state))
     linear, angular = (float(np.linalg.norm(b - a) / scale) for a, b, scale in zip(
         before[:2], after[:2], before[2:], strict=True))  # fmt: skip
     return [
@@ -311,7 +311,8 @@ def momenta(
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Linear and angular momentum of particles (n) of mass 1, the affine part included, and their scales.
 
-    L = sum x cross v + dx^2/4 skew(C) (Jiang et al. 2015, eq. 10); the scales are sum |v| and sum |x - mean| |v|.
+    L = sum x cross v + dx^2/4 skew(C F^T) (Jiang et al. 2015, eq. 10, where F = I); `c` is C F^T. The scales are
+    sum |v| and sum |x - mean| |v|.
     """
     x, v, c = (np.asarray(a, np.float64) for a in (x, v, c))
     skew = np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=1)

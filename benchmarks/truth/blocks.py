@@ -137,7 +137,8 @@ class BodyBlock(Block):
         self.state = BodyState([points])
 
     def fit(self, margin: float) -> None:
-        """Lays the grid round the particles, which may then move by margin [mm]."""
+        """Lays the grid round the particles where they are now, with a margin [mm] of at least a cell."""
+        self.state.move_reference(0)
         self.state.fit(0, self.cell, margin, self.params, self.counts)
 
     def advance(self, substeps: int, keep: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> None:

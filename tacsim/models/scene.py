@@ -24,9 +24,10 @@ Preset = Literal["learn", "draft", "standard"]
 PRESETS: dict[Preset, tuple[float, float]] = {
     "learn": (1.0e-3, 2.0e-3), "draft": (0.5e-3, 1.0e-3), "standard": (0.25e-3, 0.5e-3),
 }  # fmt: skip
-# Peak Mach number of motions between states of rest: what a tolerance asks for and what the elastic strain at yield
-# allows, within bounds; where nothing yields, a share of the speed of the gel's shear wave (docs/decisions/0002).
-MACH_BY_TOLERANCE, MACH_BY_STRAIN, SLOWEST_MACH, FASTEST_MACH = 3.0, 1.5, 0.001, 0.03
+# Peak Mach number of motions between states of rest: what a tolerance asks for and what the yield stress over the
+# P-wave modulus allows, within bounds; where nothing yields, a share of the speed of the gel's shear wave
+# (docs/decisions/0002).
+MACH_BY_TOLERANCE, MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH = 3.0, 4.0, 0.001, 0.03
 MACH_BY_SHEAR = 0.1
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
@@ -216,18 +217,20 @@ class Scene(Config):
         """Peak speed of a motion between states of rest, over the wave speed; slower on short paths (physics.path).
 
         A body that yields keeps what the speed wrote into it. So without `settling.mach` the speed goes with the
-        tolerance, and with the body's elastic strain at yield: its density is scaled with its stiffness, and so is what
-        a motion costs in stress. What is elastic comes to the same rest from any speed, but for friction: it
-        sticks where a stop finds the gel, which follows a drag with its shear wave.
+        tolerance, and with the body's yield stress over its P-wave modulus M: a motion at Mach m costs the stress m M,
+        since density is scaled so that the wave speed is 1. What is elastic comes to the same rest from any speed, but
+        for friction: it sticks where a stop finds the gel, which follows a drag with its shear wave.
         """
         settling = self.settling
         if settling.mach is not None:
             return settling.mach
         limit = math.inf if self.body is None else self.body.material.elastic_limit
-        if not math.isfinite(limit):
+        if self.body is None or not math.isfinite(limit):
             mu, lam = lame(self.gel.material)
             return min(FASTEST_MACH, MACH_BY_SHEAR * math.sqrt(mu / (lam + 2 * mu)))
-        return min(max(min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRAIN * limit), SLOWEST_MACH), FASTEST_MACH)
+        mu, lam = lame(self.body.material)
+        allowed = min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRESS * 2 * mu * limit / (lam + 2 * mu))
+        return min(max(allowed, SLOWEST_MACH), FASTEST_MACH)
 
     @property
     def spacing(self) -> float:

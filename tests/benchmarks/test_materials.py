@@ -52,4 +52,4 @@ def test_waves_run_at_the_speed_of_the_continuum_to_second_order(monkeypatch: py
 def test_a_cube_drawn_apart_yields_and_keeps_its_momentum() -> None:
     (row,) = materials.plasticine_alone(4e-3, 0.5e-3, 1)
     assert row.figures["yielded"] > 0.5
-    assert row.error < 1e-6
+    assert row.error < 3e-6  # 60 substeps round alike, since the stencils stay

@@ -84,8 +84,11 @@ def test_confined_compression_meets_its_closed_form() -> None:
 
 
 def test_a_free_body_keeps_its_momentum() -> None:
+    """Angular momentum of what does not move affinely changes with the deformation since the grid's reference, here
+    0.0005 while the body is torn about, and then no more."""
     (row,) = materials.momentum(1)
-    assert row.error < 1e-5
+    assert row.figures["momentum"] < 1e-5
+    assert row.figures["angular_momentum"] < 1e-3
     assert row.substeps == 5000
 
 

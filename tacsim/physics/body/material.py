@@ -282,3 +282,25 @@ def convect(e, d):
     m = d + d @ full(e)
     t = m + m.transpose() + m @ d.transpose()
     return e + vec6(t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2])
+
+
+@ti.func
+def gradient(rows: ti.template(), lane):
+    """H = F - I, from its columns."""
+    return mat3([[rows[3 * j + i, lane] for j in range(3)] for i in range(3)])
+
+
+@ti.func
+def inverse_of(h):
+    """F^-1 of F = I + h."""
+    f = h + mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    a, b, c = [vec3([f[i, j] for j in range(3)]) for i in range(3)]
+    bc, ca, ab = b.cross(c), c.cross(a), a.cross(b)
+    return (1.0 / a.dot(bc)) * mat3([[bc[i], ca[i], ab[i]] for i in range(3)])
+
+
+@ti.func
+def green(h):
+    """F^T F - I of F = I + h, which a rotation does not change."""
+    g = h + h.transpose() + h.transpose() @ h
+    return vec6(g[0, 0], g[1, 1], g[2, 2], g[0, 1], g[0, 2], g[1, 2])

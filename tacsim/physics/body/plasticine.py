@@ -15,7 +15,7 @@ from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NODES, aligned_zeros, padded
 from tacsim.physics.units import MM, MPA
 
-BORDER = 8  # [cells] that a grid is longer than its particles and their margin reach, at most
+BORDER = 4  # [cells] that a grid reaches beyond its particles' places, at most
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class BodyState:
         self.counts = [len(p) for p in points]
         self.rows = aligned_zeros(len(points), layout.PARTICLE_ROWS, row_length(max(self.counts)))
         for index, p in enumerate(points):
-            self.x(index)[...] = p
+            self.x(index)[...] = self.reference(index)[...] = p
             if planes is not None:
                 self.plane(index)[...] = planes[index]
         self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
@@ -90,6 +90,7 @@ class BodyState:
         self.counts[environment] = count
         self.rows[environment] = 0.0
         self.x(environment)[...], self.plane(environment)[...] = points, planes
+        self.reference(environment)[...] = points
 
     def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
         return self.rows[environment, first : first + count, : self.counts[environment]]
@@ -107,9 +108,23 @@ class BodyState:
         return self._rows(environment, layout.VELOCITY, 3).T
 
     def c(self, environment: int = 0) -> np.ndarray:
-        """Affine velocities, (n, 3, 3), a view."""
+        """Affine velocities over the places on the grid, (n, 3, 3), a view."""
         columns: np.ndarray = self.rows[environment, layout.AFFINE : layout.AFFINE + 9].reshape(3, 3, -1)
         return columns[..., : self.counts[environment]].T
+
+    def reference(self, environment: int = 0) -> np.ndarray:
+        """Places on the grid [mm], (n, 3), a view."""
+        return self._rows(environment, layout.REFERENCE, 3).T
+
+    def gradient(self, environment: int = 0) -> np.ndarray:
+        """Displacement gradients H since they were there, (n, 3, 3), a view."""
+        columns: np.ndarray = self.rows[environment, layout.GRADIENT : layout.GRADIENT + 9].reshape(3, 3, -1)
+        return columns[..., : self.counts[environment]].T
+
+    def deformation(self, environment: int = 0) -> np.ndarray:
+        """F = I + H, (n, 3, 3)."""
+        f: np.ndarray = np.eye(3, dtype=np.float32) + self.gradient(environment)
+        return f
 
     def e(self, environment: int = 0) -> np.ndarray:
         """Elastic strains b_e - I, (n, 6), a view."""
@@ -124,16 +139,33 @@ class BodyState:
         """Grid nodes that each environment may have: its share of what kernels can count, in all copies."""
         return MAX_NUMBERS // (4 * COPIES * len(self.rows))
 
-    def fit(self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray) -> None:
-        """Lays the grid of one environment round its particles: it follows the body, so no index is ever clamped.
+    def spin(self, environment: int = 0) -> np.ndarray:
+        """C F^T, (n, 3, 3): its skew part is that of the angular momentum, over mass dx^2/4."""
+        spin: np.ndarray = self.c(environment) @ self.deformation(environment).swapaxes(1, 2)
+        return spin
 
-        margin [mm]: what they may move during the launch. Writes origin, node counts and the parts' slabs of node
-        planes into `params` and `counts` (tacsim.physics.exec.layout).
+    def move_reference(self, environment: int) -> None:
+        """Moves the grid's reference to where the particles are now: there they are on the grid, undeformed.
+
+        What strains of the affine velocity is C F^-1; what spins keeps the angular momentum, mass dx^2/4 skew(C F^T).
+        """
+        c, f = self.c(environment), self.deformation(environment)
+        in_space = c @ np.linalg.inv(f)
+        more = (self.spin(environment) - in_space) / 2
+        c[...] = in_space + more - more.swapaxes(1, 2)
+        self.reference(environment)[...] = self.x(environment)
+        self.gradient(environment)[...] = 0.0
+
+    def fit(self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray) -> None:
+        """Lays the grid of one environment round its particles' places on it, so no index is ever clamped.
+
+        margin [mm]: what is left free round them. Writes origin, node counts and the parts' slabs of node planes into
+        `params` and `counts` (tacsim.physics.exec.layout).
 
         The memory of all environments grows if this one needs more; what stands in it lasts no longer than a substep.
         Raises MemoryError, with that memory as it was, where there is none.
         """
-        x = self.x(environment)
+        x = self.reference(environment)
         origin, shape = fit_grid(x, cell, margin)
         params[environment, layout.ORIGIN : layout.ORIGIN + 3] = origin
         counts[environment, layout.GRID : layout.GRID + 3] = shape
@@ -182,8 +214,15 @@ def centre_of(x: np.ndarray) -> np.ndarray:
 
 
 def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """Origin and node counts of a grid round the particles (n, 3) [mm]; whole strips along z."""
+    """Origin and node counts of a grid round the particles (n, 3) [mm]; whole strips along z.
+
+    The middle of the body is a node: what is symmetric about it stays so. margin: at least a cell.
+    """
     least, most = bounds(x)
-    low = np.floor((least - margin) / cell) * cell
-    counts = np.ceil((most + margin - low) / cell).astype(int) + 3
-    return low.astype(np.float32), (int(counts[0]), int(counts[1]), -(-int(counts[2]) // NODES) * NODES)
+    middle, reach = (least + most) / 2, np.ceil(((most - least) / 2 + margin) / cell).astype(int)
+    counts = 2 * reach + 2
+    return (middle - reach * cell).astype(np.float32), (
+        int(counts[0]),
+        int(counts[1]),
+        -(-int(counts[2]) // NODES) * NODES,
+    )

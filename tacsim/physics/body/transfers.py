@@ -7,6 +7,9 @@ whole vectors, too. What goes to nodes and comes from them is done particle by p
 line in a register; a stencil of three nodes begins at any node, a strip at every second one, so two strips hold it, and
 the node too many has weight 0.
 
+Stencils belong to where a particle was when the grid was laid, its reference, and stay; F = I + H is its deformation
+since then, and A = dv/dX its affine velocity over the reference (total-Lagrangian MPM: de Vaucorbeil et al. 2020).
+
 On a device LANES and NODES are 1, and all inner loops run once. Lanes behind the last particle stay zero.
 """
 
@@ -16,9 +19,14 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import (
     ELASTIC,
     convect,
+    full,
+    gradient,
+    green,
+    inverse_of,
     mat3,
     return_any_strain,
     return_small_strain,
+    square,
     stress_small_strain,
     vec6,
 )
@@ -33,6 +41,7 @@ from tacsim.physics.exec.lanes import (
     bounded,
     copy_of,
     four,
+    largest_lane,
     load_rows,
     opaque,
     overwrite,
@@ -172,7 +181,8 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
     slab = ti.static(slab_of(env, part, (env.index * COPIES + copy_of(part)) * env.count(layout.CAPACITY)))
     float_zero = ti.cast(zero, ti.f32)  # 0, but a 0 that the compiler knows would make a lane unlike its neighbours
     lost, spare = 0, opaque(zero, 16)
-    place = ti.Matrix.zero(ti.f32, 3, LANES)
+    place = ti.Matrix.zero(ti.f32, 3, LANES)  # on the grid
+    carried = ti.Matrix.zero(ti.f32, 9, LANES)  # displacement gradient
     old = ti.Matrix.zero(ti.f32, 7, LANES)  # elastic strain, plastic strain
     new = ti.Matrix.zero(ti.f32, 7, LANES)
     stress = ti.Matrix.zero(ti.f32, 6, LANES)
@@ -185,9 +195,10 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
         momentum[MOMENTUM + 3, lane] = mass
     for block in range(first_block, last_block):
         start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
-        load_rows(body.particles, start, stride, layout.POSITION, 3, place)
         load_rows(body.particles, start, stride, layout.STRAIN, 7, old)
         load_rows(body.particles, start, stride, layout.VELOCITY, 12, rate)
+        load_rows(body.particles, start, stride, layout.REFERENCE, 3, place)
+        load_rows(body.particles, start, stride, layout.GRADIENT, 9, carried)
         for lane in range(LANES):
             stencil(three(place, 0, lane), slab, grid, indices, lane)
         if yield_strain < ELASTIC:
@@ -213,10 +224,11 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
                 put(stress, 0, lane, tau)
                 new[6, lane] = plastic_strain
         for lane in range(LANES):
-            tau = six(stress, 0, lane)
-            ax = impulse * vec3(tau[0], tau[3], tau[4]) + inertia * three(rate, 3, lane)
-            ay = impulse * vec3(tau[3], tau[1], tau[5]) + inertia * three(rate, 6, lane)
-            az = impulse * vec3(tau[4], tau[5], tau[2]) + inertia * three(rate, 9, lane)
+            # P = tau F^-T: its columns are tau times the rows of F^-1
+            tau, back = full(six(stress, 0, lane)), inverse_of(gradient(carried, lane))
+            ax = impulse * (tau @ vec3([back[0, d] for d in range(3)])) + inertia * three(rate, 3, lane)
+            ay = impulse * (tau @ vec3([back[1, d] for d in range(3)])) + inertia * three(rate, 6, lane)
+            az = impulse * (tau @ vec3([back[2, d] for d in range(3)])) + inertia * three(rate, 9, lane)
             q = mass * three(rate, 0, lane)
             q -= grid[AT, lane] * ax + grid[AT + 1, lane] * ay + grid[AT + 2, lane] * az
             put(momentum, MOMENTUM, lane, q)
@@ -278,9 +290,9 @@ def slope(rows: ti.template(), row: ti.template(), lane, b, c):
 
 
 @ti.func
-def moved_plane(plane, x, y, z, dt):
-    """A tangent plane of the surface goes with the material, as F^-T does: m' = -C^T m; x, y, z: columns of C."""
-    return plane - dt * vec3(x.dot(plane), y.dot(plane), z.dot(plane))
+def moved_plane(plane, step):
+    """A tangent plane of the surface goes with the material, as F^-T does: m' = -L^T m; step: dt L."""
+    return plane - step.transpose() @ plane
 
 
 @ti.func
@@ -295,21 +307,26 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
     stride = env.count(layout.STRIDE)
     slab = ti.static(slab_of(env, part, env.index * env.count(layout.CAPACITY)))
     place = ti.Matrix.zero(ti.f32, 6, LANES)  # tangent plane, position
+    reference = ti.Matrix.zero(ti.f32, 3, LANES)  # place on the grid
+    carried = ti.Matrix.zero(ti.f32, 9, LANES)  # displacement gradient
     strain = ti.Matrix.zero(ti.f32, 6, LANES)
     rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
     grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
     indices = ti.Matrix.zero(ti.i32, INDICES, LANES)
     sums = ti.Matrix.zero(ti.f32, 12, LANES)  # SUM, BY_X, BY_Y, BY_Z: three numbers each
     nodes = ti.Matrix.zero(ti.f32, 4, 4 * NODES)  # the same of one particle, by nodes of a strip
-    extremes = ti.Matrix.zero(ti.f32, 7, LANES)  # fastest, sum of velocities, smallest volume of a step
+    # fastest, sum of velocities, smallest volume of a step, largest Green strain
+    extremes = ti.Matrix.zero(ti.f32, 8, LANES)
     for lane in range(LANES):
         extremes[6, lane] = 1e9
     for block in range(first_block, last_block):
         start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
         load_rows(body.particles, start, stride, layout.PLANE, 6, place)
         load_rows(body.particles, start, stride, layout.STRAIN, 6, strain)
+        load_rows(body.particles, start, stride, layout.REFERENCE, 3, reference)
+        load_rows(body.particles, start, stride, layout.GRADIENT, 9, carried)
         for lane in range(LANES):
-            stencil(three(place, 3, lane), slab, grid, indices, lane)
+            stencil(three(reference, 0, lane), slab, grid, indices, lane)
         count = ti.min(LANES, env.count(layout.PARTICLES) - block * LANES)
         for lane in range(count, LANES):  # behind the last particle
             for r in ti.static(range(12)):
@@ -343,15 +360,20 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
             x = factor * (three(sums, 3 * BY_X, lane) - grid[AT, lane] * velocity)
             y = factor * (three(sums, 3 * BY_Y, lane) - grid[AT + 1, lane] * velocity)
             z = factor * (three(sums, 3 * BY_Z, lane) - grid[AT + 2, lane] * velocity)
-            step = dt * mat3([[x[i], y[i], z[i]] for i in range(3)])
+            over_reference = dt * mat3([[x[i], y[i], z[i]] for i in range(3)])
+            step = over_reference @ inverse_of(gradient(carried, lane))
             volume = (mat3([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) + step).determinant()
             put(strain, 0, lane, convect(six(strain, 0, lane), step))
-            put(place, 0, lane, moved_plane(three(place, 0, lane), x, y, z, dt))
+            put(place, 0, lane, moved_plane(three(place, 0, lane), step))
             put(place, 3, lane, three(place, 3, lane) + dt * velocity)
             put(rate, 0, lane, velocity)
             put(rate, 3, lane, x)
             put(rate, 6, lane, y)
             put(rate, 9, lane, z)
+            put(carried, 0, lane, three(carried, 0, lane) + dt * x)
+            put(carried, 3, lane, three(carried, 3, lane) + dt * y)
+            put(carried, 6, lane, three(carried, 6, lane) + dt * z)
+            extremes[7, lane] = ti.max(extremes[7, lane], square(green(gradient(carried, lane))))
             for d in ti.static(range(3)):
                 extremes[d, lane] = ti.max(extremes[d, lane], ti.abs(velocity[d]))
                 extremes[3 + d, lane] += velocity[d]
@@ -359,12 +381,14 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
         store_rows(body.particles, start, stride, layout.PLANE, 6, place, zero)
         store_rows(body.particles, start, stride, layout.STRAIN, 6, strain, zero)
         store_rows(body.particles, start, stride, layout.VELOCITY, 12, rate, zero)
+        store_rows(body.particles, start, stride, layout.GRADIENT, 9, carried, zero)
     record_least(env, slot, layout.SMALLEST_STEP_VOLUME, smallest_lane(extremes, 6))
     fastest = 0.0
     for lane in ti.static(range(LANES)):
         for d in ti.static(range(3)):
             fastest = ti.max(fastest, extremes[d, lane])
     record_most(env, slot, layout.FASTEST, fastest)
+    record_most(env, slot, layout.GREEN, largest_lane(extremes, 7))
     if ti.static(not ON_DEVICE):  # which sums them block by block (tacsim.physics.worlds.device)
         for d in ti.static(range(3)):
             total = 0.0

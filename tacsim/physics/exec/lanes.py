@@ -149,6 +149,15 @@ def smallest_lane(rows: ti.template(), row: ti.template()):
 
 
 @ti.func
+def largest_lane(rows: ti.template(), row: ti.template()):
+    """Largest number of a row of lanes."""
+    most = rows[row, 0]
+    for lane in ti.static(range(1, LANES)):
+        most = ti.max(most, rows[row, lane])
+    return most
+
+
+@ti.func
 def share_start(count, part, parts):
     """Where share `part` of `count` things begins; it ends where the next begins."""
     return count * part // parts

@@ -27,7 +27,9 @@ SHAPE_SPACING = 31  # of its distance grid [mm]
 WIDENING = 32  # share of an incompressible body's widening that is part of the motion its damping is against
 CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
 INVERSE_INERTIA = 36  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
-PARAMS = 42
+REFERENCE_CENTRE = 42  # of the particles in the reference of the body's grid x, y, z [mm]
+CARRIED = 45  # mean displacement gradient of the particles since then, row by row
+PARAMS = 54
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite
@@ -54,7 +56,8 @@ FORCE = 6  # on gel 0, gel 1: force x, y, z [N], moment x, y, z [N mm]; of the l
 BACKING = 18  # force of this part's gel on its backing [N], of the last substep
 VELOCITY_SUM = 21  # sum of the particles' velocities
 HOUSING_FORCE = 24  # force on the housing of gel 0, gel 1: x, y, z [N]; of the last substep
-NUMBERS = 30
+GREEN = 30  # largest |F^T F - I|^2 of a particle, F its deformation since the grid's reference
+NUMBERS = 31
 
 # rows of a body's particles, one number of all of them each: float32
 PLANE = 0  # tangent plane x, y, z [1/mm] (tacsim.physics.body.surface)
@@ -62,5 +65,7 @@ POSITION = 3  # x, y, z [mm]
 STRAIN = 6  # elastic e = b_e - I: xx, yy, zz, xy, xz, yz
 PLASTIC_STRAIN = 12  # equivalent plastic strain
 VELOCITY = 13  # x, y, z
-AFFINE = 16  # affine velocity C, column by column [1/mm]
-PARTICLE_ROWS = 25
+AFFINE = 16  # affine velocity dv/dX over the grid's reference, column by column [1/mm]
+REFERENCE = 25  # place on the grid, which stays while the body moves: x, y, z [mm]
+GRADIENT = 28  # displacement gradient H = F - I since then, column by column
+PARTICLE_ROWS = 37

@@ -54,7 +54,7 @@ class Health:
     def clear(partial: NDArray[np.float32]) -> None:
         """Prepares the parts' numbers (..., PARTS, NUMBERS) for a launch; sums that outlive it stay."""
         partial[..., [layout.SMALLEST_VOLUME, layout.SMALLEST_STEP_VOLUME]] = 1e9
-        partial[..., [layout.OFF_GRID, layout.FASTEST, layout.CAPPED, layout.OVERLAP]] = 0.0
+        partial[..., [layout.OFF_GRID, layout.FASTEST, layout.CAPPED, layout.OVERLAP, layout.GREEN]] = 0.0
 
     @classmethod
     def read(cls, partial: NDArray[np.float32], courant: float = 0.0) -> Health:

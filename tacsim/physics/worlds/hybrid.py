@@ -26,6 +26,7 @@ from tacsim.physics.exec.layout import (
     BACKING,
     BODY_DAMPING,
     BODY_MASS,
+    CARRIED,
     CENTRE,
     COUNTS,
     ELEMENTS,
@@ -34,11 +35,13 @@ from tacsim.physics.exec.layout import (
     GEL_DAMPING,
     GEL_DENSITY,
     GRAVITY,
+    GREEN,
     HOUSING,
     HOUSING_FORCE,
     INVERSE_INERTIA,
     NUMBERS,
     PARAMS,
+    REFERENCE_CENTRE,
     RIGID_MASS_SCALE,
     STEP,
     STIFFNESS,
@@ -61,6 +64,7 @@ COURANT = 0.5
 # Damping of a driven motion falsifies its path, since gels yield and the body spreads; damping of the hold does not.
 ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
+LARGEST_GREEN = 0.3  # norm of F^T F - I since the reference of the body's grid: beyond, the grid is laid anew
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
 
@@ -147,7 +151,6 @@ class HybridWorld(FemWorld):
         self._rates = np.zeros((2, 6))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         self._mach = scene.peak_mach
-        self._speed = self._mach  # fastest particle seen in the last launch
         housing = scene.gel.housing
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
         self._body_force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
@@ -219,15 +222,9 @@ class HybridWorld(FemWorld):
         return {
             "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i],
             "position": b.x(i), "velocity": b.v(i), "affine": b.c(i), "strain": b.e(i), "flow": b.plastic_strain(i),
-            "planes": b.plane(i), "contact": state.contact_history[i, :, : b.counts[i]], "sums": state.partial[i],
+            "reference": b.reference(i), "gradient": b.gradient(i), "planes": b.plane(i),
+            "contact": state.contact_history[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
-
-    def _scalars(self) -> dict[str, np.ndarray]:
-        return {**super()._scalars(), "speed": np.array(self._speed)}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        super().restore(state)
-        self._speed = float(state["speed"])
 
     def truth(self) -> Truth:
         x, planes = self._state.particles.x(self._index), self._state.particles.plane(self._index)
@@ -239,32 +236,35 @@ class HybridWorld(FemWorld):
     def prepare(self, launch: Launch) -> PreparedLaunch:
         """Fits the grid and sets this environment's parameters. Raises SimulationDiverged for a grid too large."""
         state, index, path = self._state, self._index, launch.path
-        duration = (launch.last - launch.first) * path.dt
-        weight = float(np.linalg.norm(state.params[index, GRAVITY : GRAVITY + 3]))
-        fall = float(state.params[index, RIGID_MASS_SCALE]) * weight * duration
         drive = path.drive(launch.first, launch.last)
-        driven = max(self._mach, float(np.linalg.norm(drive[:, :, 4], axis=-1).max()))
-        margin = 2 * self._body.cell + 2 * duration * max(self._speed + fall, driven)
         span = path.span(self._poses, launch.first, launch.last)
-        x = state.particles.x(index)
-        low, high = bounds(x)
-        reach = margin + BORDER / 2 * self._body.cell
-        require_room(low - reach, high + reach, self._body.cell, span, state.particles.most)
+        particles, cell = state.particles, self._body.cell
+        if state.partial[index, :, GREEN].max() > LARGEST_GREEN**2:
+            particles.move_reference(index)
+        low, high = bounds(particles.reference(index))
+        require_room(low - BORDER * cell, high + BORDER * cell, cell, span, particles.most)
         try:
-            state.particles.fit(index, self._body.cell, margin, state.params, state.counts)
+            particles.fit(index, cell, cell, state.params, state.counts)
         except MemoryError as error:
             raise SimulationDiverged(f"no memory for the grid round the particles ({error})", span, NO_ROOM) from None
         before = copies(self.arrays())
         state.params[index, STEP] = path.step
-        self._write_body_inertia(x)
+        self._write_body_inertia()
         self._write_inertia(launch)
         Health.clear(state.partial[index])
         return PreparedLaunch(launch, drive, span, before)
 
-    def _write_body_inertia(self, x: np.ndarray) -> None:
-        """Centre and inverse moment of inertia of the particles (n, 3) [mm], where the kernels find them."""
-        params = self._state.params[self._index]
-        centre = centre_of(x)
+    def _write_body_inertia(self) -> None:
+        """Centre, inverse moment of inertia and mean motion of the particles since their reference, for the kernels."""
+        params, x = self._state.params[self._index], self._state.particles.x(self._index)
+        reference = self._state.particles.reference(self._index)
+        centre, reference_centre = centre_of(x), centre_of(reference)
+        arms = (reference - reference_centre).T
+        moved = (x - centre).T - arms
+        params[REFERENCE_CENTRE : REFERENCE_CENTRE + 3] = reference_centre
+        params[CARRIED : CARRIED + 9] = (
+            moved @ arms.T @ np.linalg.pinv(arms @ arms.T, rcond=1e-6, hermitian=True)
+        ).ravel()
         arms = x.T - centre[:, None]
         second = arms @ arms.T * float(params[BODY_MASS])
         inertia = np.trace(second) * np.eye(3) - second
@@ -276,7 +276,6 @@ class HybridWorld(FemWorld):
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         health = check_launch(self.arrays(), prepared.before, Health.read(partial, self._courant()), prepared.span)
-        self._speed = health.fastest
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)

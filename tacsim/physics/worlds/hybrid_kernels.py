@@ -107,6 +107,8 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
     driven = held * (v0.norm_sqr() + v1.norm_sqr() + w0.norm_sqr() + w1.norm_sqr()) > 0.0
     mean_across = mean - axis * (mean.dot(axis) / length2)
     widening = -0.5 * env.param(layout.WIDENING) * share * (v1 - v0).dot(axis) / length2
+    reference_centre = env.param3(layout.REFERENCE_CENTRE)
+    carried = ti.Matrix([[env.param(layout.CARRIED + 3 * i + j) for j in range(3)] for i in range(3)])
     nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
     base = env.index * env.count(layout.CAPACITY)
     nz = nz // NODES  # strips
@@ -124,7 +126,8 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
                     if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
-                        x = origin + cell * vec3(i, j, k * NODES + n)
+                        arm = origin + cell * vec3(i, j, k * NODES + n) - reference_centre
+                        x = centre + arm + carried @ arm
                         velocity = vec3(q[4 * n], q[4 * n + 1], q[4 * n + 2]) / q[4 * n + 3] + dt * weight
                         velocity += boost + turn.cross(x - centre)
                         t = only_upper + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))

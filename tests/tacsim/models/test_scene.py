@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from tacsim.models.quantity import Config
 from tacsim.models.rig import RepositionConfig, RigConfig, SimArmConfig, SqueezeConfig
-from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Indenter, Mesh, Scene, Settling, Sphere
+from tacsim.models.scene import Body, BodyMaterial, Box, Gel, GelMaterial, Indenter, Mesh, Scene, Settling, Sphere, lame
 from tacsim.models.sensor import CanonicalGrid
 
 
@@ -141,7 +141,13 @@ def test_a_smaller_tolerance_goes_slower_within_bounds() -> None:
 def test_what_yields_at_a_small_strain_goes_slower() -> None:
     soft, stiff = clay(0.5e6), clay(10e6)
     assert Scene(body=soft).peak_mach == 0.03
-    assert Scene(body=stiff).peak_mach == pytest.approx(1.5 * stiff.material.elastic_limit)
+    mu, lam = lame(stiff.material)
+    yield_stress = 2 * mu * stiff.material.elastic_limit
+    assert Scene(body=stiff).peak_mach == pytest.approx(4 * yield_stress / (lam + 2 * mu))
+    # the bulk counts: what a motion costs in stress grows with it, at the same yield
+    clays = [BodyMaterial(yield_stress=30e3, poisson_ratio=nu) for nu in (0.45, 0.49, 0.499)]
+    compressed = [Scene(body=Body(material=material)) for material in clays]
+    assert [scene.peak_mach for scene in compressed] == pytest.approx([0.03, 0.0114, 0.00117], rel=0.01)
     assert Scene(body=clay(1e12)).peak_mach == 0.001
 
 

@@ -57,7 +57,7 @@ def flow(n: ti.i32, planes: Points, columns: Points, dt: ti.f32):
     ti.loop_config(serialize=True)
     for _ in range(n):
         for p in range(planes.shape[0]):
-            planes[p] = moved_plane(planes[p], columns[0], columns[1], columns[2], dt)
+            planes[p] = moved_plane(planes[p], dt * ti.Matrix.cols([columns[0], columns[1], columns[2]]))
 
 
 def test_planes_go_with_the_material() -> None:

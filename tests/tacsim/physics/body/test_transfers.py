@@ -77,3 +77,32 @@ def test_a_body_that_never_yields_runs_no_return_mapping(limit: float, yields: b
         assert shear[2] == pytest.approx(shear[0], rel=0.1)
     else:
         assert shear[2] > 2 * shear[0]
+
+
+def test_elastic_strain_is_that_of_the_deformation() -> None:
+    """b_e = F F^T of what never yields, however it swings: strain is a function of where the grid's nodes are, so no
+    cycle leaves any in it."""
+    body = block(body_params(ELASTIC_BODY, 0.5e-3), 0.5e-3)
+    x = body.state.x().astype(np.float64)
+    body.state.v()[:] = 0.6 * (x @ GRADIENT.T + np.einsum("dij,ni,nj->nd", CURVATURE, x, x))
+    body.advance(200)
+    f = body.state.deformation().astype(np.float64)
+    strain = (f @ f.swapaxes(1, 2) - np.eye(3))[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    assert np.abs(strain).max() > 0.02  # and rounding is a thousandth of it
+    assert body.state.e() == pytest.approx(strain, abs=2e-5)
+
+
+def test_a_new_reference_changes_neither_state_nor_motion() -> None:
+    """Places, speeds, strains, the rate of strain in space and the angular momentum stay."""
+    body = block(body_params(ELASTIC_BODY, 0.5e-3), 0.5e-3)
+    body.state.v()[:] = body.state.x() @ GRADIENT.T
+    body.advance(10)
+    x, v, e = (a.copy() for a in (body.state.x(), body.state.v(), body.state.e()))
+    f = body.state.deformation()
+    straining, spinning = body.state.c() @ np.linalg.inv(f), body.state.c() @ f.swapaxes(1, 2)
+    body.state.move_reference(0)
+    assert np.array_equal(body.state.x(), x) and np.array_equal(body.state.v(), v) and np.array_equal(body.state.e(), e)
+    assert np.array_equal(body.state.reference(), x) and not body.state.gradient().any()
+    c = body.state.c()
+    assert c + c.swapaxes(1, 2) == pytest.approx(straining + straining.swapaxes(1, 2), abs=1e-6)
+    assert c - c.swapaxes(1, 2) == pytest.approx(spinning - spinning.swapaxes(1, 2), abs=1e-6)

@@ -200,7 +200,8 @@ def test_a_state_broken_before_is_told_in_its_place(fresh: Batch) -> None:
 def test_a_body_far_away_enlarges_no_array_but_the_grid(fresh: Batch) -> None:
     arrays = fresh._state.particles.rows, fresh._state.contact_history, fresh._state.gels.nodes
     nodes = fresh._state.particles.masses.shape[2]
-    fresh.worlds[0].arrays()["position"][-1] += [0.0, 60.0, 0.0]
+    for place in ("position", "reference"):
+        fresh.worlds[0].arrays()[place][-1] += [0.0, 60.0, 0.0]
     stats = fresh.move([STAY, closed(fresh.worlds[1], 0.4e-3), None])[1]
     assert fresh._state.particles.masses.shape[2] > nodes
     assert all(a is b for a, b in zip(
@@ -232,7 +233,8 @@ def test_one_that_needs_more_grid_than_its_share_is_told_alone() -> None:
     most = batch._state.particles.most
     assert most < LARGEST_GRID and 4 * COPIES * 4 * most <= MAX_NUMBERS
     way = (most ** (1 / 3) - 9) * 2 * SCENES[0].spacing * 1e3  # [mm]; body and borders are another 17 cells
-    batch.worlds[1].arrays()["position"][-1] += [way, way, way]
+    for place in ("position", "reference"):
+        batch.worlds[1].arrays()[place][-1] += [way, way, way]
     before = [state(world) for world in batch.worlds]
     failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 1)
     for words in ("spread over", "nodes (limit", "substeps 0 to", "restore a snapshot"):
@@ -250,7 +252,8 @@ def test_one_for_whose_grid_there_is_no_memory_is_told_alone(monkeypatch: pytest
         return zeros(*shape)
 
     monkeypatch.setattr(plasticine, "aligned_zeros", scarce)  # the second array of the two that grow
-    batch.worlds[2].arrays()["position"][-1] += [0.0, 400.0, 0.0]
+    for place in ("position", "reference"):
+        batch.worlds[2].arrays()[place][-1] += [0.0, 400.0, 0.0]
     before = [state(world) for world in batch.worlds]
     failure = out_of_room(batch.move([closed(world, 0.3e-3) for world in batch.worlds]), batch, before, 2)
     assert "no memory for the grid round the particles (Unable to allocate)" in str(failure)

@@ -32,7 +32,7 @@ from tacsim.physics.worlds.press import PressWorld
 
 SECONDS = 600  # for one process; a first run compiles
 GEL = Gel(size=(5e-3, 4e-3, 2e-3))
-QUICK = {"mach": 0.1, "tolerance": 0.4, "max_substeps": 40}  # few substeps: a device that is a processor is slow
+QUICK = {"mach": 0.1, "tolerance": 0.4, "max_substeps": 60}  # few substeps: a device that is a processor is slow
 
 
 def press(geometry: Shape) -> Scene:

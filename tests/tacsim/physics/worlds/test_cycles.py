@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Scene
+from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Scene
 from tacsim.physics.failure.diagnosis import particle_volumes
 from tacsim.physics.worlds.hybrid import HybridWorld
 
@@ -38,3 +38,23 @@ def test_flowing_to_and_fro_writes_nothing_into_the_body(along: tuple[float, flo
     assert late == pytest.approx(early, rel=0.004)
     assert [after.min(), after.max()] == pytest.approx([before.min(), before.max()], abs=0.002)
     assert after.min() > 0.96 and after.max() < 1.02
+
+
+@pytest.mark.deep
+@pytest.mark.xfail(strict=True, reason="inertia's overshoot at every reversal yields: 4.7 % are lost in 12 cycles")
+def test_the_first_settled_cycles_take_nothing() -> None:
+    """Axisymmetric finite elements (quadratic, multiplicative Hencky plasticity, implicit, h 0.5 mm) of this cylinder
+    between discs of gel, 2.0 to 2.3 mm and back: 2.934, 2.933, 2.933 N."""
+    world = HybridWorld(Scene(body=CUBE.model_copy(update={"geometry": Cylinder(radius=5e-3, height=10e-3)})))
+    lower, upper = (world.pose(name) for name in world.sensors)
+
+    def close(by: float) -> float:
+        way = np.array([0.0, 0.0, by / 2 + 0.1e-3])
+        world.move({"lower": Pose(way), "upper": Pose(upper.position - way, upper.quaternion)})
+        return -world.wrench("lower")[2]
+
+    assert not lower.position.any()
+    close(0.1e-3)
+    forces = [close(by) for by in [2.0e-3, 2.3e-3] * 12][1::2]
+    assert forces[0] == pytest.approx(2.934, rel=0.03)
+    assert forces[-1] == pytest.approx(forces[0], rel=0.01)

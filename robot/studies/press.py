@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_fill_holes
 from scipy.spatial.transform import Rotation
 
 from tacsim import pose as se3
@@ -20,17 +19,14 @@ from tacsim.models.scene import Gel, Scene, Shape
 from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
-from tacsim.optics.surface import SurfaceSample, sample_surface
+from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
 from tacsim.physics.move import MoveStats
-from tacsim.physics.world import World, make_world
+from tacsim.physics.worlds.press import PressWorld
 
-# A surface point nearer to the indenter than this share of a gel element is in contact: the gel surface is a spline on
-# its elements, which follows the indenter no closer. Enlarges the radius of a ball's contact by about 4 %.
-CONTACT_GAP = 0.01
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
 MAX_TWIST = math.radians(3600.0)
 MAX_SLIDE = 3.0  # widths of the gel: beyond, it has left the gel
-SPLINE_RIPPLE = 0.2  # share of an element by which the spline ripples under a flat face; counts within a contact
+NEAR = 0.2  # elements: a surface point farther from the indenter is not pressed
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +59,7 @@ def press(scene: Scene, sensor: SensorModel, motion: PressMotion) -> PressResult
     if scene.indenter is None:
         raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")
     _require_reachable(scene.gel, motion)
-    world = make_world(scene)
+    world = PressWorld(scene)
     targets = _targets(world.pose("indenter"), scene.indenter.geometry, motion)
     moves = tuple(world.move({"indenter": target}) for target in targets)
     surface = world.surface("lower")
@@ -104,23 +100,22 @@ def _targets(start: Pose, geometry: Shape, motion: PressMotion) -> list[Pose]:
     return targets
 
 
-def _contact(world: World, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
-    """(H, W) True where the surface seen by a pixel lies on the indenter."""
+def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
+    """(H, W) True where the indenter presses on the surface seen by a pixel."""
     assert scene.indenter is not None
     geometry = scene.indenter.geometry
     grid = image_grid(sensor.geometry)
     gel = np.concatenate([grid.points(), -seen.height[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
     sensor_pose, indenter = world.pose("lower"), world.pose("indenter")
     at = se3.transform(se3.relative(indenter, sensor_pose), gel)
-    near = (np.abs(at) <= extent(geometry) / 2 + SPLINE_RIPPLE * scene.element).all(axis=1) & seen.valid.ravel()
+    near = (np.abs(at) <= extent(geometry) / 2 + NEAR * scene.element).all(axis=1) & seen.valid.ravel()
     gaps = np.full(len(at), np.inf)
     if near.any():
         gaps[near] = distance(geometry, at[near])
-    gap = gaps.reshape(seen.valid.shape)
-    reach = max(1, round(scene.element / sensor.geometry.pixel_pitch))
-    joined = binary_closing(gap <= CONTACT_GAP * scene.element, iterations=reach)
-    enclosed: NDArray[np.bool_] = binary_fill_holes(joined)
-    return enclosed & (gap <= SPLINE_RIPPLE * scene.element)
+    table = SurfaceTable(world.surface("lower"))
+    reach, _ = table.seen(table.of_nodes(world.reach().astype(np.float32)), grid)
+    pressed: NDArray[np.bool_] = gaps.reshape(seen.valid.shape) < reach.reshape(seen.valid.shape)
+    return pressed
 
 
 def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor: SensorModel) -> dict[str, Any]:

@@ -74,6 +74,13 @@ class SurfaceTable:
         self.fields, self._lateral = _table(surface)
         self._pitch = surface.spacing / _table_points(surface)  # [m]
 
+    def of_nodes(self, values: Float32) -> Float32:
+        """(rows, columns, 1) at the table's points of the spline whose control values are `values` (nx, ny)."""
+        points = _table_points(self._surface)
+        along_x, _ = _table_matrices(values.shape[0], points)
+        along_y, _ = _table_matrices(values.shape[1], points)
+        return np.asarray((along_y @ (along_x @ values).T)[..., None], np.float32)
+
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
         (rows, columns), pitch = self.fields.shape[:2], np.float32(self._pitch)

@@ -1,25 +1,30 @@
 """A rigid indenter on the gel surface: signed distance, and contact by area-weighted quadrature on the surface.
 
-Each surface cell carries 3 x 3 points of equal area. Normal pressure is a penalty plus a multiplier that remembers
-(augmented Lagrangian, Simo & Laursen 1992), so that at rest hardly anything overlaps; friction remembers its elastic
-slip. Everything is in the sensor frame [mm, MPa].
+Each surface cell carries 3 x 3 points of equal area. Normal pressure is what the surface's nodes carry (a multiplier
+that remembers; augmented Lagrangian, Simo & Laursen 1992) plus what a point adds to it by the overlap there: the gel
+gives way between nodes as a half-space does, though the mesh cannot. Friction remembers its elastic slip. Everything is
+in the sensor frame [mm, MPa]. Why: docs/physics.md.
 """
 
 from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.contact.contact import (
-    CONTACT_DAMPING,
-    TANGENT_STIFFNESS,
-    friction,
-    normal_force,
-    spline,
-    surface_node,
-    surface_sum,
-)
+from tacsim.physics.contact.contact import CONTACT_DAMPING, MEMORY_RATE, friction, surface_node
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_most, record_sum
-from tacsim.physics.exec.lanes import ON_DEVICE, add_four, copy_of, part_range, slot_of, vec3, vec4
+from tacsim.physics.exec.lanes import (
+    COPIES,
+    LANES,
+    ON_DEVICE,
+    PARTS,
+    add_four,
+    copy_of,
+    part_range,
+    share_start,
+    slot_of,
+    vec3,
+    vec4,
+)
 from tacsim.physics.gel.kernels import contact_force_start, surface_at, surface_row
 
 Slip = ti.types.ndarray(dtype=vec3, ndim=3)
@@ -28,18 +33,24 @@ Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
 SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
-# Share of the pressure that the overlap carries at rest. With none of it, nine points on a surface cell share a
-# pressure in any way, it wanders among them, and what loses it lets go of its shear.
-COMPLIANCE = 0.1
+# The surface under the points is that of the nodes, smoothed by this share of (k h)^2 of each wave of number k.
+# Elements with one integration point are twice that too soft for it (0.124 along the lattice, 0.135 across), and the
+# surface acts twice, in what it feels and in what it hands on: a wave finds the half-space, to fourth order.
+SMOOTHING = 0.065
+SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
+TANGENT_STIFFNESS = 0.25  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
 UNKNOWN = 1e9  # distance where none is known
+FORGOTTEN = 1e-6  # shear moduli: a pressure below that is none
 CELL_REACH = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
 
 
 class Indenter(NamedTuple):
-    """The indenters of all environments inside a kernel: memory of the quadrature points, distances from a mesh."""
+    """The indenters of all environments inside a kernel: memory of the quadrature points, pressure that the surface's
+    nodes carry, distances from a mesh."""
 
     slip: Any
     pressure: Any
+    carried: Any
     values: Any
 
 
@@ -125,6 +136,77 @@ def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
     return phi, n
 
 
+def point_weights() -> tuple[tuple[float, ...], ...]:
+    """Of the two nodes before and the two after a cell's middle, at each point along it: right for whatever is linear,
+    and for a parabola but for SMOOTHING, which is the same at all points."""
+    first = 0.5 / POINTS  # distance from the nearest node; the middle one has two
+    spread = first**2 + 2 * SMOOTHING
+    near, far = (spread - first) / 2, (spread + first) / 2
+    edge = (SMOOTHING - SPLINE_SMOOTHING) / 2
+    return (near, 1 - near - far, far, 0.0), (edge, 0.5 - edge, 0.5 - edge, edge), (0.0, far, 1 - near - far, near)
+
+
+POINT_WEIGHTS = point_weights()
+
+
+@ti.func
+def weights_of(point):
+    """Of the four nodes round a cell along one axis, for its point number `point`."""
+    w = vec4([ti.static(POINT_WEIGHTS[0][c]) for c in range(4)])
+    if point > 0:
+        w = vec4([ti.static(POINT_WEIGHTS[1][c]) for c in range(4)])
+    if point > 1:
+        w = vec4([ti.static(POINT_WEIGHTS[2][c]) for c in range(4)])
+    return w
+
+
+@ti.func
+def patch_sum(gels: ti.template(), row, i, j, wx, wy):
+    """Sum of a surface quantity over the 4 x 4 nodes round cell (i, j); row: the quantity's first."""
+    total = vec3(0.0)
+    for p, q in ti.static(ti.ndrange(4, 4)):
+        at = surface_at(gels, row + i + p, j + q)
+        total += (wx[p] * wy[q]) * vec3([gels.surface[at + c] for c in range(3)])
+    return total
+
+
+@ti.func
+def carried_pressure(e, gels: ti.template(), indenter: ti.template(), i, j, wx, wy):
+    """The same sum of the pressure that the nodes carry."""
+    total = 0.0
+    for p, q in ti.static(ti.ndrange(4, 4)):
+        x, y = ti.max(0, ti.min(i + p - 1, gels.nx)), ti.max(0, ti.min(j + q - 1, gels.ny))
+        total += wx[p] * wy[q] * indenter.carried[e, x, y]
+    return total
+
+
+@ti.func
+def carry(env: ti.template(), part, gels: ti.template(), indenter: ti.template()):
+    """Nodes take over a share of the pressure on them: this part's; on a device a part is one node."""
+    e, row = env.index, gels.ny + 1
+    count, h = (gels.nx + 1) * row, env.param(layout.GEL_SPACING)
+    blocks = (count + LANES - 1) // LANES
+    first, last = share_start(blocks, part, PARTS), share_start(blocks, part + 1, PARTS)
+    if ti.static(ON_DEVICE):
+        first, last = part, part + 1
+    for node in range(first * LANES, ti.min(last * LANES, count)):
+        total = 0.0
+        for copy in ti.static(range(COPIES)):
+            at = contact_force_start(env, gels, copy, 0) + 4 * node + 3
+            total += gels.contact_force[at]
+            gels.contact_force[at] = 0.0
+        i, j = node // row, node % row
+        area = h * h
+        if i == 0 or i == gels.nx:
+            area *= 0.5
+        if j == 0 or j == gels.ny:
+            area *= 0.5
+        old = indenter.carried[e, i, j]
+        # what hardly presses any more is let go of, not halved for ever
+        new = old + MEMORY_RATE * (total / area - old)
+        indenter.carried[e, i, j] = ti.select(total == 0.0 and new < FORGOTTEN * env.param(layout.GEL_MU), 0.0, new)
+
+
 @ti.func
 def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template(), indenter: ti.template()):
     """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
@@ -142,7 +224,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
     rows = [vec3([drive[e, it, 0, r, c] for c in range(3)]) for r in range(6)]
     rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
     area = h * h / (POINTS * POINTS)
-    c_n = CONTACT_DAMPING * k_n * dt
+    c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
     back = rotate.transpose()
     total, moment = vec3(0.0), vec3(0.0)
     deepest = 0.0
@@ -178,23 +260,25 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
             else:
                 for point in range(POINTS * POINTS):
                     i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
-                    a, b = (i + 0.5) / POINTS, (j + 0.5) / POINTS
-                    first_i, wx, _dx = spline(a)
-                    first_j, wy, _dy = spline(b)
-                    us = surface_sum(gels, row, first_i, first_j, wx, wy)
-                    vs = surface_sum(gels, row + nx + 3, first_i, first_j, wx, wy)
-                    x = vec3((a - 0.5 * nx) * h + us[0], (b - 0.5 * ny) * h + us[1], us[2])
+                    wx, wy = weights_of(point // POINTS), weights_of(point % POINTS)
+                    us = patch_sum(gels, row, cell_i, cell_j, wx, wy)
+                    at_rest = vec3((i + 0.5) / POINTS - 0.5 * nx, (j + 0.5) / POINTS - 0.5 * ny, 0.0)
+                    x = h * at_rest + us
                     phi, n_local = signed_distance(env, kind, size, back @ (x - centre), grid)
                     touching = False
                     if phi < 0.5 * h:
+                        pressure = carried_pressure(e, gels, indenter, cell_i, cell_j, wx, wy) - k_n * phi
+                        vs = patch_sum(gels, row + nx + 3, cell_i, cell_j, wx, wy)
                         n = rotate @ n_local  # out of the indenter: pushes the gel
-                        moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
+                        moving = velocity + spin.cross(x - centre) - vs  # relative to the gel
                         closing = moving.dot(n)
-                        spring, memory = -k_n * phi, indenter.pressure[e, i, j]
-                        normal, memory = normal_force(spring, memory, -c_n * closing, COMPLIANCE)
+                        normal = pressure + c_n * closing
                         if normal > 0.0:
                             touching = True
                             sliding = moving - closing * n
+                            rest = ti.max(pressure, 0.0)
+                            memory = indenter.pressure[e, i, j]
+                            memory += MEMORY_RATE * (rest - memory)
                             ft, slip = friction(
                                 indenter.slip[e, i, j], n, sliding, mu * memory, TANGENT_STIFFNESS * k_n, c_n, dt
                             )
@@ -204,9 +288,9 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                             total += force
                             moment += x.cross(force)
                             deepest = ti.max(deepest, -phi)
-                            push = vec4(force[0], force[1], force[2], 0.0)
-                            for p, q in ti.static(ti.ndrange(3, 3)):
-                                node = surface_node(gels, first_i + p, first_j + q)
+                            push = vec4(force[0], force[1], force[2], area * rest)
+                            for p, q in ti.static(ti.ndrange(4, 4)):
+                                node = surface_node(gels, cell_i + p - 1, cell_j + q - 1)
                                 add_four(gels.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
                     if not touching:
                         indenter.slip[e, i, j] = vec3(0.0)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,17 +10,20 @@ from tacsim.compute.runtime import start, ti
 from tacsim.geometry.shapes import MAX_NODES, extent, farthest
 from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
 from tacsim.interface import Pose
-from tacsim.models.scene import Box, Cylinder, Mesh, Scene, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, GelSurface, Mesh, Scene, Shape, Sphere
 from tacsim.physics.contact.indenter import (
     BOX,
     CYLINDER,
     GRID,
     POINTS,
+    SMOOTHING,
     SPHERE,
+    SPLINE_SMOOTHING,
     Indenter,
     Pressure,
     Slip,
     Values,
+    carry,
     indent,
 )
 from tacsim.physics.exec import layout
@@ -83,7 +87,7 @@ TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller
 def press_substeps(
     team: ti.i32, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    slip: Slip, pressure: Pressure, values: Values,
+    slip: Slip, pressure: Pressure, carried: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
@@ -93,7 +97,7 @@ def press_substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indenter = ti.static(Indenter(slip, pressure, values))
+            indenter = ti.static(Indenter(slip, pressure, carried, values))
             pieces = 2 * PARTS * env.count(layout.STEPS)  # two stages a substep: forces, then motion
             piece = next_piece(sync, turn, pieces)
             while piece < pieces:
@@ -102,9 +106,27 @@ def press_substeps(
                     indent(env, part, stage // 2, drive, gels, indenter)
                     gel_forces(env, part, gels)
                 for _motion in range(once_if(stage % 2 == 1)):
+                    carry(env, part, gels, indenter)
                     gel_advance(env, part, gels)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, pieces)
+
+
+def contact_stiffness(gel: GelParams, step: float) -> float:
+    """Of a contact point [MPa/mm]: that of a half-space to the shortest wave of pressure that the points can carry, but
+    no more than the mass of the surface's nodes allows in a `step` [mm]."""
+    mu, lam = gel.mu, gel.lam
+    half_space = (2 * math.pi * POINTS / gel.spacing) * 2 * mu * (lam + mu) / (lam + 2 * mu)  # k E / (2 (1 - nu^2))
+    return min(half_space, gel.density * gel.spacing / (2 * step**2))
+
+
+def sharpened(nodes: np.ndarray, share: float) -> np.ndarray:
+    """(nx, ny, 3) less `share` of their second differences along either axis; beyond the rim they repeat."""
+    out = np.asarray(nodes, np.float64)
+    for axis in (0, 1):
+        padded = np.pad(out, [(int(d == axis),) * 2 for d in range(3)], mode="edge")
+        out = out - share * np.diff(padded, 2, axis=axis)
+    return out.astype(np.float32)
 
 
 def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
@@ -134,7 +156,8 @@ class PressState:
         self.gels = GelState(lattice, len(scenes), 1)
         nx, ny, _ = lattice.elements
         self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
-        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # that normal contact remembers [MPa]
+        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
+        self.carried = np.zeros((len(scenes), nx + 1, ny + 1), np.float32)  # pressure that the nodes carry [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
@@ -192,13 +215,14 @@ class PressState:
         self.gels.refresh()
         if ON_DEVICE:
             run_press(
-                self._device_arrays, drive, self.gels, self.slip, self.pressure, self._values, self._covered,
+                self._device_arrays, drive, self.gels, self.slip, self.pressure, self.carried, self._values,
+                self._covered,
                 (self.params, self.counts, self.partial),
             )  # fmt: skip
         else:
             run_team(
-                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values, self.params,
-                self.counts, self.partial, active=list(drives),
+                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self.carried, self._values,
+                self.params, self.counts, self.partial, active=list(drives),
             )  # fmt: skip
 
 
@@ -221,7 +245,7 @@ class PressWorld(FemWorld):
         self._true = Inertia({GEL_DAMPING: 0.0}, step, kernel_second(self._gel, scene.gel.material.density))
         self._floor = force_floor(scene.gel.material.youngs_modulus * MPA, self._gel.thickness)
         params = {
-            **self._gel.params(), STIFFNESS: self._gel.density * self._gel.spacing / (2 * step**2),
+            **self._gel.params(), STIFFNESS: contact_stiffness(self._gel, step),
             FRICTION: scene.indenter.friction,
         }  # fmt: skip
         self._state.params[index, list(params)] = list(params.values())
@@ -234,11 +258,21 @@ class PressWorld(FemWorld):
     def _stop(self) -> None:
         self._state.gels.v[self._index] = 0.0
 
+    def surface(self, name: str) -> GelSurface:
+        """The surface that its contact points lie on, which smooths the nodes less than their spline does."""
+        of_nodes = super().surface(name)
+        return replace(of_nodes, displacement=sharpened(of_nodes.displacement, SPLINE_SMOOTHING - SMOOTHING))
+
+    def reach(self) -> np.ndarray:
+        """How far from the indenter the surface is still pressed [m], at its nodes (nx + 1, ny + 1)."""
+        stiffness = float(self._state.params[self._index, STIFFNESS])
+        return np.asarray(self._state.carried[self._index] / (stiffness * MM))
+
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         return {
             "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "slip": state.slip[i],
-            "pressure": state.pressure[i], "sums": state.partial[i],
+            "pressure": state.pressure[i], "carried": state.carried[i], "sums": state.partial[i],
         }  # fmt: skip
 
     def truth(self) -> None:

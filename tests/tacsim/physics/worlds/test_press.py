@@ -9,8 +9,7 @@ import pytest
 from tacsim.geometry import tiles
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, Gel, GelMaterial, Indenter, Mesh, Scene, Shape, Sphere
-from tacsim.physics.contact.indenter import COMPLIANCE, POINTS
-from tacsim.physics.exec.layout import STIFFNESS
+from tacsim.physics.contact.indenter import POINTS
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.oracle.layer import layer_contact
@@ -66,10 +65,34 @@ def test_a_nearly_incompressible_gel_does_not_lock() -> None:
     assert -w.wrench("lower")[2] == pytest.approx(layer_force(4e-3, 0.3e-3, 0.49), rel=0.05)
 
 
-def left_over(w: PressWorld) -> float:
-    """The overlap [m] that carries the share COMPLIANCE of the largest pressure."""
-    stiffness = float(w._state.params[0, STIFFNESS])
-    return COMPLIANCE * float(w._state.pressure.max()) / stiffness * 1e-3
+# Axisymmetric finite elements of our own (quadratic, finite strain, rigid ball by a stiff penalty, converged to 0.1 %):
+# radius and depth [mm], force [N]; nu 0.48, no friction, element 0.5 mm here.
+BALLS = [(2.0, 0.1, 0.0126), (2.0, 0.3, 0.0709), (4.0, 0.1, 0.0190), (4.0, 0.3, 0.1149), (8.0, 0.1, 0.0295)]
+
+
+@pytest.mark.parametrize(("radius", "depth", "force"), BALLS)
+def test_a_shallow_ball_presses_as_on_a_half_space_though_its_contact_is_an_element_wide(
+    radius: float, depth: float, force: float
+) -> None:
+    gel = Gel(material=GelMaterial(poisson_ratio=0.48))
+    w = world(Sphere(radius=radius * 1e-3), 0.0, preset="standard", gel=gel)
+    move(w, (0, 0, -(depth + 0.1) * 1e-3))
+    assert -w.wrench("lower")[2] == pytest.approx(force, rel=0.04)
+
+
+def test_a_flat_punch_is_no_wider_than_it_is() -> None:
+    """By the same finite elements, 0.1 mm deep: its rim is where it is in force and in the moment of a twist."""
+    gel = Gel(material=GelMaterial(poisson_ratio=0.48))
+    for radius, force in ((2e-3, 0.1428), (3e-3, 0.2936)):
+        w = world(Cylinder(radius=radius, height=4e-3), 0.0, preset="standard", gel=gel)
+        move(w, (0, 0, -0.2e-3))
+        assert -w.wrench("lower")[2] == pytest.approx(force, rel=0.04)
+    w = world(Cylinder(radius=3e-3, height=4e-3), 5.0, tolerance=1e-4, preset="standard", gel=gel)
+    move(w, (0, 0, -0.2e-3))
+    before, turn = w.wrench("lower")[5], np.radians(1.0)
+    move(w, (0, 0, 0), turn)
+    stiffness = 1.032 * 16 / 3 * 0.145e6 / (2 * 1.48) * 3e-3**3  # of a bonded disc on the layer
+    assert w.wrench("lower")[5] - before == pytest.approx(stiffness * turn, rel=0.04)
 
 
 def test_hardly_anything_overlaps_at_rest_and_backing_balances_contact() -> None:
@@ -80,7 +103,7 @@ def test_hardly_anything_overlaps_at_rest_and_backing_balances_contact() -> None
     assert stats.substeps > stats.hold > 0
     for _ in range(10):
         stats = w.move({})
-    assert stats.overlap < 1.1 * left_over(w) < 13e-6  # the memory goes on taking over from the penalty
+    assert stats.overlap < 25e-6  # what the gel gives way between its nodes, 1 mm apart
 
 
 def test_an_off_centre_press_shows_where_it_is() -> None:
@@ -120,26 +143,27 @@ def pressed_ball(friction: float, preset: str, deep: float = 0.5e-3) -> PressWor
     return w
 
 
-@pytest.mark.parametrize("preset", ["draft", "standard"])
-@pytest.mark.parametrize(("friction", "ratio"), [(0.3, 0.32), (0.6, 0.647), (1.0, 1.098)])
+@pytest.mark.parametrize(
+    ("preset", "friction", "ratio"),
+    [
+        ("standard", 0.3, 0.32), ("standard", 0.6, 0.647), ("standard", 1.0, 1.098),
+        ("draft", 0.3, 0.32), ("draft", 0.6, 0.663), ("draft", 1.0, 1.148),
+    ],
+)  # fmt: skip
 def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
     preset: str, friction: float, ratio: float
 ) -> None:
     """Ratios: of the contact that an axisymmetric finite-element solver (second order, neo-Hookean, 0.2 mm elements)
-    finds under this ball, 0.5 mm deep, where it slides everywhere."""
+    finds under this ball, 0.5 mm deep, where it slides everywhere. At draft, with much friction, of the same mesh at
+    Mach 0.003: it lies 2.5 and 4.5 % above, since an element is as wide as the contact."""
     assert slide(pressed_ball(friction, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
 
 
 def test_a_short_slide_ends_as_a_slow_one() -> None:
     """0.3 and 0.6 mm at draft, where a part of the contact still sticks: the same mesh at Mach 0.001."""
-    for friction, ratios in ((0.3, (0.313, 0.319)), (0.6, (0.409, 0.639)), (1.0, (0.420, 0.791))):
+    for friction, ratios in ((0.3, (0.321, 0.325)), (0.6, (0.421, 0.652)), (1.0, (0.450, 0.810))):
         w = pressed_ball(friction, "draft")
         assert [slide(w, 0.3e-3), slide(w, 0.3e-3)] == pytest.approx(ratios, rel=0.02)
-
-
-SHARP = pytest.mark.xfail(
-    strict=True, reason="0.525 instead of 0.632: a sharp edge goes over whole contact points, which jump to its side"
-)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +173,7 @@ SHARP = pytest.mark.xfail(
         (Box(size=(4e-3, 4e-3, 4e-3)), 0.6),
         (Box(size=(4e-3, 4e-3, 4e-3)), 1.0),
         (Cylinder(radius=2e-3, height=4e-3), 1.0),
-        pytest.param(Cylinder(radius=2e-3, height=4e-3), 0.6, marks=SHARP),
+        (Cylinder(radius=2e-3, height=4e-3), 0.6),
     ],
 )
 def test_what_has_edges_ends_a_slide_as_a_slow_one(shape: Shape, friction: float) -> None:
@@ -347,12 +371,12 @@ def test_a_press_allocates_no_particles_or_grid() -> None:
     move(w, (0, 0, -0.3e-3))
     state = w._state
     nx, ny, _ = state.gel[0].elements
-    points = 4 * POINTS**2 * nx * ny
+    points = 4 * POINTS**2 * nx * ny + (nx + 1) * (ny + 1)
     assert sum(a.size for a in owned(state)) < sum(a.size for a in owned(state.gels)) + points + 1000
     assert not {"body", "particles", "memory"} & set(vars(state))
     assert w.truth() is None
     assert set(w.snapshot()) == {
-        "gel_displacement", "gel_velocity", "slip", "pressure", "sums", "poses", "rates", "true_inertia",
+        "gel_displacement", "gel_velocity", "slip", "pressure", "carried", "sums", "poses", "rates", "true_inertia",
     }  # fmt: skip
 
 

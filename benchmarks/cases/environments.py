@@ -150,7 +150,13 @@ def _same(a: Pose, b: Pose) -> bool:
 
 CASES = (
     *(
-        Case("scenes", "random_actions", "tacsim", f"16 x {PRESETS[preset]}", partial(random_actions, preset, motion))
+        Case(
+            "scenes",
+            "random_actions",
+            "tacsim",
+            f"16 x {PRESETS[preset]}, {motion}",
+            partial(random_actions, preset, motion),
+        )
         for preset, motion in (("learn", "flowing"), ("learn", "settled"), ("draft", "flowing"), ("draft", "settled"))
     ),
     *(

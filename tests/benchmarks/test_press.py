@@ -22,7 +22,7 @@ def test_a_balls_dent_is_that_of_fine_meshes() -> None:
     assert row.note == ""
     assert row.error < 2.4  # um rms
     assert row.error < row.figures["largest_um"] < 25
-    assert row.figures["overlap_um"] < 5
+    assert row.figures["overlap_um"] < 10  # what the gel gives way between its nodes, as a half-space does
 
 
 @pytest.mark.deep

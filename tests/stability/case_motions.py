@@ -171,5 +171,7 @@ def poison(name: str, value: float = math.nan) -> Motions:
 
 def escape(world: World) -> Iterator[Targets]:
     """A particle 100 m away: no grid can follow."""
-    world.arrays()["position"][-1] = [1e5, 1e5, 0.0]  # type: ignore[attr-defined]
+    arrays = world.arrays()  # type: ignore[attr-defined]
+    for place in {"position", "reference"} & set(arrays):  # in space, and on the grid of `physics: hybrid`
+        arrays[place][-1] = [1e5, 1e5, 0.0]
     yield {}

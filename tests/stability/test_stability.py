@@ -72,6 +72,10 @@ def sliding_torque(force: float, friction: float, side: float) -> float:
     return friction * force * side * (math.sqrt(2) + math.asinh(1)) / 6
 
 
+# Force of a ball 1.5 mm deep, 3 % beyond that without friction (1.73 N) and that of one that sticks (1.97 N): what slips
+# on the way down depends on the speed, and an elastic gel forgets all else.
+PRESSED = 1.68, 2.03
+
 # What must come out, by case and physics: a judgement of the facts of a finite end, or a text of the error.
 EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     "elastic, nu 0.45, to half": {"hybrid": keeps(0.7, 1.1), "seed": keeps(0.4, 1.1)},
@@ -110,12 +114,12 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     "sharp cone": {"press": lambda f: f["settled"] == 1 and 0.05 < f["force"] < 0.3 and f["overlap"] < 10e-6},
     "sharp cone, deep": {"press": "turned inside out"},
     "Mach 0.3": {"hybrid": balanced, "seed": balanced},
-    "Mach 0.3, press": {"press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(2.14, rel=0.1)},
+    "Mach 0.3, press": {"press": lambda f: f["settled"] == 1 and PRESSED[0] < f["force"] < PRESSED[1]},
     # The gels give half of the 3 mm; a body without yield springs back.
     "impact, elastic": {"hybrid": lambda f: keeps(0.9, 1.05)(f) and f["height"] > 3.4e-3},
     "impact, plastic": {"hybrid": lambda f: keeps(0.9, 1.05)(f) and f["height"] < 3.0e-3},
-    # As deep as at Mach 0.3 above: an elastic gel forgets how it got there.
-    "impact, press": {"press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(2.14, rel=0.1)},
+    # As deep as at Mach 0.3 above.
+    "impact, press": {"press": lambda f: f["settled"] == 1 and PRESSED[0] < f["force"] < PRESSED[1]},
     # However fast it came there: an elastic gel forgets its way, and the body remembers little of it.
     "flow, back and forth": {"hybrid": lambda f: keeps(0.9, 1.05)(f) and f["force"] == pytest.approx(0.46, rel=0.05)},
     "flow, back and forth, fast": {
@@ -133,7 +137,7 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     ),
     # Gels don't feel each other in hybrid.
     "sensor through the body": {"hybrid": "mm inside one another, which they do not feel", "seed": balanced},
-    "indenter through the gel": {"press": "of the wave speed"},
+    "indenter through the gel": {"press": "what the pressure wave takes through the most squeezed element"},
     "body over the rim": {
         "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.635, rel=0.05),
         "seed": balanced,

@@ -30,7 +30,7 @@ def test_a_press_ends_where_a_slow_one_does() -> None:
     settled, *speeds = press.quasi_static(1)
     assert settled.error < 1.2 and settled.figures["force_percent"] < 0.5
     by_mach = dict(zip(press.OTHER_MACHS, speeds, strict=True))
-    for mach, most in ((0.015, 3.0), (0.05, 5.0), (0.1, 25.0)):  # um at most
+    for mach, most in ((0.015, 3.0), (0.05, 5.0), (0.1, 30.0)):  # um at most
         row = by_mach[mach]
         assert 0 < row.figures["rms_um"] < row.error < most
         assert row.substeps is not None and settled.substeps is not None
@@ -39,15 +39,14 @@ def test_a_press_ends_where_a_slow_one_does() -> None:
 
 @pytest.mark.deep
 def test_a_shallow_balls_force_goes_to_that_of_an_elastic_layer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With h^2, within a percent of the layer's."""
+    """Within a percent of the layer's at 0.5 mm (0.85, 0.68 at 0.25), within 4 at 1 mm."""
     monkeypatch.setattr(press, "FORCE_DEPTHS", (0.3e-3,))
     fine, incompressible = press.sphere_force(0.5e-3, 1)
-    assert fine.error < 5.0 and incompressible.error < 3.5  # %
+    assert fine.error < 1.0 and incompressible.error < 2.6  # %
     assert incompressible.figures["force_n"] > fine.figures["force_n"]
     monkeypatch.setattr(press, "FORCE_RATIOS", (0.45,))
     (coarse,) = press.sphere_force(1e-3, 1)
-    limit, truth = forces(coarse, fine, order=2)
-    assert limit == pytest.approx(truth, rel=0.015)
+    assert fine.error < coarse.error < 4.2
 
 
 @pytest.mark.deep

@@ -158,7 +158,7 @@ CASES: dict[str, Case] = {
     "body over the rim": Case(cube(), over_the_rim),
     "body over the rim, no housing": Case(cube(gel=Gel(size=GEL.size, housing=None)), over_the_rim, ("hybrid",)),
     "release and grasp again": Case(cube(settling=USUAL), regrasp),
-    "twist": Case(cube(), twist),
+    "twist": Case(cube(settling=USUAL), twist),
     "twist, press": Case(indented(Box(size=(4e-3, 4e-3, 4e-3))), twist, PRESS),
     # rest
     "unstressed rest": Case(SMALL, rest(4_000), ("hybrid",)),

@@ -72,8 +72,8 @@ def sliding_torque(force: float, friction: float, side: float) -> float:
     return friction * force * side * (math.sqrt(2) + math.asinh(1)) / 6
 
 
-# Force of a ball 1.5 mm deep, 3 % beyond that without friction (1.73 N) and that of one that sticks (1.97 N): what slips
-# on the way down depends on the speed, and an elastic gel forgets all else.
+# Force of a ball 1.5 mm deep, 3 % beyond that without friction (1.73 N) and that of one that sticks (1.97 N): what
+# slips on the way down depends on the speed, and an elastic gel forgets all else.
 PRESSED = 1.68, 2.03
 
 # What must come out, by case and physics: a judgement of the facts of a finite end, or a text of the error.
@@ -111,7 +111,8 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "hybrid": lambda f: balanced(f) and f["retries"] == 0 and f["force"] == pytest.approx(0.521e4, rel=0.1),
         "seed": lambda f: balanced(f) and f["retries"] == 0 and f["force"] == pytest.approx(0.528e4, rel=0.02),
     },
-    "sharp cone": {"press": lambda f: f["settled"] == 1 and 0.05 < f["force"] < 0.3 and f["overlap"] < 10e-6},
+    # A tip and an edge go as deep into the surface as a half-space gives way between two nodes, 1 mm apart here.
+    "sharp cone": {"press": lambda f: f["settled"] == 1 and 0.05 < f["force"] < 0.3 and f["overlap"] < 150e-6},
     "sharp cone, deep": {"press": "turned inside out"},
     "Mach 0.3": {"hybrid": balanced, "seed": balanced},
     "Mach 0.3, press": {"press": lambda f: f["settled"] == 1 and PRESSED[0] < f["force"] < PRESSED[1]},
@@ -126,10 +127,10 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "hybrid": lambda f: keeps(0.9, 1.05)(f) and f["force"] == pytest.approx(0.46, rel=0.05)
     },
     "flow, back and forth, press": {
-        "press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(0.324, rel=0.01)
+        "press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(0.293, rel=0.01)
     },
     "flow, back and forth, fast, press": {
-        "press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(0.324, rel=0.01)
+        "press": lambda f: f["settled"] == 1 and f["force"] == pytest.approx(0.293, rel=0.01)
     },
     # By symmetry the body goes half of the upper sensor's 3 mm.
     "yield and slide": dict.fromkeys(
@@ -163,7 +164,7 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
     # More than a flat face bears: edges and corners plough.
     "twist, press": {
         "press": lambda f: (
-            f["settled"] == 1 and f["overlap"] < 50e-6 and 1 < f["torque"] / sliding_torque(f["force"], 0.6, 4e-3) < 2
+            f["settled"] == 1 and f["overlap"] < 150e-6 and 1 < f["torque"] / sliding_torque(f["force"], 0.6, 4e-3) < 2
         )
     },
     "unstressed rest": {"hybrid": still},
@@ -186,7 +187,7 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.602, rel=0.02),
         "seed": lambda f: balanced(f) and f["force"] == pytest.approx(0.581, rel=0.05),
     },
-    "short steps, press": {"press": lambda f: f["retries"] == 0 and f["force"] == pytest.approx(0.682, rel=0.02)},
+    "short steps, press": {"press": lambda f: f["retries"] == 0 and f["force"] == pytest.approx(0.611, rel=0.02)},
     "step limit violated": dict.fromkeys(("hybrid", "seed"), lambda f: balanced(f) and f["retries"] > 0),
     "step limit violated, press": {"press": lambda f: f["settled"] == 1 and f["retries"] > 0},
     "NaN in position": dict.fromkeys(("hybrid", "seed"), "position[0, 0] is nan"),

@@ -9,8 +9,9 @@ import builtins
 import io
 import ipaddress
 import os
+import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from numbers import Integral
 from typing import Any
 
@@ -21,6 +22,19 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("TACSIM_THREADS", "1")  # every process has a core
 
 DEVICES = ("/dev/tty", "/dev/video", "/dev/v4l", "/dev/serial")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def interruptible() -> Iterator[None]:
+    """Signals work in tests whoever started them: a shell's background job inherits SIGINT as ignored, `nohup`'s
+    SIGHUP, and so would the processes that tests start."""
+    before = {
+        number: signal.signal(number, handler)
+        for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL))
+    }
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 class RealHardware(AssertionError):

@@ -97,14 +97,12 @@ def newton_step(t1, t2, miss):
 
 
 @ti.func
-def normal_force(spring, memory, drag, compliance):
-    """Normal force of a contact and its new memory, which is the force at rest; all forces, or all pressures.
+def normal_force(spring, memory, drag):
+    """Normal force of a contact and its new memory, which carries the force at rest.
 
-    spring: of the overlap; drag: of the dashpot, away from the contact. compliance: share of the force that the overlap
-    still carries at rest; the memory carries the others.
+    spring: of the overlap; drag: of the dashpot, away from the contact.
     """
-    force = ti.max(spring + (1.0 - compliance) * memory - drag, 0.0)
-    return force, ti.max(memory + MEMORY_RATE * (spring - compliance * memory), 0.0)
+    return ti.max(spring + memory - drag, 0.0), ti.max(memory + MEMORY_RATE * spring, 0.0)
 
 
 @ti.func
@@ -199,7 +197,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     record_more(env, slot_of(part), layout.CAPPED, 1.0)
                 vr = v - vec3(vs[0], vs[1], vs[2])
                 vn = vr.dot(n)
-                fn, pressed = normal_force(k_n * gap, pressed, c_n * vn, 0.0)
+                fn, pressed = normal_force(k_n * gap, pressed, c_n * vn)
                 ft, slip = friction(slip, n, vr - vn * n, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
                 force = fn * n + ft
                 in_contact = True
@@ -215,7 +213,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
                     gap = deepest
                     record_more(env, slot_of(part), layout.CAPPED, 1.0)
                 n = vec3(0.0, 0.0, 1.0)
-                fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2], 0.0)
+                fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
                 along = vec3(v[0], v[1], 0.0)
                 ft, slip = friction(slip, n, along, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
                 force = fn * n + ft

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import http.client
 import io
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -21,10 +18,9 @@ from PIL import Image
 from robot.common import stamp
 from robot.errors import DeviceError, DeviceNotConnectedError
 from robot.mock.camera.camera import MockCamera
+from tests.robot.mock.camera_client import HOST, Client, get, running, until
 
-HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # parallel sessions stay apart
 FPS = 200.0
-WAIT = 20.0  # for what must come, however slow the machine [s]
 
 
 @pytest.fixture(scope="module")
@@ -46,73 +42,6 @@ def camera(shared: MockCamera) -> Iterator[MockCamera]:
     shared.brightness(1.0)
     shared.disconnect()
     until(lambda: shared.state().clients == 0)
-
-
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT
-    while not holds():
-        assert time.monotonic() < deadline, "it never came"
-        time.sleep(0.005)
-
-
-def running(pid: int) -> bool:
-    """False for a zombie, too: who reaps an orphan is not this project's matter."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def get(camera: MockCamera, path: str) -> tuple[int, str, bytes]:
-    connection = http.client.HTTPConnection(camera.host, camera.port, timeout=WAIT)
-    try:
-        connection.request("GET", path)
-        answer = connection.getresponse()
-        return answer.status, answer.headers["Content-Type"], answer.read()
-    finally:
-        connection.close()
-
-
-class Client:
-    """A plain reader of the stream."""
-
-    def __init__(self, camera: MockCamera) -> None:
-        self._socket = socket.create_connection((camera.host, camera.port), timeout=WAIT)
-        self._socket.sendall(b"GET /?action=stream HTTP/1.0\r\n\r\n")
-        self._file = self._socket.makefile("rb")
-        self.head = self._lines()
-
-    def _lines(self) -> list[str]:
-        lines = []
-        while (line := self._file.readline()) != b"\r\n":
-            if not line:
-                raise ConnectionError("cut")
-            lines.append(line.decode().strip())
-        return lines
-
-    def jpeg(self) -> bytes:
-        head = self._lines()
-        while not any(line.startswith("Content-Length") for line in head):
-            head = self._lines()
-        (length,) = (int(line.split(":")[1]) for line in head if line.startswith("Content-Length"))
-        data = self._file.read(length)
-        assert self._file.readline() == b"\r\n"
-        return data
-
-    def frame(self) -> tuple[np.ndarray, stamp.Stamp]:
-        picture, mark = stamp.split(np.array(Image.open(io.BytesIO(self.jpeg())).convert("RGB")))
-        assert mark is not None
-        return picture, mark
-
-    def close(self) -> None:
-        self._file.close()
-        self._socket.close()
-
-    def __enter__(self) -> Client:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
 
 def test_streams_as_mjpg_streamer_does(camera: MockCamera) -> None:

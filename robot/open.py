@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
+from tacsim.models.features import Features
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.rig import Rig
@@ -88,20 +89,23 @@ def make_env(
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
+    features: Features | Mapping[str, Any] | None = None,
 ) -> TacsimEnv:
     """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters.
 
     variants: overrides of scene and task, on top of `overrides`; each reset draws one of them from its seed. The state
     of first contact of each is computed once. The world of a simulated rig is made at the first reset.
+    features: what of its observations a policy learns from (`tacsim.Features`, or what it is made of); None: all.
 
-    Raises what open_rig raises, and ValueError for variants that change what must stay (`TacsimEnv.reset`).
+    Raises what open_rig raises, IncompatibleRig for features that the rig does not have, and ValueError for variants
+    that change what must stay (`TacsimEnv.reset`).
     """
-    configs = _rigs_of_episodes(task, rig, overrides, variants)
+    configs, seen = _rigs_of_episodes(task, rig, overrides, variants), _features(features)
     if configs[0].clock == "sim":
         from robot.rig.sim_env import open_env
 
-        return open_env(configs, render_mode)
-    return _env_of_hardware(configs, render_mode)
+        return open_env(configs, render_mode, seen)
+    return _env_of_hardware(configs, render_mode, seen)
 
 
 def make_vector_env(
@@ -112,23 +116,29 @@ def make_vector_env(
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
     autoreset_mode: str | AutoresetMode = "NextStep",
+    features: Features | Mapping[str, Any] | None = None,
 ) -> TacsimVectorEnv:
     """`num_envs` of these environments, whose simulations share launches: what ``gymnasium.make_vec`` makes.
 
     Raises as `make_env`, and CannotOpen for a rig that is not simulated, or by physics 'seed'.
     """
-    configs = _rigs_of_episodes(task, rig, overrides, variants)
+    configs, seen = _rigs_of_episodes(task, rig, overrides, variants), _features(features)
     if configs[0].clock != "sim":
         raise CannotOpen(
             f"rig '{configs[0].name}' is not simulated: only simulations run many at once; use robot.make_env"
         )
     from robot.rig.sim_env import open_vector_env
 
-    return open_vector_env(configs, num_envs, render_mode, autoreset_mode)
+    return open_vector_env(configs, num_envs, render_mode, autoreset_mode, seen)
 
 
-def _env_of_hardware(configs: Sequence[RigConfig], render_mode: str | None) -> TacsimEnv:
+def _features(given: Features | Mapping[str, Any] | None) -> Features | None:
+    return given if given is None or isinstance(given, Features) else Features.model_validate(given)
+
+
+def _env_of_hardware(configs: Sequence[RigConfig], render_mode: str | None, features: Features | None) -> TacsimEnv:
     """Of a rig that tells the truth of its body without being a simulation of ours, if there is one."""
+    from tacsim.features.encoder import FeatureEncoder
     from tacsim.gym.env import TacsimEnv
     from tacsim.tasks import make_task
 
@@ -137,7 +147,8 @@ def _env_of_hardware(configs: Sequence[RigConfig], render_mode: str | None) -> T
     opened, task = open_rig(configs[0]), configs[0].task
     assert task is not None
     try:
-        return TacsimEnv(opened, make_task(task), render_mode)
+        encoder = None if features is None else FeatureEncoder(features, configs[0].canonical)
+        return TacsimEnv(opened, make_task(task), render_mode, encoder=encoder)
     except BaseException:
         opened.close()
         raise

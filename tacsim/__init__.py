@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tacsim.config import load_task as load_task
     from tacsim.control.approach import NoTouch as NoTouch
     from tacsim.control.contact_signal import contact_signal as contact_signal
+    from tacsim.features.encoder import FeatureEncoder as FeatureEncoder
     from tacsim.gym.env import TacsimEnv as TacsimEnv
     from tacsim.gym.vector import TacsimVectorEnv as TacsimVectorEnv
     from tacsim.interface import Action as Action
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from tacsim.interface import Truth as Truth
     from tacsim.limits import ActionError as ActionError
     from tacsim.limits import LimitExceeded as LimitExceeded
+    from tacsim.models.features import Features as Features
+    from tacsim.models.features import MapGrid as MapGrid
     from tacsim.models.hardware import ArmLimits as ArmLimits
     from tacsim.models.hardware import CameraSensorConfig as CameraSensorConfig
     from tacsim.models.hardware import KeepOut as KeepOut

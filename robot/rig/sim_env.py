@@ -9,22 +9,28 @@ from gymnasium.vector import AutoresetMode
 
 from robot.rig import CannotOpen
 from robot.rig.sim_rig import Simulation, simulate
+from tacsim.features.encoder import FeatureEncoder
 from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_alike
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
+from tacsim.models.features import Features
 from tacsim.models.rig import RigConfig
 from tacsim.sim.stage import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
 
-def open_env(configs: Sequence[RigConfig], render_mode: str | None) -> TacsimEnv:
+def open_env(configs: Sequence[RigConfig], render_mode: str | None, features: Features | None) -> TacsimEnv:
     """An environment of the first of `configs`; the others are its variants. Raises CannotOpen, ValueError."""
     variants = _variants(configs)
-    return _env(simulate(configs[0]), configs[0], variants, render_mode)
+    return _env(simulate(configs[0]), configs[0], variants, render_mode, features)
 
 
 def open_vector_env(
-    configs: Sequence[RigConfig], number: int, render_mode: str | None, autoreset_mode: str | AutoresetMode
+    configs: Sequence[RigConfig],
+    number: int,
+    render_mode: str | None,
+    autoreset_mode: str | AutoresetMode,
+    features: Features | None,
 ) -> TacsimVectorEnv:
     """`number` of these environments in one batch. Raises CannotOpen, ValueError."""
     config, variants = configs[0], _variants(configs)
@@ -42,14 +48,29 @@ def open_vector_env(
     members = []
     for index in range(number):
         simulation = simulate(config, partial(batch.world, index), pool, parallel=False)
-        members.append(Member(_env(simulation, config, variants, render_mode), simulation.clock))
+        members.append(Member(_env(simulation, config, variants, render_mode, features), simulation.clock))
     return TacsimVectorEnv(members, batch, autoreset_mode)
 
 
-def _env(simulation: Simulation, config: RigConfig, variants: Sequence[Variant], render_mode: str | None) -> TacsimEnv:
+def _env(
+    simulation: Simulation,
+    config: RigConfig,
+    variants: Sequence[Variant],
+    render_mode: str | None,
+    features: Features | None,
+) -> TacsimEnv:
     assert config.task is not None
-    task, space = make_task(config.task), encode.space_of_rig(config)
-    return TacsimEnv(simulation.rig, task, render_mode, space=space, variants=variants, stage=simulation.stage)
+    encoder = None if features is None else FeatureEncoder(features, config.canonical)
+    space = encode.space_of_rig(config) if encoder is None else encode.space_of_features(encoder, config)
+    return TacsimEnv(
+        simulation.rig,
+        make_task(config.task),
+        render_mode,
+        space=space,
+        encoder=encoder,
+        variants=variants,
+        stage=simulation.stage,
+    )
 
 
 def _variants(configs: Sequence[RigConfig]) -> list[Variant]:

@@ -28,7 +28,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.interface import Action, ArmState, Observation, Pose, TactileObservation
+from tacsim.features.encoder import CHANNELS, FeatureEncoder
+from tacsim.interface import Action, ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.limits import ActionError
 from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.tasks.task import Axis
@@ -45,6 +46,8 @@ BOUNDS = {
     "wrench": 1e4,  # [N, N m]
     "joints": 4 * math.pi,  # [rad]
 }
+
+FARTHEST = 1e4  # the same of features, which are numbers of order 1
 
 
 def flatten(observation: Observation, start: Mapping[str, Pose]) -> Flat:
@@ -76,6 +79,20 @@ def _arm(arm: ArmState, start: Pose) -> Flat:
     return {key: value.astype(np.float32) for key, value in flat.items()}
 
 
+class FlatView:
+    """What an environment shows where no features are chosen: all that there is, by `flatten`."""
+
+    needs = Needs()
+
+    def begin(self, observation: Observation, goal: object = None) -> Flat:
+        """The first observation of an episode."""
+        self._start = {name: arm.pose for name, arm in observation.arms.items()}
+        return flatten(observation, self._start)
+
+    def __call__(self, observation: Observation) -> Flat:
+        return flatten(observation, self._start)
+
+
 def space_of(flat: Flat) -> spaces.Space[Flat]:
     """The Gymnasium space that `flat` and everything flattened from the same rig lies in."""
     space: spaces.Space[Any] = spaces.Dict({key: _space(key, value) for key, value in flat.items()})
@@ -102,6 +119,38 @@ def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
         numbers = {"pose": 9, "twist": 6, "wrench": 6}
         flat |= {f"{key}_{name}": np.zeros(count, np.float32) for key, count in numbers.items()}
     return space_of(flat)
+
+
+def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[Flat]:
+    """Of what `encoder` makes of this rig, whose task has a goal."""
+    features = encoder.features
+    shapes: dict[str, tuple[int, ...]] = {}
+    if features.maps:
+        channels = features.frames * len(features.sensors) * sum(CHANNELS[kind] for kind in features.maps)
+        shapes["maps"] = (channels, features.grid.rows, features.grid.columns)
+    if features.flow:
+        lattices = {name: _lattice(name, config) for name in features.sensors}
+        if len(set(lattices.values())) > 1:
+            raise IncompatibleRig(f"flow of sensors with different markers makes no array: {lattices}")
+        shapes["flow"] = (features.frames * len(features.sensors) * 2, *next(iter(lattices.values())))
+    if features.touch:
+        shapes["touch"] = (features.frames * len(encoder.names),)
+    if features.goal:
+        assert config.task is not None
+        shapes["goal"] = np.atleast_1d(config.task.goal).shape
+    space: spaces.Space[Any] = spaces.Dict(
+        {key: spaces.Box(-FARTHEST, FARTHEST, shape, np.float32) for key, shape in shapes.items()}
+    )
+    return space
+
+
+def _lattice(name: str, config: RigConfig) -> tuple[int, int]:
+    """Rows and columns of a sensor's markers. Raises IncompatibleRig without such a sensor or markers."""
+    sensor = config.sensors.get(name)
+    markers = sensor.model.markers if isinstance(sensor, SimSensorConfig) else None
+    if markers is None:
+        raise IncompatibleRig(f"the features ask for tactile flow, and sensor '{name}' of this rig has no markers")
+    return markers.rows, markers.columns
 
 
 def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:

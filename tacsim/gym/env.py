@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from tacsim.features.encoder import FeatureEncoder
 from tacsim.gym import encode
 from tacsim.gym.plugin import register_envs
 from tacsim.interface import Needs, Pose, Truth
@@ -39,17 +40,19 @@ class Variant:
 
 
 class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
-    """A rig with a task. Observations: `tacsim.gym.encode.flatten`. Actions: Box(-1, 1), one component for each free
-    axis of the task, in units of its max_step from where the arm was last sent.
+    """A rig with a task. Observations: `tacsim.gym.encode.flatten`, or with an encoder what that makes of them.
+    Actions: Box(-1, 1), one component for each free axis of the task, in units of its max_step from where the arm was
+    last sent.
 
     An episode terminates only when a limit of an arm is exceeded (info["limit"] says which). It is truncated after the
     task's steps, or when the simulation diverges (info["diverged"] says why; the observation is the last good one).
 
-    info: distance [m], success, score, body_height [m], and the rig's diagnostics; with variants also `variant`, the
+    info: distance [m], is_success, score, body_height [m], and the rig's diagnostics; with variants also `variant`, the
     number of the one that is played.
 
     Args:
         space: of the observations; None: the rig is reset once to learn the shapes.
+        encoder: of the features that a learned policy sees; None: the environment shows all that there is.
         variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
         stage: what the rig simulates, where a reset may exchange its scene.
 
@@ -65,6 +68,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         render_mode: str | None = None,
         *,
         space: gymnasium.Space[encode.Flat] | None = None,
+        encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
         stage: Stage | None = None,
     ) -> None:
@@ -72,6 +76,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         rig.require(Needs(truth=True), "an environment")
         rig.require(task.needs, f"task '{task.config.kind}'")
+        self._view = encode.FlatView() if encoder is None else encoder
+        rig.require(self._view.needs, "a choice of features")
         self.rig, self.task, self.render_mode = rig, task, render_mode
         self._variants, self._stage = tuple(variants), stage
         self._played: int | None = None  # the variant
@@ -133,11 +139,10 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     def _begin(self, seed: int) -> None:
         self.phase, self._failure, self._done = "new", None, None
         observation = self.rig.reset(seed)
-        self._start: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}
-        self._targets = dict(self._start)  # where each arm was last sent
+        self._targets: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}  # last sent there
         self._truth_at_start = self._truth()
         self._count, self.phase = 0, "running"
-        self._flat: encode.Flat = encode.flatten(observation, self._start)
+        self._flat: encode.Flat = self._view.begin(observation, self.task.config.goal)
 
     def _truth(self) -> Truth:
         truth = self.rig.truth()
@@ -199,7 +204,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             self._done = flat, reward, exceeded, not exceeded, info
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
-        self._flat = encode.flatten(observation, self._start)
+        self._flat = self._view(observation)
         truncated = self._count >= self.task.config.steps
         if truncated:
             self.phase = "over"
@@ -211,7 +216,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         outcome = judge(self.task, truth, self._truth_at_start)
         info: dict[str, Any] = {
             "distance": outcome.distance,
-            "success": outcome.success,
+            "is_success": outcome.success,
             "score": outcome.score,
             "body_height": truth.height,
         }

@@ -76,7 +76,7 @@ def test_reward_and_info_come_from_the_truth(open_springs: Any) -> None:
     assert reward == pytest.approx(-info["distance"] / 1e-3)
     assert not terminated
     assert not truncated
-    assert info["success"] is False
+    assert info["is_success"] is False
     assert 0 < info["score"] < 0.1
 
 

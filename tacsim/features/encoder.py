@@ -1,0 +1,246 @@
+"""Observation -> arrays of order 1 that a learned policy sees: the same in training, on a mock and on a robot.
+
+| key   | shape, float32                      | what                                                   |
+|-------|-------------------------------------|--------------------------------------------------------|
+| maps  | (frames * sensors * channels, h, w) | frame by frame (oldest first), sensor by sensor        |
+| flow  | (frames * sensors * 2, m, n)        | (x, y) of each sensor's markers                        |
+| touch | (frames * numbers,)                 | `numbers` are those of `FeatureEncoder.names`          |
+| goal  | (1,) or (2,)                        | of the task                                            |
+
+Every number is its SI value over the scale of its quantity in `SCALES`. Nothing is clipped and nothing is normalised
+further here: what else a network wants is inside the network.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim import pose as se3
+from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
+from tacsim.models.features import Channel, Features, MapGrid, Quantity
+from tacsim.models.sensor import CanonicalGrid
+
+Arrays = dict[str, NDArray[Any]]
+
+# The SI value that is encoded as 1.
+SCALES = {
+    "height": 1e-3,  # [m]
+    "slope": 1.0,  # [-]
+    "contact": 1.0,  # share of a cell that is in contact [-]
+    "image": 1.0,  # relative change of colour, (v - 128) / 128 [-]
+    "flow": 0.2e-3,  # [m]
+    "area": 1e-4,  # in contact [m^2]
+    "depth": 1e-3,  # greatest, and mean over the contact [m]
+    "centroid": 5e-3,  # of the indented volume, sensor x and y [m]
+    "shear": 0.2e-3,  # mean flow of all markers, sensor x and y [m]
+    "force": 10.0,  # [N]
+    "torque": 0.05,  # [N m]
+    "moved": 5e-3,  # of an arm since reset, in the axes of its sensor then [m]
+    "between": 10e-3,  # from the first arm's sensor to another's, in the axes of the first [m]
+    "turn": 0.1,  # first two columns of a rotation, less those of no rotation [-]
+    "goal": 10e-3,  # [m]
+}
+CHANNELS = {"height": 1, "slope": 2, "contact": 1, "image": 3}
+_MOVED = (*(f"moved_{axis}" for axis in "xyz"), *(f"turn_{column}{axis}" for column in "xy" for axis in "xyz"))
+_PARTS: dict[Quantity, tuple[str, ...]] = {
+    "area": ("area",),
+    "depth": ("depth_greatest", "depth_mean"),
+    "centroid": ("centroid_x", "centroid_y"),
+    "shear": ("shear_x", "shear_y"),
+    "wrench": tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz"),
+    "moved": _MOVED,
+    "between": tuple(f"between_{axis}" for axis in "xyz"),
+}
+_UNTURNED = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+_OF_SENSORS = ("area", "depth", "centroid", "shear")
+
+
+class FeatureEncoder:
+    """Encodes the observations of one rig. It remembers the episode's start and the last frames: `begin` it with the
+    first observation, then call it with each other.
+
+    Raises IncompatibleRig when the maps do not fit the rig's canonical grid.
+    """
+
+    def __init__(self, features: Features, canonical: CanonicalGrid) -> None:
+        self.features = features
+        self._pool = _Pool(features.grid, canonical) if features.maps else None
+        self._rows, self._columns = (_centres(n, canonical.pitch) for n in (canonical.rows, canonical.columns))
+        self._cell_area = canonical.pitch**2
+        self._goal: Arrays = {}
+        self._start: Mapping[str, Pose] = {}
+        self._frames: deque[Arrays] = deque(maxlen=features.frames)
+
+    @property
+    def needs(self) -> Needs:
+        wanted = self.features
+        height = bool({"height", "slope"} & set(wanted.maps) or {"depth", "centroid"} & set(wanted.touch))
+        flow = wanted.flow or "shear" in wanted.touch
+        return Needs(frozenset(wanted.sensors), frozenset(wanted.arms), height=height, flow=flow)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers of one frame in `touch`: quantity, axis, and of which sensor or arm."""
+        found: list[str] = []
+        for quantity in self.features.touch:
+            owners = self.features.sensors if quantity in _OF_SENSORS else self.features.arms
+            found += [f"{part}_{owner}" for owner in owners[quantity == "between" :] for part in _PARTS[quantity]]
+        return tuple(found)
+
+    def begin(self, observation: Observation, goal: float | Sequence[float] | None = None) -> Arrays:
+        """The first observation of an episode; frames before it are taken to be like it.
+
+        goal: of the task [m]. Raises IncompatibleRig when a policy wants one and there is none.
+        """
+        if self.features.goal:
+            if goal is None:
+                raise IncompatibleRig("the policy is told a goal, but the rig has no task: name one (--task)")
+            self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
+        self._start = {name: observation.arms[name].pose for name in self.features.arms}
+        self._frames.extend([self._encode(observation)] * self.features.frames)
+        return self._stacked()
+
+    def __call__(self, observation: Observation) -> Arrays:
+        self._frames.append(self._encode(observation))
+        return self._stacked()
+
+    def _stacked(self) -> Arrays:
+        arrays = {key: np.concatenate([frame[key] for frame in self._frames]) for key in self._frames[-1]}
+        return arrays | {key: value.copy() for key, value in self._goal.items()}
+
+    def _encode(self, observation: Observation) -> Arrays:
+        wanted = self.features
+        touches = [observation.tactile[name] for name in wanted.sensors]
+        arrays: Arrays = {}
+        if self._pool is not None:
+            arrays["maps"] = np.concatenate(
+                [self._pool(_channel(t, kind), t.valid) for t in touches for kind in wanted.maps]
+            )
+        if wanted.flow:
+            arrays["flow"] = np.concatenate([_flow(touch).transpose(2, 0, 1) / SCALES["flow"] for touch in touches])
+        if wanted.touch:
+            arms = {name: observation.arms[name] for name in wanted.arms}
+            arrays["touch"] = np.concatenate([self._numbers(quantity, touches, arms) for quantity in wanted.touch])
+        return {key: value.astype(np.float32) for key, value in arrays.items()}
+
+    def _numbers(
+        self, quantity: Quantity, touches: Sequence[TactileObservation], arms: Mapping[str, ArmState]
+    ) -> FloatArray:
+        """All that `touch` says of one quantity."""
+        each: list[FloatArray]
+        if quantity == "area":
+            each = [np.array([touch.contact.sum() * self._cell_area / SCALES["area"]]) for touch in touches]
+        elif quantity == "depth":
+            each = [_depths(touch) / SCALES["depth"] for touch in touches]
+        elif quantity == "centroid":
+            each = [self._centroid(touch) / SCALES["centroid"] for touch in touches]
+        elif quantity == "shear":
+            each = [_flow(touch).mean(axis=(0, 1)) / SCALES["shear"] for touch in touches]
+        elif quantity == "wrench":
+            each = [
+                np.concatenate([a.wrench[:3] / SCALES["force"], a.wrench[3:] / SCALES["torque"]]) for a in arms.values()
+            ]
+        elif quantity == "moved":
+            each = [_moved(se3.relative(self._start[name], arm.pose)) for name, arm in arms.items()]
+        else:
+            first, *others = arms.values()
+            each = [se3.relative(first.pose, arm.pose).position / SCALES["between"] for arm in others]
+        return np.concatenate(each)
+
+    def _centroid(self, touch: TactileObservation) -> FloatArray:
+        """(2,) of what is pressed in where there is contact [m]; the middle without contact."""
+        pressed = _height(touch).clip(min=0.0) * touch.contact
+        total = float(pressed.sum())
+        if total == 0.0:
+            return np.zeros(2)
+        return np.array([pressed.sum(axis=0) @ self._columns, pressed.sum(axis=1) @ self._rows]) / total
+
+
+class _Pool:
+    """Means over the cells of a finer grid with the same centre.
+
+    Raises IncompatibleRig when a cell is no whole number of the finer cells, or lies beyond them.
+    """
+
+    def __init__(self, grid: MapGrid, canonical: CanonicalGrid) -> None:
+        self._shape, self._every = (grid.rows, grid.columns), round(grid.pitch / canonical.pitch)
+        finer = (canonical.rows, canonical.columns)
+        margins = [have - want * self._every for have, want in zip(finer, self._shape, strict=True)]
+        whole = self._every >= 1 and abs(self._every * canonical.pitch - grid.pitch) <= 1e-6 * grid.pitch
+        if not whole or min(margins) < 0 or any(margin % 2 for margin in margins):
+            raise IncompatibleRig(
+                f"maps of {grid.rows} x {grid.columns} cells of {1e3 * grid.pitch:g} mm cannot be put together from "
+                f"the rig's canonical grid of {canonical.rows} x {canonical.columns} cells of "
+                f"{1e3 * canonical.pitch:g} mm: give the rig a grid whose cells are a whole part of these, and that "
+                "spans them (canonical)"
+            )
+        self._inside = tuple(
+            slice(margin // 2, have - margin // 2) for margin, have in zip(margins, finer, strict=True)
+        )
+
+    def __call__(self, values: FloatArray, valid: NDArray[np.bool_]) -> FloatArray:
+        """(channels, h, w) means of (rows, columns, channels) over valid cells; 0 where none is."""
+        weights = valid[self._inside].astype(np.float64)[..., None]
+        total, count = self._sums(values[self._inside] * weights), self._sums(weights)
+        means: FloatArray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+        return means.transpose(2, 0, 1)
+
+    def _sums(self, values: FloatArray) -> FloatArray:
+        rows, columns = self._shape
+        blocks = values.reshape(rows, self._every, columns, self._every, values.shape[-1])
+        total: FloatArray = blocks.sum(axis=(1, 3))
+        return total
+
+
+def _centres(cells: int, pitch: float) -> FloatArray:
+    """(cells,) of the cells along one axis, sensor frame [m]."""
+    return (np.arange(cells, dtype=np.float64) - (cells - 1) / 2) * pitch
+
+
+def _channel(touch: TactileObservation, kind: Channel) -> FloatArray:
+    """(h, w, channels) of the canonical grid, encoded."""
+    values: NDArray[Any]
+    if kind == "height":
+        values = _height(touch)[..., None]
+    elif kind == "slope":
+        if touch.gradient is None:
+            raise IncompatibleRig("the policy sees slopes, and this sensor delivers none")
+        values = touch.gradient
+    elif kind == "contact":
+        values = touch.contact[..., None]
+    else:
+        rows, columns = touch.contact.shape
+        scale = touch.image.shape[0] // rows
+        values = touch.image.reshape(rows, scale, columns, scale, 3).mean(axis=(1, 3)) / 128.0 - 1.0
+    encoded: FloatArray = values.astype(np.float64) / SCALES[kind]
+    return encoded
+
+
+def _height(touch: TactileObservation) -> FloatArray:
+    if touch.height is None:
+        raise IncompatibleRig("the policy sees heights, and this sensor delivers none")
+    return touch.height.astype(np.float64)
+
+
+def _flow(touch: TactileObservation) -> FloatArray:
+    if touch.flow is None:
+        raise IncompatibleRig("the policy sees tactile flow, and this sensor has no markers")
+    return touch.flow.astype(np.float64)
+
+
+def _depths(touch: TactileObservation) -> FloatArray:
+    """(2,) greatest depth, and mean depth where there is contact [m]; 0 without contact."""
+    height = _height(touch)
+    greatest = height.max(where=touch.valid, initial=0.0)
+    mean = height.mean(where=touch.contact) if touch.contact.any() else 0.0
+    return np.array([greatest, mean])
+
+
+def _moved(pose: Pose) -> FloatArray:
+    """(9,) of the pose relative to that at reset."""
+    return np.concatenate([pose.position / SCALES["moved"], (se3.two_columns(pose) - _UNTURNED) / SCALES["turn"]])

@@ -1,0 +1,197 @@
+"""What a learned policy sees: every number against the observation that it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from tacsim.features.encoder import FeatureEncoder
+from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
+from tacsim.models.features import Features, MapGrid
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.pose import HALF_TURN_X
+
+GRID = CanonicalGrid(rows=8, columns=12, pitch=0.5e-3, image_scale=2)
+COARSE = MapGrid(rows=4, columns=6, pitch=1e-3)
+
+
+def touch(seed: int) -> TactileObservation:
+    random = np.random.default_rng(seed)
+    height = random.normal(0, 1e-4, (8, 12)).astype(np.float32)
+    return TactileObservation(
+        image=random.integers(0, 256, (16, 24, 3), dtype=np.uint8),
+        gradient=random.normal(0, 0.1, (8, 12, 2)).astype(np.float32),
+        height=height,
+        contact=height > 1e-4,
+        valid=np.ones((8, 12), np.bool_),
+        flow=random.normal(0, 1e-4, (3, 5, 2)).astype(np.float32),
+        time=1.0,
+        age=0.0,
+    )
+
+
+def arm(pose: Pose, wrench: Any = (0.0,) * 6) -> ArmState:
+    return ArmState(pose, np.zeros(6), np.array(wrench, dtype=np.float64), None, 1.0)
+
+
+def observation(seed: int = 0, z: float = 10e-3, **changed: Any) -> Observation:
+    arms = {
+        "lower": arm(Pose(), (1.0, 2.0, -5.0, 0.01, 0.02, 0.03)),
+        "upper": arm(Pose(np.array([1e-3, -2e-3, z]), HALF_TURN_X.quaternion)),
+    }
+    tactile = {"lower": replace(touch(seed), **changed), "upper": touch(seed + 100)}
+    return Observation(tactile, arms, 1.0)
+
+
+def encoder(**wanted: Any) -> FeatureEncoder:
+    return FeatureEncoder(Features(**{"grid": COARSE, "goal": False, **wanted}), GRID)
+
+
+def test_maps_are_means_of_the_cells_channel_by_channel() -> None:
+    seen = observation()
+    maps = encoder(maps=("height", "slope", "contact", "image")).begin(seen)["maps"]
+    assert maps.shape == (2 * 7, 4, 6) and maps.dtype == np.float32
+    lower, upper = seen.tactile["lower"], seen.tactile["upper"]
+    assert lower.height is not None and upper.gradient is not None
+    assert maps[0, 1, 2] == pytest.approx(1e3 * lower.height[2:4, 4:6].mean(dtype=float), rel=1e-6)  # mm
+    assert maps[9, 3, 5] == pytest.approx(
+        upper.gradient[6:8, 10:12, 1].mean(dtype=float), rel=1e-6
+    )  # after its height and x
+    assert maps[3, 0, 0] == pytest.approx(lower.contact[:2, :2].mean())
+    assert maps[4, 0, 1] == pytest.approx(lower.image[:4, 4:8, 0].mean() / 128 - 1, rel=1e-6)
+
+
+def test_maps_lie_in_the_middle_and_leave_out_what_is_not_valid() -> None:
+    valid = np.ones((8, 12), np.bool_)
+    valid[3, 4:] = False
+    valid[4, 4:6] = False
+    valid[4, 6:] = False
+    seen = observation(valid=valid)
+    maps = encoder(grid=MapGrid(rows=1, columns=4, pitch=1e-3), sensors=("lower",), touch=()).begin(seen)["maps"]
+    height = seen.tactile["lower"].height
+    assert height is not None
+    assert maps[0, 0, 0] == pytest.approx(1e3 * height[3:5, 2:4].mean(dtype=float), rel=1e-6)
+    assert maps[0, 0, 1:].tolist() == [0.0] * 3  # nothing valid there
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        MapGrid(rows=4, columns=6, pitch=0.75e-3),
+        MapGrid(rows=5, columns=6, pitch=1e-3),
+        MapGrid(rows=3, columns=6, pitch=0.5e-3),
+        MapGrid(rows=4, columns=6, pitch=0.1e-3),
+    ],
+)
+def test_a_grid_that_cannot_be_put_together_is_refused(grid: MapGrid) -> None:
+    with pytest.raises(IncompatibleRig, match=r"cannot be put together from the rig's canonical grid of 8 x 12 cells"):
+        encoder(grid=grid)
+    FeatureEncoder(Features(grid=grid, maps=()), GRID)  # without maps the grid says nothing
+
+
+def test_touch_holds_what_its_names_say() -> None:
+    asked = encoder(touch=("area", "depth", "centroid", "shear", "wrench", "moved", "between"))
+    first = observation()
+    asked.begin(first)
+    later = observation(seed=5, z=9e-3)
+    values = dict(zip(asked.names, asked(later)["touch"].tolist(), strict=True))
+    seen = later.tactile["upper"]
+    assert seen.height is not None and seen.flow is not None
+    assert values["area_upper"] == pytest.approx(seen.contact.sum() * 0.25e-6 / 1e-4)
+    assert values["depth_greatest_upper"] == pytest.approx(1e3 * seen.height.max(), rel=1e-6)
+    assert values["depth_mean_upper"] == pytest.approx(1e3 * seen.height[seen.contact].mean(dtype=float), rel=1e-6)
+    x, y = np.meshgrid((np.arange(12) - 5.5) * 0.5e-3, (np.arange(8) - 3.5) * 0.5e-3)
+    weights = np.where(seen.contact, seen.height, 0.0)
+    assert values["centroid_x_upper"] == pytest.approx((weights * x).sum() / weights.sum() / 5e-3, rel=1e-5)
+    assert values["centroid_y_upper"] == pytest.approx((weights * y).sum() / weights.sum() / 5e-3, rel=1e-5)
+    assert values["shear_y_upper"] == pytest.approx(seen.flow[..., 1].mean() / 0.2e-3, rel=1e-5)
+    assert [values[f"force_{axis}_lower"] for axis in "xyz"] == pytest.approx([0.1, 0.2, -0.5])
+    assert values["torque_z_lower"] == pytest.approx(0.6)
+    assert values["moved_z_upper"] == pytest.approx(0.2)  # 1 mm down, which is along z of a sensor that faces down
+    assert values["moved_z_lower"] == 0.0
+    assert [values[f"between_{axis}_upper"] for axis in "xyz"] == pytest.approx([0.1, -0.2, 0.9])
+    assert "between_x_lower" not in values
+    assert all(
+        values[f"turn_{c}{a}_{n}"] == pytest.approx(0.0, abs=1e-6)
+        for c in "xy"
+        for a in "xyz"
+        for n in ("lower", "upper")
+    )
+
+
+def test_a_turn_is_that_since_reset() -> None:
+    asked = encoder(touch=("moved",))
+    asked.begin(observation())
+    turned = Rotation.from_rotvec([0.0, 0.0, 0.01]) * Rotation.from_quat(HALF_TURN_X.quaternion)
+    later = observation()
+    arms = {**later.arms, "upper": arm(Pose(later.arms["upper"].pose.position, turned.as_quat()))}
+    values = dict(zip(asked.names, asked(replace(later, arms=arms))["touch"].tolist(), strict=True))
+    assert values["turn_xy_upper"] == pytest.approx(-0.1, rel=1e-3)  # z of the upper sensor points down
+    assert values["turn_yx_upper"] == pytest.approx(0.1, rel=1e-3)
+
+
+def test_without_contact_nothing_is_felt_and_all_is_finite() -> None:
+    flat = np.zeros((8, 12), np.float32)
+    seen = observation(height=flat, contact=flat > 0)
+    asked = encoder(sensors=("lower",), touch=("area", "depth", "centroid"))
+    assert asked.begin(seen)["touch"].tolist() == [0.0] * 5
+
+
+def test_frames_are_stacked_oldest_first_and_begin_alike() -> None:
+    asked = encoder(frames=3, sensors=("lower",), touch=("depth",))
+    views = [observation(seed) for seed in range(3)]
+    one = [encoder(sensors=("lower",), touch=("depth",)).begin(view) for view in views]
+    begun = asked.begin(views[0])
+    assert begun["maps"].tolist() == np.concatenate([one[0]["maps"]] * 3).tolist()
+    asked(views[1])
+    last = asked(views[2])
+    assert last["maps"].tolist() == np.concatenate([each["maps"] for each in one]).tolist()
+    assert last["touch"].tolist() == np.concatenate([each["touch"] for each in one]).tolist()
+    assert asked.begin(views[1])["touch"].tolist() == one[1]["touch"].tolist() * 3  # a new episode remembers nothing
+
+
+def test_the_goal_is_told() -> None:
+    asked = encoder(goal=True)
+    assert asked.begin(observation(), (2e-3, -1e-3))["goal"].tolist() == pytest.approx([0.2, -0.1])
+    assert asked(observation())["goal"].tolist() == pytest.approx([0.2, -0.1])
+    assert asked.begin(observation(), 7e-3)["goal"].tolist() == pytest.approx([0.7])  # of the next episode
+    assert "goal" not in encoder().begin(observation(), 7e-3)
+    with pytest.raises(IncompatibleRig, match="the rig has no task"):
+        asked.begin(observation())
+
+
+def test_its_needs_are_those_of_what_it_sees() -> None:
+    both = frozenset({"lower", "upper"})
+    assert encoder().needs == Needs(both, both, height=True)
+    assert encoder(maps=("image",), touch=("wrench",)).needs == Needs(both, both)
+    assert encoder(maps=(), touch=("shear",)).needs == Needs(both, both, flow=True)
+
+
+def test_what_a_sensor_does_not_deliver_is_told() -> None:
+    with pytest.raises(IncompatibleRig, match="heights"):
+        encoder().begin(observation(height=None))
+    with pytest.raises(IncompatibleRig, match="slopes"):
+        encoder(maps=("slope",)).begin(observation(gradient=None))
+    with pytest.raises(IncompatibleRig, match="no markers"):
+        encoder(flow=True).begin(observation(flow=None))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"maps": ("height", "height")}, "names something twice"),
+        ({"maps": (), "touch": (), "goal": True}, "sees nothing"),
+        ({"arms": ("upper",)}, "two arms"),
+        ({"sensors": (), "touch": ("wrench",)}, "those of sensors"),
+        ({"frames": 0}, "greater than or equal to 1"),
+        ({"maps": ("colour",)}, "'height'"),
+    ],
+)
+def test_features_that_make_no_sense_are_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        Features(**wrong)

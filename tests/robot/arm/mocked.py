@@ -13,7 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from robot.arm import channel
-from robot.arm.channel import HISTORY
+from robot.arm.channel import HISTORY, ArmStatus
+from robot.arm.servo import FAULT_DECELERATION, STALL_PATIENCE
 from robot.arm.shared_ring import Record
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
@@ -107,6 +108,27 @@ def records(arm: URArm) -> Record:
     found = arm._channel.states.recent(HISTORY)
     kept: Record = found[found["stamp"] != 0.0]
     return kept
+
+
+def heights_in_a_fault(arm: URArm, status: ArmStatus) -> tuple[float, float]:
+    """How low the target of an arm that went down may be from this fault on, and how low once it has been led back [m].
+
+    By what the worker itself knew, however late it or its packages came: the target stands until a package tells where
+    the arm is, and brakes from there. Where no package does so in time, it goes on standing."""
+    seen = records(arm)
+    found = int(np.argmax(seen["status"] == status))
+    assert seen["status"][found] == status and found > 0, "the records do not go back to the fault"
+    seen = seen[found:]
+    held = float(seen["target"][0, 2])
+    led_back = np.flatnonzero((seen["target"] != seen["target"][0]).any(axis=1))
+    if not len(led_back):
+        rests = seen[seen["resting"] == 1][0]
+        assert rests["cycles"] - seen["cycles"][0] >= STALL_PATIENCE  # not before it has waited
+        return held, held
+    before = seen[: led_back[0]]  # the last of these is of the package from which it brakes
+    assert len(np.unique(before["stamp"])) <= STALL_PATIENCE
+    speed = float(np.linalg.norm(before["tcp_speed"][-1, :3]))
+    return held, float(before["position"][-1, 2]) - speed**2 / (2 * FAULT_DECELERATION)
 
 
 def stands(state: MockState) -> bool:

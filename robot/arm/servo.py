@@ -27,8 +27,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.arm.channel import ArmStatus, CommandKind, WorkerConfig
+from robot.arm.channel import CommandKind, WorkerConfig
 from robot.arm.shared_ring import Record
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD, MotionState, Rates, braking, resting, stopping_point, towards
 from robot.common.kinematics import Kinematics, inverse_frame, rotation, rotation_vector
 from robot.common.tcp import Measured

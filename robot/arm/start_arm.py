@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from robot.arm.channel import ArmStatus, CommandKind
+from robot.arm.channel import CommandKind
+from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
 from robot.errors import DeviceError
 from tacsim.interface import FloatArray, Pose

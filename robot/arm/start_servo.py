@@ -16,9 +16,10 @@ from typing import Protocol
 
 import numpy as np
 
-from robot.arm.channel import ArmStatus, CommandKind, WorkerConfig
+from robot.arm.channel import CommandKind, WorkerConfig
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD, MotionState, Rates, advance, resting, slower, stopping_distance
 from robot.common.kinematics import Kinematics, inverse_frame, rotation_vector
 from robot.common.tcp import ArmFrames, Measured

@@ -8,7 +8,6 @@ belong in the safety configuration on the pendant.
 from __future__ import annotations
 
 import math
-import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -17,9 +16,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from robot.arm.channel import (
-    AT_CONNECTING,
     HISTORY,
-    ArmStatus,
     Channel,
     CommandKind,
     Partner,
@@ -30,6 +27,7 @@ from robot.arm.channel import (
 from robot.arm.dashboard import Dashboard
 from robot.arm.package_log import PackageLog
 from robot.arm.shared_ring import Record
+from robot.arm.status import AT_CONNECTING, OUTLIVED, ArmStatus, status_of
 from robot.arm.worker_config import check_host, worker_config
 from robot.common import Closing
 from robot.common.kinematics import Kinematics
@@ -125,15 +123,8 @@ class URArm(Closing):
         """What the arm is doing now; never raises."""
         if self._closed:
             return ArmStatus.CLOSED
-        ended = (worker := self._worker) is None or not worker.running  # another thread may close the arm meanwhile
-        record = self._channel.states.latest()
-        last = ArmStatus.WORKER_DEAD if record is None else ArmStatus(int(record["status"]))
-        if ended:
-            return last if last == ArmStatus.LINK_LOST else ArmStatus.WORKER_DEAD
-        now = time.monotonic()
-        if record is not None and last != ArmStatus.CONNECTING and not _fresh(record, now, self.config.link_timeout):
-            return ArmStatus.LINK_LOST
-        return last
+        ended = 0 if (worker := self._worker) is None else worker.exit_status  # another thread may close it meanwhile
+        return status_of(self._channel.states.latest(), ended, self.config.link_timeout + 5 * POLL)
 
     def explain(self) -> str:
         """The status in words, with its numbers."""
@@ -386,15 +377,12 @@ class URArm(Closing):
                 text += f" (now {force:.1f} of {limits.force:g} N, {torque:.2f} of {limits.torque:g} N m)"
             elif status == ArmStatus.WORKSPACE_LIMIT:
                 text += f" ({self._region.broken(record['position']) or 'it is inside again'})"
-        if status == ArmStatus.WORKER_DEAD and (worker := self._worker) is not None:
-            late = worker.exit_status == -signal.SIGALRM
-            text += f" ({'a command took longer than link_timeout' if late else worker.last_words})"
+        worker = self._worker
+        if worker is not None and status == ArmStatus.WORKER_DEAD:
+            text += f" ({worker.last_words})"
+        elif worker is not None and status == ArmStatus.LINK_LOST and worker.exit_status == OUTLIVED:
+            text += " (a command took longer than link_timeout)"
         return text
 
 
 _DASHBOARD_FIRST = (ArmStatus.PROTECTIVE_STOP, ArmStatus.EMERGENCY_STOP, ArmStatus.PROGRAM_STOPPED)
-
-
-def _fresh(record: Record, now: float, link_timeout: float) -> bool:
-    """True if the newest package is fresh, or the worker is in a call of the controller that may take this long."""
-    return now <= max(float(record["time"]) + link_timeout + 5 * POLL, float(record["busy_until"]))

@@ -23,12 +23,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from robot.arm.channel import STATE, ArmStatus, Channel, WorkerConfig
+from robot.arm.channel import STATE, Channel, WorkerConfig
 from robot.arm.confinement import TimeLimit, allow_time_limits, last_connections
 from robot.arm.dashboard import Dashboard
 from robot.arm.servo import Servo, is_healthy
 from robot.arm.shared_ring import Segment
 from robot.arm.start_servo import StartServo
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.common.process import Parent

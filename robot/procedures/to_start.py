@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.arm.channel import ArmStatus
 from robot.arm.rtde import read_controller
 from robot.arm.start_arm import StartArm
+from robot.arm.status import ArmStatus
 from robot.errors import DeviceError
 from robot.procedures.start_way import Way, find_way, require_clear
 from tacsim import pose as se3

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from robot.arm.channel import ArmStatus
+from robot.arm.status import ArmStatus
 from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import PATIENCE, config, until

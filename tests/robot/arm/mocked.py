@@ -13,9 +13,10 @@ from collections.abc import Callable
 import numpy as np
 
 from robot.arm import channel
-from robot.arm.channel import HISTORY, ArmStatus
+from robot.arm.channel import HISTORY
 from robot.arm.servo import FAULT_DECELERATION, STALL_PATIENCE
 from robot.arm.shared_ring import Record
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.common.kinematics import Kinematics
@@ -25,7 +26,7 @@ from tacsim.interface import Pose
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Payload, Placement, UrArmConfig, Workspace
 
 HOST, OTHER = (f"127.{net}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" for net in (23, 123))
-PATIENCE = 20.0  # for anything that has to happen [s]
+PATIENCE = 60.0  # for anything that has to happen [s]
 CARRIED = (0.4, 0.0, 0.0, 0.04)  # what a mock has on its flange: mass [kg], centre [m]
 SERVO, ZERO = 11, 8  # numbers of the commands servoJ and zeroFtSensor in the registers
 STILL = 1e-3  # slower than this an arm stands [m/s]

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from robot.arm.channel import STATE, ArmStatus, CommandKind, WorkerConfig, command_record
+from robot.arm.channel import STATE, CommandKind, WorkerConfig, command_record
 from robot.arm.servo import Servo
 from robot.arm.shared_ring import Record
 from robot.arm.start_servo import StartServo
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, pose, rotation
 from robot.common.tcp import Measured, pose_of

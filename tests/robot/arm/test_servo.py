@@ -9,8 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus, CommandKind, Partner, WorkerConfig, command_record
+from robot.arm.channel import CommandKind, Partner, WorkerConfig, command_record
 from robot.arm.servo import MAX_SINGULAR_VALUE_RATE
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import rotation
 from tacsim.limits import region

@@ -8,8 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus, CommandKind, Partner, tactile_record
+from robot.arm.channel import CommandKind, Partner, tactile_record
 from robot.arm.servo import FAULT_DECELERATION, ZERO_PATIENCE, Servo
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from tests.robot.arm.servo_bench import Bench, other, shifted, worker_config
 

@@ -8,8 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus, CommandKind, Partner, command_record, tactile_record
+from robot.arm.channel import CommandKind, Partner, command_record, tactile_record
 from robot.arm.servo import Servo
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.tcp import Measured
 from tests.robot.arm.servo_bench import OnController, other, shifted

@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus, Partner
+from robot.arm.channel import Partner
 from robot.arm.servo import STALL_PATIENCE
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.worker import BLIND
 from robot.common.kinematics import rotation

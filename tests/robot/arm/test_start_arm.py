@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus
 from robot.arm.start_arm import StartArm
 from robot.arm.start_servo import JOINT_SPEED, distance_from_way
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.errors import DeviceError, SafetyViolation

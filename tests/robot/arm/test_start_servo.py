@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.arm.channel import STATE, ArmStatus, CommandKind, Partner, command_record
+from robot.arm.channel import STATE, CommandKind, Partner, command_record
 from robot.arm.start_servo import JOINT_SPEED, OFF_WAY, distance_from_way
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from tests.robot.arm.servo_bench import HOME, Bench, other, shifted
 

@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from robot.arm.channel import HISTORY, STATE, ArmStatus, CommandKind, command_record
+from robot.arm.channel import HISTORY, STATE, CommandKind, command_record
+from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.common.kinematics import matrix

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.arm.channel import ArmStatus
+from robot.arm.status import ArmStatus
 from robot.arm.ur import URArm
 from robot.errors import (
     SafetyViolation,

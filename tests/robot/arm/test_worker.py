@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from robot.arm import shared_ring, worker
-from robot.arm.channel import ArmStatus, Channel, WorkerConfig
+from robot.arm.channel import Channel, WorkerConfig
+from robot.arm.status import ArmStatus
 from robot.arm.worker_config import worker_config as config_of
 from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace

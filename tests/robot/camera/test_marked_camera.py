@@ -40,7 +40,7 @@ sensors:
     {{ driver: camera, source: '{source}', width: 320, height: 240, fps: 60, max_age: 10 s, model: ideal-markers,
        size: [20 mm, 15 mm] }}
 """
-PATIENCE = 20.0  # [s]
+PATIENCE = 60.0  # [s]
 
 
 class Gel:

@@ -14,7 +14,7 @@ from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS
 from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, package
 
-TIMEOUT = 20.0  # of whatever a test waits for [s]
+TIMEOUT = 60.0  # of whatever a test waits for [s]
 
 
 def wire_host(number: int) -> str:

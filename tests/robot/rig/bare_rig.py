@@ -31,7 +31,7 @@ from tacsim.rig import Rig
 if find_spec("rtde_control") is None:
     pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
 
-PATIENCE = 20.0  # for anything that has to happen [s]
+PATIENCE = 60.0  # for anything that has to happen [s]
 BARE = """
 name: bare
 clock: wall

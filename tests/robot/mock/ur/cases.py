@@ -23,7 +23,7 @@ from robot.common.kinematics import Kinematics, displacement, matrix
 from robot.mock import FaultClient
 from tacsim.interface import FloatArray
 
-PATIENCE = 20.0  # for anything that has to happen [s]
+PATIENCE = 60.0  # for anything that has to happen [s]
 CLASSES = {
     "RTDEControlInterface": "rtde_control",
     "RTDEReceiveInterface": "rtde_receive",

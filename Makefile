@@ -54,7 +54,7 @@ test-all: test test-deep
 test-gpu: $(DEV)
 	@TACSIM_DEVICE=cuda $(BIN)/python -c 'from tacsim.compute.runtime import start; start()' >/dev/null 2>&1 || { \
 	  echo "make test-gpu: Taichi finds no CUDA device (or no driver) on this machine, so nothing was tested."; exit 77; }
-	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q tests/physics $(ARGS)
+	@TACSIM_DEVICE=cuda $(BIN)/python -m pytest -q tests/tacsim/physics $(ARGS)
 	@TACSIM_DEVICE=cuda $(BIN)/tacsim bench all --long --json benchmarks/gpu/report.json
 	@$(BIN)/tacsim bench --from benchmarks/reference.json --from benchmarks/gpu/report.json --docs docs
 	@echo "To publish the figures, commit benchmarks/gpu and docs."

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup as EpisodeSetup
     from robot.deploy.control_loop import RecordingFailed as RecordingFailed
     from robot.deploy.control_loop import run_episode as run_episode
-    from robot.deploy.policy import FunctionPolicy as FunctionPolicy
     from robot.deploy.policy import PolicyNotFound as PolicyNotFound
     from robot.deploy.policy import load_policy as load_policy
+    from robot.deploy.python_policy import FunctionPolicy as FunctionPolicy
     from robot.errors import DeviceAlreadyConnectedError as DeviceAlreadyConnectedError
     from robot.errors import DeviceBusyError as DeviceBusyError
     from robot.errors import DeviceError as DeviceError

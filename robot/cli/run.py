@@ -40,7 +40,10 @@ def run(
     ] = None,
     policy: Annotated[
         str | None,
-        typer.Option(help="scripted, grip, or package.module:name.", show_default="scripted; grip without a task"),
+        typer.Option(
+            help="scripted, grip, a learned one (FILE.onnx), or package.module:name.",
+            show_default="scripted; grip without a task",
+        ),
     ] = None,
     steps: Annotated[
         int | None, typer.Option(min=0, help="Exactly so many control steps.", show_default="the task's; else 40")
@@ -100,7 +103,7 @@ def _run(
     fitting: list[Policy] = []
 
     def fit(spec: RigSpec) -> None:
-        fitting.append(load_policy(policy, task, spec))
+        fitting.append(load_policy(policy, task, spec, loaded.config.canonical))
         require_fit(loaded.config.name, spec, fitting[0], policy, task)
 
     with (

@@ -1,47 +1,27 @@
-"""Policies by name: the scripted one of a task, `grip`, or a person's own Python code."""
+"""Policies by name: the scripted one of a task, `grip`, a learned one in an ONNX file, or a person's Python code."""
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import re
-from collections.abc import Callable
 from pathlib import Path
 
-from tacsim.interface import Action, Needs, Observation, Policy, RigSpec
+from robot.deploy.onnx_policy import OnnxPolicy, misfits
+from robot.deploy.python_policy import PolicyNotFound as PolicyNotFound
+from robot.deploy.python_policy import policy_of_code
+from tacsim.interface import IncompatibleRig, Policy, RigSpec
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.rig import require
 from tacsim.tasks import Task
 
-PACKAGES = ("tacsim", "calibration", "robot")
 
+def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: CanonicalGrid | None = None) -> Policy:
+    """The policy called `name`, for a rig that delivers `spec` on this canonical grid (None: the usual one).
 
-class PolicyNotFound(ValueError):
-    """The name of a policy leads to nothing that acts."""
+    "scripted": the task's own. "grip": closes until it feels contact, on any rig. "path/to/file.onnx": a learned one.
+    "package.module:attribute": an object with needs, reset and __call__ as tacsim.Policy has them, a class of such
+    objects (made without arguments), or a function from Observation to Action. Runs code of that module, so name only
+    modules you trust; of an ONNX file nothing is run but its operators.
 
-
-class FunctionPolicy:
-    """A plain function from Observation to Action as a policy that needs nothing and remembers nothing."""
-
-    needs = Needs()
-
-    def __init__(self, act: Callable[[Observation], Action]) -> None:
-        self._act = act
-
-    def reset(self) -> None:
-        """A function has no state."""
-
-    def __call__(self, observation: Observation) -> Action:
-        return self._act(observation)
-
-
-def load_policy(name: str, task: Task | None, spec: RigSpec) -> Policy:
-    """The policy called `name`, for a rig that delivers `spec`.
-
-    "scripted": the task's own. "grip": closes until it feels contact, on any rig. "package.module:attribute": an object
-    with needs, reset and __call__ as tacsim.Policy has them, a class of such objects (made without
-    arguments), or a function from Observation to Action. Runs code of that module, so name only modules you trust.
-
-    Raises PolicyNotFound.
+    Raises PolicyNotFound, and IncompatibleRig for a learned policy that sees another grid.
     """
     if name == "scripted":
         if task is None:
@@ -53,9 +33,12 @@ def load_policy(name: str, task: Task | None, spec: RigSpec) -> Policy:
         from tacsim.tasks.grip import Grip
 
         return Grip(spec)
+    if name.endswith(".onnx"):
+        return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.config.goal)
     if ":" not in name:
-        raise PolicyNotFound(f"no policy '{name}'; allowed: 'scripted', 'grip', or 'package.module:attribute'")
-    return _as_policy(_attribute(name), name)
+        allowed = "'scripted', 'grip', 'path/to/file.onnx', or 'package.module:attribute'"
+        raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}")
+    return policy_of_code(name)
 
 
 def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task | None) -> None:
@@ -66,55 +49,5 @@ def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task |
         require(rig, spec, task.needs, f"task '{task.config.kind}'", advice)
     advice = "" if name == "grip" else "Take --policy grip, which needs pictures alone, or one of your own"
     require(rig, spec, policy.needs, f"policy '{name}'", advice)
-
-
-def _attribute(name: str) -> object:
-    module_name, _, path = name.partition(":")
-    if not path or not all(part.isidentifier() for part in [*module_name.split("."), *path.split(".")]):
-        raise PolicyNotFound(f"policy '{name}' must have the form 'package.module:attribute'")
-    try:
-        found: object = importlib.import_module(module_name)
-    except ModuleNotFoundError as failure:
-        missing = failure.name or ""
-        if not missing or not (module_name + ".").startswith(missing + "."):
-            why = f"module '{module_name}' itself imports '{missing}', which is missing{_namesake(missing)}"
-        else:
-            why = f"no module '{missing}'; is its folder on PYTHONPATH?{_namesake(missing)}"
-        raise PolicyNotFound(f"policy '{name}': {why}") from failure
-    except (Exception, SystemExit) as failure:  # a script may end Python when it is imported
-        why = f"importing '{module_name}' failed: {failure!r}{_namesake(str(failure))}"
-        raise PolicyNotFound(f"policy '{name}': {why}") from failure
-    for part in path.split("."):
-        if not hasattr(found, part):
-            raise PolicyNotFound(f"policy '{name}': '{module_name}' has no '{path}'{_namesake(module_name)}")
-        found = getattr(found, part)
-    return found
-
-
-def _namesake(words: str) -> str:
-    """What to add to an error that speaks of one of our packages: a file in the working folder has the same name."""
-    ours = Path(__file__).resolve().parents[2]
-    for package in PACKAGES:
-        for path in (Path(package).absolute(), Path(f"{package}.py").absolute()):
-            if re.search(rf"\b{package}\b", words) and path.exists() and path.resolve() != ours / package:
-                return f". '{package}' is a package of tacsim, {path} is not imported: rename it"
-    return ""
-
-
-def _as_policy(found: object, name: str) -> Policy:
-    if inspect.isclass(found):
-        try:
-            found = found()
-        except Exception as failure:
-            raise PolicyNotFound(
-                f"policy '{name}': the class cannot be made without arguments: {failure!r}"
-            ) from failure
-    if isinstance(found, Policy):
-        if not isinstance(found.needs, Needs):
-            raise PolicyNotFound(f"policy '{name}': its needs must be a tacsim.Needs, got {type(found.needs).__name__}")
-        return found
-    if callable(found):
-        return FunctionPolicy(found)
-    raise PolicyNotFound(
-        f"policy '{name}' is a {type(found).__name__}: neither a policy nor a function of an Observation"
-    )
+    if isinstance(policy, OnnxPolicy) and (found := misfits(policy, spec, task)):
+        raise IncompatibleRig(f"policy '{name}' cannot run on rig '{rig}': it was trained for {'; '.join(found)}")

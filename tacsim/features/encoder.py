@@ -4,7 +4,7 @@
 |-------|-------------------------------------|--------------------------------------------------------|
 | maps  | (frames * sensors * channels, h, w) | frame by frame (oldest first), sensor by sensor        |
 | flow  | (frames * sensors * 2, m, n)        | (x, y) of each sensor's markers                        |
-| touch | (frames * numbers,)                 | `numbers` are those of `FeatureEncoder.names`          |
+| touch | (frames * numbers,)                 | named by `FeatureEncoder.inputs`                        |
 | goal  | (1,) or (2,)                        | of the task                                            |
 
 Every number is its SI value over the scale of its quantity in `SCALES`. Nothing is clipped and nothing is normalised
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
-from tacsim.models.features import Channel, Features, MapGrid, Quantity
+from tacsim.models.features import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
 
 Arrays = dict[str, NDArray[Any]]
@@ -45,16 +45,21 @@ SCALES = {
     "turn": 0.1,  # first two columns of a rotation, less those of no rotation [-]
     "goal": 10e-3,  # [m]
 }
-CHANNELS = {"height": 1, "slope": 2, "contact": 1, "image": 3}
-_MOVED = (*(f"moved_{axis}" for axis in "xyz"), *(f"turn_{column}{axis}" for column in "xy" for axis in "xyz"))
-_PARTS: dict[Quantity, tuple[str, ...]] = {
-    "area": ("area",),
-    "depth": ("depth_greatest", "depth_mean"),
-    "centroid": ("centroid_x", "centroid_y"),
-    "shear": ("shear_x", "shear_y"),
-    "wrench": tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz"),
-    "moved": _MOVED,
-    "between": tuple(f"between_{axis}" for axis in "xyz"),
+# What each quantity consists of, and the scale of each part.
+PARTS: dict[str, dict[str, str]] = {
+    "height": {"height": "height"},
+    "slope": {"slope_x": "slope", "slope_y": "slope"},
+    "contact": {"contact": "contact"},
+    "image": dict.fromkeys(("red", "green", "blue"), "image"),
+    "flow": {"flow_x": "flow", "flow_y": "flow"},
+    "area": {"area": "area"},
+    "depth": {"depth_greatest": "depth", "depth_mean": "depth"},
+    "centroid": {"centroid_x": "centroid", "centroid_y": "centroid"},
+    "shear": {"shear_x": "shear", "shear_y": "shear"},
+    "wrench": {f"{what}_{axis}": what for what in ("force", "torque") for axis in "xyz"},
+    "moved": {f"moved_{axis}": "moved" for axis in "xyz"}
+    | {f"turn_{column}{axis}": "turn" for column in "xy" for axis in "xyz"},
+    "between": {f"between_{axis}": "between" for axis in "xyz"},
 }
 _UNTURNED = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
 _OF_SENSORS = ("area", "depth", "centroid", "shear")
@@ -84,13 +89,31 @@ class FeatureEncoder:
         return Needs(frozenset(wanted.sensors), frozenset(wanted.arms), height=height, flow=flow)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of the numbers of one frame in `touch`: quantity, axis, and of which sensor or arm."""
-        found: list[str] = []
-        for quantity in self.features.touch:
-            owners = self.features.sensors if quantity in _OF_SENSORS else self.features.arms
-            found += [f"{part}_{owner}" for owner in owners[quantity == "between" :] for part in _PARTS[quantity]]
-        return tuple(found)
+    def inputs(self) -> dict[str, Numbers]:
+        """What the numbers of each array are, along its first axis: quantity and axis, of which sensor or arm, and with
+        several frames how many periods ago. Without the goal's, which depend on the task."""
+        wanted = self.features
+        found: dict[str, list[tuple[str, float]]] = {}
+        if wanted.maps:
+            found["maps"] = [part for name in wanted.sensors for kind in wanted.maps for part in _named(kind, name)]
+        if wanted.flow:
+            found["flow"] = [part for name in wanted.sensors for part in _named("flow", name)]
+        if wanted.touch:
+            owners = {kind: wanted.sensors if kind in _OF_SENSORS else wanted.arms for kind in wanted.touch}
+            found["touch"] = [
+                part
+                for kind, names in owners.items()
+                for name in names[kind == "between" :]
+                for part in _named(kind, name)
+            ]
+        ages = [f" -{age}" if age else "" for age in reversed(range(wanted.frames))]
+        return {
+            key: Numbers(
+                names=tuple(name + age for age in ages for name, _ in parts),
+                scales=tuple(scale for _ in ages for _, scale in parts),
+            )
+            for key, parts in found.items()
+        }
 
     def begin(self, observation: Observation, goal: float | Sequence[float] | None = None) -> Arrays:
         """The first observation of an episode; frames before it are taken to be like it.
@@ -195,6 +218,10 @@ class _Pool:
         blocks = values.reshape(rows, self._every, columns, self._every, values.shape[-1])
         total: FloatArray = blocks.sum(axis=(1, 3))
         return total
+
+
+def _named(kind: str, owner: str) -> list[tuple[str, float]]:
+    return [(f"{part}_{owner}", SCALES[scale]) for part, scale in PARTS[kind].items()]
 
 
 def _centres(cells: int, pitch: float) -> FloatArray:

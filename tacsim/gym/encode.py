@@ -1,4 +1,4 @@
-"""Observation -> flat dict of arrays, vector -> Action: what learning code sees of the contract.
+"""Observation -> flat dict of arrays, and their spaces: what learning code sees of the contract.
 
 Keys carry no dots: `tactile_upper`, `height_upper`, `pose_upper` ... All values are SI. What a sensor does not deliver
 has no key.
@@ -20,7 +20,7 @@ has no key.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -28,11 +28,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.features.encoder import CHANNELS, FeatureEncoder
-from tacsim.interface import Action, ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
-from tacsim.limits import ActionError
+from tacsim.features.encoder import FeatureEncoder
+from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.tasks.task import Axis
 
 Flat = dict[str, NDArray[Any]]
 
@@ -124,17 +122,17 @@ def space_of_rig(config: RigConfig) -> spaces.Space[Flat]:
 def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Space[Flat]:
     """Of what `encoder` makes of this rig, whose task has a goal."""
     features = encoder.features
+    numbers = {key: len(each.names) for key, each in encoder.inputs.items()}
     shapes: dict[str, tuple[int, ...]] = {}
     if features.maps:
-        channels = features.frames * len(features.sensors) * sum(CHANNELS[kind] for kind in features.maps)
-        shapes["maps"] = (channels, features.grid.rows, features.grid.columns)
+        shapes["maps"] = (numbers["maps"], features.grid.rows, features.grid.columns)
     if features.flow:
         lattices = {name: _lattice(name, config) for name in features.sensors}
         if len(set(lattices.values())) > 1:
             raise IncompatibleRig(f"flow of sensors with different markers makes no array: {lattices}")
-        shapes["flow"] = (features.frames * len(features.sensors) * 2, *next(iter(lattices.values())))
+        shapes["flow"] = (numbers["flow"], *next(iter(lattices.values())))
     if features.touch:
-        shapes["touch"] = (features.frames * len(encoder.names),)
+        shapes["touch"] = (numbers["touch"],)
     if features.goal:
         assert config.task is not None
         shapes["goal"] = np.atleast_1d(config.task.goal).shape
@@ -160,28 +158,3 @@ def _space(key: str, value: NDArray[Any]) -> spaces.Space[Any]:
         return spaces.MultiBinary(value.shape)
     bound = BOUNDS[key.split("_", 1)[0]]
     return spaces.Box(-bound, bound, value.shape, np.float32)
-
-
-def action_from(
-    vector: NDArray[np.floating[Any]], axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]
-) -> Action:
-    """Component i moves its arm from `poses` by vector[i] * max_step [m] along its axis, rotation kept.
-
-    Raises ActionError for a wrong shape, a component that is not finite, or one outside [-1, 1].
-    """
-    given = np.asarray(vector)
-    if given.dtype.kind not in "fiub":
-        raise ActionError(f"action must be an array of {len(axes)} real numbers, got {vector!r}")
-    values = given.astype(np.float64)
-    if values.shape != (len(axes),):
-        raise ActionError(f"action must have shape ({len(axes)},), one number for each free axis, got {values.shape}")
-    # The margin admits 1.0 in any float precision.
-    if not np.isfinite(values).all() or float(np.abs(values).max(initial=0.0)) > 1.0 + 1e-6:
-        raise ActionError(
-            f"action components must be finite and within [-1, 1], got {values.tolist()}; "
-            "bound the policy's output (gymnasium.wrappers.ClipAction does it)"
-        )
-    positions = {axis.arm: np.array(poses[axis.arm].position) for axis in axes}
-    for axis, value in zip(axes, values, strict=True):
-        positions[axis.arm] += value * max_step * np.array(axis.direction)
-    return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})

@@ -26,6 +26,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
 from tacsim.tasks import make_task
+from tacsim.tasks.action import action_from
 from tacsim.tasks.task import Task, judge
 
 Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
@@ -171,7 +172,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         `end_step`. Raises as `step`."""
         if self.phase != "running":
             raise ResetNeeded("call reset() before step(): no episode is running")
-        asked = encode.action_from(action, self.task.axes, self.task.config.max_step, self._targets)
+        asked = action_from(action, self.task.axes, self.task.config.max_step, self._targets)
         self._failure = None
         try:
             self._sent = self.rig.command(asked)

@@ -50,3 +50,16 @@ class Features(Config):
         if not (self.maps or self.flow or self.touch):
             raise ValueError("a policy that sees nothing: choose maps, flow or touch")
         return self
+
+
+class Numbers(Config):
+    """What the numbers of one input are, along its first axis."""
+
+    names: Annotated[tuple[str, ...], Field(min_length=1, max_length=10_000)]
+    scales: tuple[float, ...]  # SI value that is encoded as 1
+
+    @model_validator(mode="after")
+    def _alike(self) -> Self:
+        if len(self.names) != len(self.scales):
+            raise ValueError(f"{len(self.names)} names, but {len(self.scales)} scales")
+        return self

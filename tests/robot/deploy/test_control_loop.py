@@ -17,7 +17,8 @@ import pytest
 from mcap.reader import make_reader
 
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode, versions
-from robot.deploy.policy import FunctionPolicy, PolicyNotFound, load_policy
+from robot.deploy.policy import PolicyNotFound, load_policy
+from robot.deploy.python_policy import FunctionPolicy
 from tacsim.interface import (
     Action,
     ArmState,
@@ -370,7 +371,10 @@ def test_policies_by_name() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("scriptd", "no policy 'scriptd'; allowed: 'scripted', 'grip', or 'package.module:attribute'"),
+        (
+            "scriptd",
+            "no policy 'scriptd'; allowed: 'scripted', 'grip', 'path/to/file.onnx', or 'package.module:attribute'",
+        ),
         ("my_policies:", "must have the form"),
         ("no_policies:hold", "no module 'no_policies'"),
         ("my_policies:absent", "'my_policies' has no 'absent'"),

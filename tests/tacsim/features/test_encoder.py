@@ -99,7 +99,7 @@ def test_touch_holds_what_its_names_say() -> None:
     first = observation()
     asked.begin(first)
     later = observation(seed=5, z=9e-3)
-    values = dict(zip(asked.names, asked(later)["touch"].tolist(), strict=True))
+    values = dict(zip(asked.inputs["touch"].names, asked(later)["touch"].tolist(), strict=True))
     seen = later.tactile["upper"]
     assert seen.height is not None and seen.flow is not None
     assert values["area_upper"] == pytest.approx(seen.contact.sum() * 0.25e-6 / 1e-4)
@@ -130,7 +130,7 @@ def test_a_turn_is_that_since_reset() -> None:
     turned = Rotation.from_rotvec([0.0, 0.0, 0.01]) * Rotation.from_quat(HALF_TURN_X.quaternion)
     later = observation()
     arms = {**later.arms, "upper": arm(Pose(later.arms["upper"].pose.position, turned.as_quat()))}
-    values = dict(zip(asked.names, asked(replace(later, arms=arms))["touch"].tolist(), strict=True))
+    values = dict(zip(asked.inputs["touch"].names, asked(replace(later, arms=arms))["touch"].tolist(), strict=True))
     assert values["turn_xy_upper"] == pytest.approx(-0.1, rel=1e-3)  # z of the upper sensor points down
     assert values["turn_yx_upper"] == pytest.approx(0.1, rel=1e-3)
 

@@ -1,0 +1,43 @@
+"""What a policy file says of itself: the JSON in its metadata. A file is read on the rig that it is to run on, so it
+says everything that its numbers depend on."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from tacsim.models.features import Features, Numbers
+from tacsim.models.hardware import Name
+from tacsim.models.quantity import Config, Length, Time
+
+METADATA_KEY = "tacsim.spec"  # of an ONNX file
+Component = Annotated[float, Field(ge=-1, le=1)]
+
+
+class ActionAxis(Config):
+    """One number of an action: it moves `arm` along `direction`."""
+
+    arm: Name
+    direction: tuple[Component, Component, Component]  # unit vector, world
+
+    @model_validator(mode="after")
+    def _is_a_direction(self) -> Self:
+        if abs(math.hypot(*self.direction) - 1.0) > 1e-6:
+            raise ValueError(f"direction {self.direction} is no unit vector")
+        return self
+
+
+class PolicySpec(Config):
+    """A learned policy: what it sees, what its numbers do, and where it comes from."""
+
+    version: Literal[1] = 1
+    task: str  # the kind that it was trained for
+    period: Annotated[Time, Field(gt=0)]  # control period [s]
+    features: Features
+    # Of each input of the graph; so a change of the encoder's own conventions is noticed.
+    inputs: dict[str, Numbers]
+    axes: Annotated[tuple[ActionAxis, ...], Field(min_length=1, max_length=64)]
+    max_step: Annotated[Length, Field(gt=0)]  # an action of 1 moves its arm so far [m]
+    trained: dict[str, Any] = {}  # how it was made, for people

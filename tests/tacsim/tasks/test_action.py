@@ -1,0 +1,44 @@
+"""Action vectors keep what they encode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tacsim.interface import Pose
+from tacsim.limits import ActionError
+from tacsim.tasks.action import action_from
+from tacsim.tasks.task import Axis
+
+AXES = (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (1.0, 0.0, 0.0)), Axis("upper", (0.0, 1.0, 0.0)))
+POSES = {
+    "lower": Pose(np.array([0.1, 0.2, 0.3])),
+    "upper": Pose(np.array([1.0, 2.0, 3.0]), Rotation.from_euler("xyz", [3.0, 0.2, -0.4]).as_quat()),
+}
+
+
+def test_a_vector_moves_each_arm_along_its_axes() -> None:
+    vector = np.array([0.5, -1.0, 0.25], np.float32)
+    action = action_from(vector, AXES, 2e-4, POSES)
+    assert action.tool["lower"].position == pytest.approx([0.1, 0.2, 0.3 + 1e-4], abs=1e-12)  # type: ignore[union-attr]
+    assert action.tool["upper"].position == pytest.approx([1.0 - 2e-4, 2.0 + 5e-5, 3.0], abs=1e-12)  # type: ignore[union-attr]
+    assert np.array_equal(action.tool["upper"].quaternion, POSES["upper"].quaternion)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("vector", "message"),
+    [
+        ([0.0, 0.0], r"shape \(3,\)"),
+        ([0.0, np.nan, 0.0], "finite"),
+        ([0.0, 1.01, 0.0], r"within \[-1, 1\], got \[0.0, 1.01, 0.0\]"),
+        ([0.0, -np.inf, 0.0], "finite"),
+        ("up", "3 real numbers, got .*'up'"),
+        (np.array([1j, 0.0, 0.0]), "real numbers"),
+    ],
+)
+def test_a_vector_that_is_no_action_is_refused(vector: Any, message: str) -> None:
+    with pytest.raises(ActionError, match=message):
+        action_from(np.array(vector), AXES, 2e-4, POSES)

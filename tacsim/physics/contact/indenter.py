@@ -16,15 +16,14 @@ from tacsim.physics.exec.lanes import (
     COPIES,
     LANES,
     ON_DEVICE,
-    PARTS,
     add_four,
     copy_of,
     part_range,
-    share_start,
     slot_of,
     vec3,
     vec4,
 )
+from tacsim.physics.exec.team import once_if
 from tacsim.physics.gel.kernels import contact_force_start, surface_at, surface_row
 
 Slip = ti.types.ndarray(dtype=vec3, ndim=3)
@@ -41,16 +40,15 @@ SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
 TANGENT_STIFFNESS = 0.25  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
 UNKNOWN = 1e9  # distance where none is known
 FORGOTTEN = 1e-6  # shear moduli: a pressure below that is none
-CELL_REACH = 2.5  # elements: a cell whose middle is farther from the indenter touches nothing
+TOUCHABLE = 0.5  # elements: a point farther from the indenter touches nothing
+MARGIN = 1.0  # elements: nothing passes so much in one substep, so cells that are farther have forgotten
 
 
 class Indenter(NamedTuple):
-    """The indenters of all environments inside a kernel: memory of the quadrature points, pressure that the surface's
-    nodes carry, distances from a mesh."""
+    """The indenters of all environments inside a kernel: memory of the quadrature points, distances from a mesh."""
 
     slip: Any
     pressure: Any
-    carried: Any
     values: Any
 
 
@@ -147,6 +145,7 @@ def point_weights() -> tuple[tuple[float, ...], ...]:
 
 
 POINT_WEIGHTS = point_weights()
+WEIGHTS_OF_NODES = tuple(zip(*POINT_WEIGHTS, strict=True))  # of the three points, for each of the four nodes
 
 
 @ti.func
@@ -161,50 +160,86 @@ def weights_of(point):
 
 
 @ti.func
+def by_weights(values: ti.template(), weights: ti.template()):
+    """Sum of `values` by weights that are known when a kernel is compiled: those of 0 cost nothing."""
+    total = 0.0
+    for k in ti.static(range(len(weights))):
+        if ti.static(weights[k] != 0.0):
+            total += weights[k] * values[k]
+    return total
+
+
+@ti.func
 def patch_sum(gels: ti.template(), row, i, j, wx, wy):
     """Sum of a surface quantity over the 4 x 4 nodes round cell (i, j); row: the quantity's first."""
-    total = vec3(0.0)
+    total = vec4(0.0)
     for p, q in ti.static(ti.ndrange(4, 4)):
         at = surface_at(gels, row + i + p, j + q)
-        total += (wx[p] * wy[q]) * vec3([gels.surface[at + c] for c in range(3)])
+        total += (wx[p] * wy[q]) * vec4([gels.surface[at + c] for c in range(4)])
     return total
 
 
 @ti.func
-def carried_pressure(e, gels: ti.template(), indenter: ti.template(), i, j, wx, wy):
-    """The same sum of the pressure that the nodes carry."""
-    total = 0.0
+def patch_sums(gels: ti.template(), row, i, j, points: ti.template()):
+    """The same at all points of a cell, of both quantities, into `points` (2 x 9, 4): along one axis, then the other.
+
+    Each node is read once. A loop over its four numbers, as in `surface_sum`.
+    """
+    for quantity in range(2):
+        for c in range(4):
+            nodes = [
+                [gels.surface[surface_at(gels, row + quantity * (gels.nx + 3) + i + p, j + q) + c] for q in range(4)]
+                for p in range(4)
+            ]
+            for y in ti.static(range(POINTS)):
+                line = [by_weights(nodes[p], ti.static(POINT_WEIGHTS[y])) for p in range(4)]
+                for x in ti.static(range(POINTS)):
+                    value = by_weights(line, ti.static(POINT_WEIGHTS[x]))
+                    points[POINTS * (POINTS * quantity + x) + y, c] = value
+
+
+@ti.func
+def hand_on(gels: ti.template(), forces, i, j, pushes: ti.template()):
+    """Adds what the points of cell (i, j) push, `pushes` (9, 4), to its 4 x 4 nodes: the other way round."""
+    nodes = ti.Matrix.zero(ti.f32, 16, 4)
+    for c in range(4):
+        at = [[pushes[POINTS * x + y, c] for y in range(POINTS)] for x in range(POINTS)]
+        for q in ti.static(range(4)):
+            line = [by_weights(at[x], ti.static(WEIGHTS_OF_NODES[q])) for x in range(POINTS)]
+            for p in ti.static(range(4)):
+                nodes[4 * p + q, c] = by_weights(line, ti.static(WEIGHTS_OF_NODES[p]))
     for p, q in ti.static(ti.ndrange(4, 4)):
-        x, y = ti.max(0, ti.min(i + p - 1, gels.nx)), ti.max(0, ti.min(j + q - 1, gels.ny))
-        total += wx[p] * wy[q] * indenter.carried[e, x, y]
-    return total
+        node = surface_node(gels, i + p - 1, j + q - 1)
+        add_four(gels.contact_force, forces + 4 * node, vec4([nodes[4 * p + q, c] for c in range(4)]))
 
 
 @ti.func
-def carry(env: ti.template(), part, gels: ti.template(), indenter: ti.template()):
+def carry(env: ti.template(), part, gels: ti.template()):
     """Nodes take over a share of the pressure on them: this part's; on a device a part is one node."""
-    e, row = env.index, gels.ny + 1
+    row = gels.ny + 1
     count, h = (gels.nx + 1) * row, env.param(layout.GEL_SPACING)
     blocks = (count + LANES - 1) // LANES
-    first, last = share_start(blocks, part, PARTS), share_start(blocks, part + 1, PARTS)
-    if ti.static(ON_DEVICE):
-        first, last = part, part + 1
+    first, last = part_range(blocks, part)
+    first_row, least = surface_row(env, gels, 0), FORGOTTEN * env.param(layout.GEL_MU)
+    i, j = first * LANES // row, first * LANES % row
     for node in range(first * LANES, ti.min(last * LANES, count)):
         total = 0.0
         for copy in ti.static(range(COPIES)):
-            at = contact_force_start(env, gels, copy, 0) + 4 * node + 3
-            total += gels.contact_force[at]
-            gels.contact_force[at] = 0.0
-        i, j = node // row, node % row
-        area = h * h
-        if i == 0 or i == gels.nx:
-            area *= 0.5
-        if j == 0 or j == gels.ny:
-            area *= 0.5
-        old = indenter.carried[e, i, j]
-        # what hardly presses any more is let go of, not halved for ever
-        new = old + MEMORY_RATE * (total / area - old)
-        indenter.carried[e, i, j] = ti.select(total == 0.0 and new < FORGOTTEN * env.param(layout.GEL_MU), 0.0, new)
+            total += gels.contact_force[contact_force_start(env, gels, copy, 0) + 4 * node + 3]
+        at = surface_at(gels, first_row + i + 1, j + 1) + 3
+        old = gels.surface[at]
+        if total != 0.0 or old != 0.0:
+            area = h * h
+            if i == 0 or i == gels.nx:
+                area *= 0.5
+            if j == 0 or j == gels.ny:
+                area *= 0.5
+            # what hardly presses any more is let go of, not halved for ever
+            new = old + MEMORY_RATE * (total / area - old)
+            gels.surface[at] = ti.select(total == 0.0 and new < least, 0.0, new)
+        j += 1
+        if j == row:
+            i, j = i + 1, 0
 
 
 @ti.func
@@ -230,6 +265,8 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
     deepest = 0.0
     row, forces = surface_row(env, gels, 0), contact_force_start(env, gels, copy_of(part), 0)
     first_cell, last_cell, low, high = 0, 0, 0, ny
+    points = ti.Matrix.zero(ti.f32, 2 * POINTS * POINTS, 4)  # of one cell: what its points feel, and what they push
+    pushes = ti.Matrix.zero(ti.f32, POINTS * POINTS, 4)
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny
         last_cell, high = first_cell + 1, low + 1
@@ -238,8 +275,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
     for cell_i in range(first_cell, last_cell):
         for cell_j in range(low, high):
             # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh,
-            # whose distances are true only near it, that of its bounding box. A distance grows no faster than
-            # the path, and no point of the cell is farther from its middle than two elements.
+            # whose distances are true only near it, that of its bounding box. A distance grows no faster than the path.
             middle = vec3(0.0)
             for p, q in ti.static(ti.ndrange(2, 2)):
                 node = surface_at(gels, row + cell_i + p + 1, cell_j + q + 1)
@@ -251,30 +287,45 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                 far, _ = box_distance(size, back @ (at - centre))
             else:
                 far, _ = signed_distance(env, kind, size, back @ (at - centre), grid)
-            if far > CELL_REACH * h:
-                # Nothing passes this margin in one substep, so what is beyond has forgotten.
-                if far < (CELL_REACH + 1) * h:
+            # how far its points can lie from its middle
+            reach = 0.0
+            for p, q in ti.static(ti.ndrange(2, 2)):
+                node = surface_at(gels, row + cell_i + p + 1, cell_j + q + 1)
+                corner = vec3([gels.surface[node + c] for c in range(3)]) - middle
+                reach = ti.max(reach, (corner + h * vec3(p - 0.5, q - 0.5, 0.0)).norm_sqr())
+            spare = far - ti.sqrt(reach) - TOUCHABLE * h
+            if spare > 0.0:
+                if spare < MARGIN * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
                         indenter.slip[e, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
                         indenter.pressure[e, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
             else:
+                if ti.static(not ON_DEVICE):
+                    patch_sums(gels, row, cell_i, cell_j, points)
+                pushed = False
                 for point in range(POINTS * POINTS):
                     i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
                     wx, wy = weights_of(point // POINTS), weights_of(point % POINTS)
-                    us = patch_sum(gels, row, cell_i, cell_j, wx, wy)
+                    us, vs = vec4(0.0), vec4(0.0)  # displacement and the pressure that the nodes carry; velocity
+                    if ti.static(ON_DEVICE):
+                        us = patch_sum(gels, row, cell_i, cell_j, wx, wy)
+                        vs = patch_sum(gels, row + nx + 3, cell_i, cell_j, wx, wy)
+                    else:
+                        us = vec4([points[point, c] for c in range(4)])
+                        vs = vec4([points[POINTS * POINTS + point, c] for c in range(4)])
                     at_rest = vec3((i + 0.5) / POINTS - 0.5 * nx, (j + 0.5) / POINTS - 0.5 * ny, 0.0)
-                    x = h * at_rest + us
+                    x = h * at_rest + vec3(us[0], us[1], us[2])
                     phi, n_local = signed_distance(env, kind, size, back @ (x - centre), grid)
                     touching = False
-                    if phi < 0.5 * h:
-                        pressure = carried_pressure(e, gels, indenter, cell_i, cell_j, wx, wy) - k_n * phi
-                        vs = patch_sum(gels, row + nx + 3, cell_i, cell_j, wx, wy)
+                    push = vec4(0.0)
+                    if phi < TOUCHABLE * h:
+                        pressure = us[3] - k_n * phi
                         n = rotate @ n_local  # out of the indenter: pushes the gel
-                        moving = velocity + spin.cross(x - centre) - vs  # relative to the gel
+                        moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
                         closing = moving.dot(n)
                         normal = pressure + c_n * closing
                         if normal > 0.0:
-                            touching = True
+                            touching, pushed = True, True
                             sliding = moving - closing * n
                             rest = ti.max(pressure, 0.0)
                             memory = indenter.pressure[e, i, j]
@@ -289,12 +340,19 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                             moment += x.cross(force)
                             deepest = ti.max(deepest, -phi)
                             push = vec4(force[0], force[1], force[2], area * rest)
-                            for p, q in ti.static(ti.ndrange(4, 4)):
-                                node = surface_node(gels, cell_i + p - 1, cell_j + q - 1)
-                                add_four(gels.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
                     if not touching:
                         indenter.slip[e, i, j] = vec3(0.0)
                         indenter.pressure[e, i, j] = 0.0
+                    if ti.static(not ON_DEVICE):
+                        for c in ti.static(range(4)):
+                            pushes[point, c] = push[c]
+                    elif touching:
+                        for p, q in ti.static(ti.ndrange(4, 4)):
+                            node = surface_node(gels, cell_i + p - 1, cell_j + q - 1)
+                            add_four(gels.contact_force, forces + 4 * node, (wx[p] * wy[q]) * push)
+                if ti.static(not ON_DEVICE):
+                    for _ in range(once_if(pushed)):
+                        hand_on(gels, forces, cell_i, cell_j, pushes)
     slot = slot_of(part)
     if ti.static(ON_DEVICE):
         record_most(env, slot, layout.OVERLAP, deepest)

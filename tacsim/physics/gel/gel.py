@@ -90,7 +90,8 @@ class GelState:
 
     nodes: (E, gels, 3, 3, nz + 1, P) displacement, velocity, force; axis; layer; the nodes of a layer as one row, node
     (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
-    surface: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside.
+    surface: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside;
+    behind a displacement the pressure that the node carries [MPa], under an indenter.
     contact_force: (E, COPIES, gels, P, 4) on the surface nodes, one copy a part; zeros between substeps.
     corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
     which works on all layers at once, (E, gels, nz, 24, W).
@@ -145,6 +146,11 @@ class GelState:
         """Force on the nodes in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
         return self._view(2)
 
+    @property
+    def carried(self) -> np.ndarray:
+        """Pressure that the surface nodes carry [MPa], (E, gels, nx + 1, ny + 1), a view."""
+        return self.surface[:, :, 0, 1:-1, 1:-1, 3]
+
     def shortest(self, environment: int, spacing: float) -> float:
         """The shortest edge of an element [mm], each along its direction at rest, so one that has turned seems shorter
         than it is; NaN if a displacement is."""
@@ -154,7 +160,7 @@ class GelState:
         return spacing + min(float(np.diff(u[:, axis], axis=along).min()) for axis, along in ((0, 2), (1, 3), (2, 1)))
 
     def refresh(self) -> None:
-        """Copies the nodes' top layer to `surface`: before a launch, since nodes may have been written.
+        """Copies the nodes' top layer to `surface`, and its rim outside: before a launch, since all may be written.
 
         Writes zeros behind the last node: what stands there takes part in sums with weight 0, so it must be finite.
         """
@@ -162,9 +168,9 @@ class GelState:
         self.nodes[..., nx1 * ny1 :] = 0.0
         for quantity in range(2):
             top = self._view(quantity)[..., -1, :]
-            surface = self.surface[:, :, quantity, ..., :3]
-            surface[:, :, 1:-1, 1:-1] = top
-            surface[:, :, [0, -1], 1:-1] = top[:, :, [0, -1]]
+            surface = self.surface[:, :, quantity]
+            surface[:, :, 1:-1, 1:-1, :3] = top
+            surface[:, :, [0, -1], 1:-1] = surface[:, :, [1, -2], 1:-1]
             surface[:, :, :, [0, -1]] = surface[:, :, :, [1, -2]]
 
     def arguments(self) -> tuple[np.ndarray, ...]:

@@ -178,10 +178,11 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
         record_sum(env, slot, layout.BACKING + d, held.sum())
     top = u + layers * layer
     if ti.static(ON_DEVICE):
+        at = contact_force_start(env, gels, 0, g) + 4 * first
         for d in ti.static(range(3)):
-            at = contact_force_start(env, gels, 0, g) + 4 * first + d
-            gels.nodes[top + (6 + d) * axis + first] += gels.contact_force[at]
-            gels.contact_force[at] = 0.0
+            gels.nodes[top + (6 + d) * axis + first] += gels.contact_force[at + d]
+        for d in ti.static(range(4)):
+            gels.contact_force[at + d] = 0.0
     else:
         add_contact_forces(env, gels, g, first, last, top + 6 * axis, axis, zero)
     for k in range(1, layers + 1):
@@ -205,6 +206,7 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
                 at = vec4(0.0)
                 for d in ti.static(range(3)):
                     at[d] = gels.nodes[top + (3 * quantity + d) * axis + block * LANES + lane]
+                at[3] = gels.surface[surface_at(gels, first_row + quantity * (nx + 3) + i + 1, j + 1) + 3]
                 for p in range(p0, p1):
                     for q in range(q0, q1):
                         to = surface_at(gels, first_row + quantity * (nx + 3) + p, q)

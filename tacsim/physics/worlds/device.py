@@ -99,7 +99,7 @@ def column(env: ti.template(), gels: ti.template(), g, block):
 def press_substep(
     clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    slip: Slip, pressure: Pressure, carried: Pressure, values: Values,
+    slip: Slip, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
@@ -115,12 +115,12 @@ def press_substep(
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indent(env, cell, clock[0], drive, gels, ti.static(Indenter(slip, pressure, carried, values)))
+            indent(env, cell, clock[0], drive, gels, ti.static(Indenter(slip, pressure, values)))
     for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
         env = ti.static(Environment(e, params, counts, partial))
         if clock[1] < counts[e, layout.STEPS]:
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            carry(env, n, gels, ti.static(Indenter(slip, pressure, carried, values)))
+            carry(env, n, gels)
             column(env, gels, 0, n)
         if e + n == 0:
             clock[0] += 1
@@ -322,20 +322,20 @@ class DeviceArrays:
 @launching()
 def run_press(
     arrays: DeviceArrays, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray,
-    carried: np.ndarray, values: np.ndarray, version: int, numbers: tuple[np.ndarray, np.ndarray, np.ndarray],
+    values: np.ndarray, version: int, numbers: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
     """One launch; the arrays are those of `PressState`. version: another whenever `values` has changed; numbers:
     params, counts, partial."""
     arguments = {
         "drive": arrays.upload("drive", drive, ti.f32), "slip": arrays.upload("slip", slip, vec3),
         "pressure": arrays.upload("pressure", pressure, ti.f32),
-        "carried": arrays.upload("carried", carried, ti.f32),
         "values": arrays.upload_if_changed("values", values, ti.f32, version),
         **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
     }  # fmt: skip
-    arrays.forget("nodes", "surface", "slip", "pressure", "carried", "partial")
+    arrays.forget("nodes", "surface", "slip", "pressure", "partial")
     press_substeps.run(drive.shape[1], arguments)
-    arrays.download(nodes=gels.arguments()[0], slip=slip, pressure=pressure, carried=carried, partial=numbers[2])
+    nodes, surface = gels.arguments()[:2]
+    arrays.download(nodes=nodes, surface=surface, slip=slip, pressure=pressure, partial=numbers[2])
 
 
 @launching()

@@ -87,7 +87,7 @@ TOO_MUCH = "cut off parts of mesh and gel that cannot touch; worlds of a smaller
 def press_substeps(
     team: ti.i32, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    slip: Slip, pressure: Pressure, carried: Pressure, values: Values,
+    slip: Slip, pressure: Pressure, values: Values,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps in one launch by `team` threads; drive: pose and velocity of the indenter, sensor frame."""
@@ -97,7 +97,7 @@ def press_substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
-            indenter = ti.static(Indenter(slip, pressure, carried, values))
+            indenter = ti.static(Indenter(slip, pressure, values))
             pieces = 2 * PARTS * env.count(layout.STEPS)  # two stages a substep: forces, then motion
             piece = next_piece(sync, turn, pieces)
             while piece < pieces:
@@ -106,7 +106,7 @@ def press_substeps(
                     indent(env, part, stage // 2, drive, gels, indenter)
                     gel_forces(env, part, gels)
                 for _motion in range(once_if(stage % 2 == 1)):
-                    carry(env, part, gels, indenter)
+                    carry(env, part, gels)
                     gel_advance(env, part, gels)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, pieces)
@@ -157,7 +157,6 @@ class PressState:
         nx, ny, _ = lattice.elements
         self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
         self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
-        self.carried = np.zeros((len(scenes), nx + 1, ny + 1), np.float32)  # pressure that the nodes carry [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
@@ -215,13 +214,13 @@ class PressState:
         self.gels.refresh()
         if ON_DEVICE:
             run_press(
-                self._device_arrays, drive, self.gels, self.slip, self.pressure, self.carried, self._values,
+                self._device_arrays, drive, self.gels, self.slip, self.pressure, self._values,
                 self._covered,
                 (self.params, self.counts, self.partial),
             )  # fmt: skip
         else:
             run_team(
-                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self.carried, self._values,
+                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values,
                 self.params, self.counts, self.partial, active=list(drives),
             )  # fmt: skip
 
@@ -266,13 +265,13 @@ class PressWorld(FemWorld):
     def reach(self) -> np.ndarray:
         """How far from the indenter the surface is still pressed [m], at its nodes (nx + 1, ny + 1)."""
         stiffness = float(self._state.params[self._index, STIFFNESS])
-        return np.asarray(self._state.carried[self._index] / (stiffness * MM))
+        return np.asarray(self._state.gels.carried[self._index, 0] / (stiffness * MM))
 
     def arrays(self) -> dict[str, np.ndarray]:
         state, i = self._state, self._index
         return {
             "gel_displacement": state.gels.u[i], "gel_velocity": state.gels.v[i], "slip": state.slip[i],
-            "pressure": state.pressure[i], "carried": state.carried[i], "sums": state.partial[i],
+            "pressure": state.pressure[i], "carried": state.gels.carried[i, 0], "sums": state.partial[i],
         }  # fmt: skip
 
     def truth(self) -> None:

@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from robot.arm.status import ArmStatus
+from robot.arm.trajectory import PERIOD
 from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import PATIENCE, config, until
@@ -114,9 +115,11 @@ class Trial:
         return now
 
     def watch(self, event: float, seconds: float) -> Outcome:
-        """What happened since the time `event` until now, and `seconds` [s] more after the first standstill."""
+        """What happened since the time `event` until now, and `seconds` [s] of the controller more after the first
+        standstill."""
         until(lambda: self.mock.faults.state().rests, "rest", pause=0.05)
-        time.sleep(seconds)
+        end = self.mock.faults.state().tick + seconds / PERIOD
+        until(lambda: self.mock.faults.state().tick >= end, "end of the watch", pause=0.05)
         assert self.observer.stdin is not None
         self.observer.stdin.close()
         assert self.observer.wait(PATIENCE) == 0

@@ -28,7 +28,7 @@ from tacsim.models.hardware import ArmLimits, MockArmConfig, Payload, Placement,
 HOST, OTHER = (f"127.{net}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" for net in (23, 123))
 PATIENCE = 60.0  # for anything that has to happen [s]
 CARRIED = (0.4, 0.0, 0.0, 0.04)  # what a mock has on its flange: mass [kg], centre [m]
-SERVO, ZERO = 11, 8  # numbers of the commands servoJ and zeroFtSensor in the registers
+SERVO, SERVO_STOP, ZERO = 11, 16, 8  # numbers of the commands servoJ, servoStop and zeroFtSensor in the registers
 STILL = 1e-3  # slower than this an arm stands [m/s]
 KINEMATICS = Kinematics("ur5e")
 TOOL_FROM_SENSOR = Placement(position=(0.01, 0.0, 0.05), rotation=(0.0, 0.0, 0.3))
@@ -81,27 +81,34 @@ def go(arm: URArm, target: Pose) -> None:
     until(there, "arrival")
 
 
-def in_motion(arm: URArm, target: Pose) -> None:
-    """Commands `target` and comes back when the arm is on its way."""
-    _beyond(arm, target, 2e-3)
+def in_motion(arm: URArm, target: Pose) -> float:
+    """Commands `target` and comes back when the arm is on its way: when it was commanded, monotonic clock [s]."""
+    return _beyond(arm, target, 2e-3)
 
 
-def at_full_speed(arm: URArm, target: Pose) -> None:
+def at_full_speed(arm: URArm, target: Pose) -> float:
     """Commands `target`; comes back when the arm has gone one and a half times the path that it takes to full speed.
 
     (Not when a speed is measured: a loop that misses periods on a busy machine does not make up for them.)"""
-    _beyond(arm, target, 0.75 * arm.config.limits.speed**2 / arm.config.limits.acceleration)
+    return _beyond(arm, target, 0.75 * arm.config.limits.speed**2 / arm.config.limits.acceleration)
 
 
-def _beyond(arm: URArm, target: Pose, distance: float) -> None:
-    start = arm.state().pose.position
-    arm.command(target)
+def _beyond(arm: URArm, target: Pose, distance: float) -> float:
+    start, asked = arm.state().pose.position, 0.0
 
     def there() -> bool:
+        nonlocal asked
         assert not arm.status().is_fault, arm.explain()
+        newest = arm._channel.states.latest()
+        assert newest is not None
+        followed = newest["commands_read"] == arm._channel.commands.count
+        if asked == 0.0 or (followed and newest["status"] == ArmStatus.HOLD):  # its time-out has passed on the way
+            asked = time.monotonic()
+            arm.command(target)
         return float(np.linalg.norm(arm.state().pose.position - start)) > distance
 
     until(there, "motion")
+    return asked
 
 
 def records(arm: URArm) -> Record:

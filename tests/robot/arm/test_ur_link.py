@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -162,8 +162,8 @@ def test_late_and_lost_packages_are_lived_with(arm: URArm, mock: MockUR) -> None
 
 
 @pytest.fixture
-def blocked() -> Iterator[Callable[[], float]]:
-    """How long another thread of this process had to wait for its turn at most, beyond its own millisecond [s]."""
+def gaps() -> Iterator[list[float]]:
+    """How long another thread of this process had to wait for its turn, each time, beyond its own millisecond [s]."""
     gaps, over = [0.0], threading.Event()
 
     def beat() -> None:
@@ -176,7 +176,7 @@ def blocked() -> Iterator[Callable[[], float]]:
 
     thread = threading.Thread(target=beat)
     thread.start()
-    yield lambda: max(gaps)
+    yield gaps
     over.set()
     thread.join()
 
@@ -184,7 +184,7 @@ def blocked() -> Iterator[Callable[[], float]]:
 @pytest.mark.promise(9)
 @pytest.mark.parametrize("fault", ["silent", "refusing", "black hole", "mute dashboard"])
 def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
-    mock: MockUR, blocked: Callable[[], float], fault: str, measuring: bool, figure: Record
+    mock: MockUR, gaps: list[float], fault: str, measuring: bool, figure: Record
 ) -> None:
     faults, host, timeout = mock.faults, HOST, 0.6 if measuring else 1.0
     if fault == "black hole":
@@ -199,8 +199,9 @@ def test_connecting_to_nobody_ends_in_time_and_blocks_no_thread(
     with pytest.raises(DeviceNotConnectedError):
         URArm(config(host, realtime=measuring), "left", timeout=timeout).close()
     assert time.monotonic() - begun < timeout + PATIENCE
-    figure(f"interpreter blocked, {fault} peer", 1e3 * blocked(), "ms", at_most=50)
-    assert blocked() < 1.0  # the library would have blocked them until the end
+    turns = list(gaps)
+    figure(f"interpreter blocked, {fault} peer", 1e3 * max(turns), "ms", at_most=50)
+    assert len(turns) > 20  # the library would have blocked them until the end
     assert leftovers() == 0
     faults.reset()
     with URArm(config(), "left") as arm:

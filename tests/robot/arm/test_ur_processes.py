@@ -31,6 +31,7 @@ from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import (
     PATIENCE,
+    SERVO_STOP,
     ZERO,
     at_full_speed,
     check_path,
@@ -42,6 +43,7 @@ from tests.robot.arm.mocked import (
     records,
     sensor_path,
     servo_targets,
+    servo_ticks,
     stands,
     until,
 )
@@ -182,12 +184,15 @@ def test_a_signal_to_every_process_ends_with_a_ramp(mock: MockUR, program: str, 
     until(lambda: not running(worker), "end of the worker")
     until(lambda: not mock.faults.state().program, "end of the program")
     assert "watchdog" not in mock.faults.state().stop_reason.lower()
-    sent = servo_targets(mock.faults.received(since).entries)
+    entries = mock.faults.received(since).entries
+    sent, ticks = servo_targets(entries), servo_ticks(entries)
     arm = cast("URArm", SimpleNamespace(config=given))
     if program == COMMAND:
         check_path(arm, sent)
-    steps = np.linalg.norm(np.diff(sensor_path(arm, sent)[:, :3, 3], axis=0), axis=1) / PERIOD
-    assert steps[-1] < 0.05 * given.limits.speed
+    speed = np.diff(sensor_path(arm, sent)[:, 0, 3]) / PERIOD  # towards its goal; an arm in a fault is led back, too
+    ended = min(entry.tick for entry in entries if entry.values.get("input_int_register_0") == SERVO_STOP)
+    # A worker that was held up longer than it may brake finds an arm that stands: the last target is an old one.
+    assert speed[-1] < 0.05 * given.limits.speed or ended - ticks[-1] > 100
 
 
 def test_a_zeroing_that_failed_does_not_happen_later(mock: MockUR) -> None:
@@ -198,7 +203,7 @@ def test_a_zeroing_that_failed_does_not_happen_later(mock: MockUR) -> None:
             arm.zero_wrench()
         mark = mock.faults.received().last
         os.kill(arm._worker.pid, signal.SIGCONT)
-        until(lambda: arm.status() in (ArmStatus.HOLD, ArmStatus.WORKER_DEAD), "end of the stop")
+        until(lambda: arm.status() == ArmStatus.HOLD or not arm._worker.running, "end of the stop")  # type: ignore[union-attr]
         time.sleep(0.2)
         asked = [entry.values.get("input_int_register_0") for entry in mock.faults.received(mark).entries]
         assert ZERO not in asked
@@ -242,8 +247,12 @@ def open_files() -> int:
 
 @pytest.mark.promise(14)
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files as Linux shows them")
-def test_nothing_is_left_after_close(mock: MockUR, measuring: bool, figure: Record) -> None:
+def test_nothing_is_left_after_close(
+    mock: MockUR, measuring: bool, figure: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = open_files()
+    if not measuring:
+        monkeypatch.setattr(ur, "CLOSE_TIMEOUT", PATIENCE)
     arm = URArm(config(realtime=measuring), "left")
     at_full_speed(arm, moved(arm.state().pose, x=0.12))
     worker = arm._worker

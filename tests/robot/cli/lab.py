@@ -29,11 +29,13 @@ POSTURE = np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0])
 
 
 def copy_of(rig: str, folder: Path, first: int) -> Path:
-    """The shipped file `rig` with the hosts and cameras of mocks, number `first` on, said to be a maker's simulator."""
+    """The shipped file `rig` with the hosts and cameras of mocks, number `first` on, said to be a maker's simulator,
+    and time-outs that no busy machine breaks."""
     text = (config_root() / "rigs" / f"{rig}.yaml").read_text(encoding="utf-8")
     number = iter(range(first, first + 9))
     text = re.sub(r"host: [\d.]+", lambda found: f"host: {mock_host(next(number))}", text)
     text = text.replace("simulator: false", "simulator: true")
+    text = text.replace("link_timeout: 50 ms", "link_timeout: 2 s").replace("max_age: 200 ms", "max_age: 5 s")
     number = iter(range(first, first + 9))
     text = re.sub(
         r"source: /dev/v4l/.*", lambda found: f"source: http://{mock_host(next(number))}:8081/?action=stream", text

@@ -81,7 +81,7 @@ def looked(
 def unpowered(faults: FaultClient) -> None:
     """After an emergency stop that a person has released already."""
     faults.estop()
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 60.0
     while faults.state().mode == "RUNNING":
         assert time.monotonic() < deadline
         time.sleep(0.01)

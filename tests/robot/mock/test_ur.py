@@ -167,7 +167,7 @@ def test_a_client_killed_in_motion_with_and_without_watchdog() -> None:
             code = (
                 "import sys, time; from tests.robot.mock.wire_client import ControlClient\n"
                 f"client = ControlClient({mock.host!r})\n"
-                f"if {watchdog}: client.call(35, [10.0])\n"
+                f"if {watchdog}: client.call(35, [1.0])\n"
                 "client.write(10, [0, 0, -0.01, 0, 0, 0, 0.5, 0]); print('moves', flush=True); \n"
                 "while True: client.write(10, [0, 0, -0.01, 0, 0, 0, 0.5, 0]); time.sleep(0.01)"
             )

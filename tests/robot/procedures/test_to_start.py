@@ -19,7 +19,7 @@ from tacsim.interface import FloatArray, Pose
 from tacsim.models.hardware import Placement, Plane, UrArmConfig
 from tests.robot.arm.mocked import until
 from tests.robot.cli.lab import Lab, copy_of
-from tests.robot.cli.test_start import AWAY, slow_to_die
+from tests.robot.cli.test_start import AWAY, fast
 
 KINEMATICS = Kinematics("ur5e")
 TURNED = np.array([0.5, -0.2, 0.1, 0.0, 0.1, 0.3])  # from the start to where the arm stands [rad]
@@ -124,7 +124,7 @@ needs_arms = pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur_rt
 @needs_arms
 @pytest.mark.deep
 def test_two_arms_are_led_one_after_the_other(tmp_path: Path) -> None:
-    file = slow_to_die(copy_of("ur5e", tmp_path, 86))
+    file = fast(copy_of("ur5e", tmp_path, 86))
     with Lab(file, beside=AWAY) as lab:
         config = load_rig(file).config
         said: list[str] = []
@@ -150,7 +150,7 @@ def test_two_arms_are_led_one_after_the_other(tmp_path: Path) -> None:
 @needs_arms
 @pytest.mark.deep
 def test_a_stop_brakes_and_a_no_leaves_every_arm(tmp_path: Path) -> None:
-    file = slow_to_die(copy_of("ur5e", tmp_path, 86))
+    file = fast(copy_of("ur5e", tmp_path, 86))
     with Lab(file, beside=AWAY) as lab:
         config = load_rig(file).config
         here = {name: faults.state().joints for name, faults in lab.faults.items()}

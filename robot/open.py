@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
-from tacsim.config import LoadedRig, load_rig
+from tacsim.config import LoadedRig, load, load_rig
 from tacsim.interface import RigSpec
 from tacsim.models.features import Features
 from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.rig import Rig
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
     from tacsim.gym.env import TacsimEnv
     from tacsim.gym.vector import TacsimVectorEnv
+
+Randomised = Randomisation | Mapping[str, Any] | str | Path | None
 
 # Which drivers go by which clock. A simulated sensor on hardware shows the gel as it would look at the arm's pose.
 ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
@@ -89,23 +92,28 @@ def make_env(
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
+    randomise: Randomised = None,
     features: Features | Mapping[str, Any] | None = None,
 ) -> TacsimEnv:
     """The Gymnasium environment of a task on a rig; entry point of "tacsim/Squeeze-v0" and its sisters.
 
     variants: overrides of scene and task, on top of `overrides`; each reset draws one of them from its seed. The state
     of first contact of each is computed once. The world of a simulated rig is made at the first reset.
+    randomise: draws the variants (`tacsim.Randomisation`, what it is made of, or the name or path of its file).
     features: what of its observations a policy learns from (`tacsim.Features`, or what it is made of); None: all.
 
     Raises what open_rig raises, IncompatibleRig for features that the rig does not have, and ValueError for variants
     that change what must stay (`TacsimEnv.reset`).
     """
-    configs, seen = _rigs_of_episodes(task, rig, overrides, variants), _features(features)
-    if configs[0].clock == "sim":
+    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise))
+    first, seen = episodes[0][0], _features(features)
+    if first.clock == "sim":
         from robot.rig.sim_env import open_env
 
-        return open_env(configs, render_mode, seen)
-    return _env_of_hardware(configs, render_mode, seen)
+        return open_env(episodes, render_mode, seen)
+    if len(episodes) > 1:
+        raise CannotOpen(f"rig '{first.name}' is not simulated, so it has no variants")
+    return _env_of_hardware(first, render_mode, seen)
 
 
 def make_vector_env(
@@ -116,38 +124,47 @@ def make_vector_env(
     render_mode: str | None = None,
     variants: Sequence[Sequence[str]] = (),
     autoreset_mode: str | AutoresetMode = "NextStep",
+    randomise: Randomised = None,
     features: Features | Mapping[str, Any] | None = None,
 ) -> TacsimVectorEnv:
     """`num_envs` of these environments, whose simulations share launches: what ``gymnasium.make_vec`` makes.
 
     Raises as `make_env`, and CannotOpen for a rig that is not simulated, or by physics 'seed'.
     """
-    configs, seen = _rigs_of_episodes(task, rig, overrides, variants), _features(features)
-    if configs[0].clock != "sim":
+    episodes = _rigs_of_episodes(task, rig, overrides, _drawn(variants, randomise))
+    if episodes[0][0].clock != "sim":
         raise CannotOpen(
-            f"rig '{configs[0].name}' is not simulated: only simulations run many at once; use robot.make_env"
+            f"rig '{episodes[0][0].name}' is not simulated: only simulations run many at once; use robot.make_env"
         )
     from robot.rig.sim_env import open_vector_env
 
-    return open_vector_env(configs, num_envs, render_mode, autoreset_mode, seen)
+    return open_vector_env(episodes, num_envs, render_mode, autoreset_mode, _features(features))
+
+
+def _drawn(variants: Sequence[Sequence[str]], randomise: Randomised) -> Sequence[Sequence[str]]:
+    if randomise is None:
+        return variants
+    if variants:
+        raise ValueError("give variants, or a randomisation that draws them, not both")
+    if isinstance(randomise, (str, Path)):
+        return load(Randomisation, randomise).drawn()
+    return (randomise if isinstance(randomise, Randomisation) else Randomisation.model_validate(randomise)).drawn()
 
 
 def _features(given: Features | Mapping[str, Any] | None) -> Features | None:
     return given if given is None or isinstance(given, Features) else Features.model_validate(given)
 
 
-def _env_of_hardware(configs: Sequence[RigConfig], render_mode: str | None, features: Features | None) -> TacsimEnv:
+def _env_of_hardware(config: RigConfig, render_mode: str | None, features: Features | None) -> TacsimEnv:
     """Of a rig that tells the truth of its body without being a simulation of ours, if there is one."""
     from tacsim.features.encoder import FeatureEncoder
     from tacsim.gym.env import TacsimEnv
     from tacsim.tasks import make_task
 
-    if len(configs) > 1:
-        raise CannotOpen(f"rig '{configs[0].name}' is not simulated, so it has no variants")
-    opened, task = open_rig(configs[0]), configs[0].task
+    opened, task = open_rig(config), config.task
     assert task is not None
     try:
-        encoder = None if features is None else FeatureEncoder(features, configs[0].canonical)
+        encoder = None if features is None else FeatureEncoder(features, config.canonical)
         return TacsimEnv(opened, make_task(task), render_mode, encoder=encoder)
     except BaseException:
         opened.close()
@@ -156,13 +173,15 @@ def _env_of_hardware(configs: Sequence[RigConfig], render_mode: str | None, feat
 
 def _rigs_of_episodes(
     task: str, rig: str | Path, overrides: Sequence[str], variants: Sequence[Sequence[str]]
-) -> list[RigConfig]:
-    """The rig without a variant, then with each."""
-    found = [load_rig(rig, task=task, overrides=[*overrides, *more]).config for more in ((), *variants)]
-    for config in found:
+) -> list[tuple[RigConfig, str]]:
+    """The rig without a variant, then with each, and the variant in words."""
+    found = []
+    for more in ((), *variants):
+        config = load_rig(rig, task=task, overrides=[*overrides, *more]).config
         if config.task is None:
             raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
         _check_parts(config)
+        found.append((config, "; ".join(more)))
     return found
 
 

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Placement as Placement
     from tacsim.models.hardware import UrArmConfig as UrArmConfig
     from tacsim.models.hardware import Workspace as Workspace
+    from tacsim.models.randomisation import Randomisation as Randomisation
     from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
     from tacsim.models.rig import ReplaySensorConfig as ReplaySensorConfig
     from tacsim.models.rig import RepositionConfig as RepositionConfig

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from gymnasium.vector import AutoresetMode
@@ -14,26 +15,29 @@ from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_alike
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.features import Features
-from tacsim.models.rig import RigConfig
+from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.sim.stage import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
+Episodes = Sequence[tuple[RigConfig, str]]  # rigs, and what makes each of them in words
 
-def open_env(configs: Sequence[RigConfig], render_mode: str | None, features: Features | None) -> TacsimEnv:
-    """An environment of the first of `configs`; the others are its variants. Raises CannotOpen, ValueError."""
-    variants = _variants(configs)
-    return _env(simulate(configs[0]), configs[0], variants, render_mode, features)
+
+def open_env(episodes: Episodes, render_mode: str | None, features: Features | None) -> TacsimEnv:
+    """An environment of the first of `episodes`; the others are its variants. Raises CannotOpen, ValueError."""
+    config = episodes[0][0]
+    return _env(simulate(config), config, _variants(episodes), render_mode, features)
 
 
 def open_vector_env(
-    configs: Sequence[RigConfig],
+    episodes: Episodes,
     number: int,
     render_mode: str | None,
     autoreset_mode: str | AutoresetMode,
     features: Features | None,
 ) -> TacsimVectorEnv:
     """`number` of these environments in one batch. Raises CannotOpen, ValueError."""
-    config, variants = configs[0], _variants(configs)
+    config, variants = episodes[0][0], _variants(episodes)
     if number < 1:
         raise ValueError(f"a vector environment needs at least one environment, got {number}")
     modes = [mode.value for mode in AutoresetMode]
@@ -70,16 +74,20 @@ def _env(
         encoder=encoder,
         variants=variants,
         stage=simulation.stage,
+        wear=simulation.wear,
     )
 
 
-def _variants(configs: Sequence[RigConfig]) -> list[Variant]:
+def _variants(episodes: Episodes) -> list[Variant]:
     """All but the first. Raises ValueError for one that changes what an environment cannot change at a reset."""
-    first, variants = configs[0], []
-    for number, config in enumerate(configs[1:]):
-        same = {"scene": None, "task": None}
-        if config.model_copy(update=same) != first.model_copy(update=same):
-            raise ValueError(f"variant {number} may change nothing but scene and task; make another environment for it")
+    first, variants = episodes[0][0], []
+    kept = _unchanging(first)
+    for number, (config, words) in enumerate(episodes[1:]):
+        if _unchanging(config) != kept:
+            raise ValueError(
+                f"variant {number} may change nothing but scene, task, and light, texture and noise of the sensors; "
+                "make another environment for it"
+            )
         assert first.scene is not None and first.task is not None and config.scene is not None
         assert config.task is not None
         try:
@@ -87,5 +95,23 @@ def _variants(configs: Sequence[RigConfig]) -> list[Variant]:
             require_alike(first.task, config.task)
         except ValueError as error:
             raise ValueError(f"variant {number}: {error}") from None
-        variants.append(Variant(config.task, config.scene))
+        variants.append(Variant(config.task, config.scene, _models(config), words))
+    if all(variant.sensors == _models(first) for variant in variants):
+        variants = [replace(variant, sensors={}) for variant in variants]  # nothing to change at a reset
     return variants
+
+
+def _models(config: RigConfig) -> dict[str, SensorModel]:
+    return {name: each.model for name, each in config.sensors.items() if isinstance(each, SimSensorConfig)}
+
+
+def _unchanging(config: RigConfig) -> RigConfig:
+    """What of a rig is the same in all episodes of an environment; the rest is left out."""
+    look = {"lighting": Lighting(), "photometric": None, "texture": 0.0, "texture_seed": 0, "noise": None, "name": ""}
+    sensors = {
+        name: each.model_copy(update={"model": each.model.model_copy(update=look)})
+        if isinstance(each, SimSensorConfig)
+        else each
+        for name, each in config.sensors.items()
+    }
+    return config.model_copy(update={"scene": None, "task": None, "sensors": sensors})

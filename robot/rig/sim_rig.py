@@ -14,7 +14,8 @@ from tacsim.control.load_controller import load_controller
 from tacsim.interface import Arm, SensorSpec
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.models.scene import Scene
-from tacsim.optics.noise import noise_source
+from tacsim.models.sensor import SensorModel
+from tacsim.optics.noise import NoiseSource, noise_source
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.physics.world import World, make_world
@@ -33,6 +34,13 @@ class Simulation:
     rig: Rig
     clock: SimClock
     stage: Stage
+    sensors: Mapping[str, SimSensor]
+
+    def wear(self, models: Mapping[str, SensorModel]) -> None:
+        """Light, texture and noise of the sensors from the next episode on; their geometry and markers are those they
+        were made with."""
+        for name, model in models.items():
+            self.sensors[name].wear(*_pictures(model, name, self.stage.scene))
 
 
 def open_sim(config: RigConfig) -> Rig:
@@ -94,7 +102,7 @@ def simulate(
         on_tactile=_gel_monitor(config, sensors),
         load_control=load_controller(config.task),
     )
-    return Simulation(rig, clock, world)
+    return Simulation(rig, clock, world, sensors)
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
@@ -136,5 +144,9 @@ def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfi
     shape = (model.geometry.height, model.geometry.width)
     spec = SensorSpec(shape, height=True, flow=model.markers is not None, arm=config.arm)
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
-    render = Renderer(model, rig.scene.gel.size[:2])
-    return SimSensor(world, clock, name, spec, render, sample, noise_source(model, name))
+    render, noise = _pictures(model, name, rig.scene)
+    return SimSensor(world, clock, name, spec, render, sample, noise)
+
+
+def _pictures(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:
+    return Renderer(model, scene.gel.size[:2]), noise_source(model, name)

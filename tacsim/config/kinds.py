@@ -14,6 +14,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from tacsim.config.errors import did_you_mean
+from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
 from tacsim.models.scene import BodyMaterial, GelMaterial, Scene
 from tacsim.models.sensor import SensorModel
@@ -38,6 +39,7 @@ KINDS = {
         Kind("task", "tasks", (SqueezeConfig, RepositionConfig), TaskConfig),
         Kind("scene", "scenes", (Scene,), Scene),
         Kind("sensor", "sensors", (SensorModel,), SensorModel),
+        Kind("randomisation", "randomisations", (Randomisation,), Randomisation),
         Kind("material", "materials", (GelMaterial, BodyMaterial), GelMaterial | BodyMaterial),
     )
 }
@@ -61,7 +63,7 @@ def config_root() -> Path:
 
 
 def names(kind: str) -> list[str]:
-    """Sorted names of the shipped files of a kind: rig, task, scene, sensor, material. Raises KeyError on another."""
+    """Sorted names of the shipped files of a kind (a key of KINDS). Raises KeyError on another."""
     return sorted(path.stem for path in (config_root() / KINDS[kind].folder).glob("*.yaml"))
 
 
@@ -107,7 +109,7 @@ def resolve(kind: Kind, reference: str, folder: Path) -> Path:
 
 
 def json_schema(kind: str = "rig") -> dict[str, Any]:
-    """The JSON schema of a kind of file (rig, task, scene, sensor, material), string references and units included.
+    """The JSON schema of a kind of file (a key of KINDS), string references and units included.
 
     For completion and checks while you type, write it to a file and name that in the first line of the YAML file; any
     editor with yaml-language-server (VS Code's YAML extension, Neovim, Emacs, JetBrains) understands::

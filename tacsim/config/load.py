@@ -28,8 +28,13 @@ class LoadedRig:
     """A rig file, resolved."""
 
     config: RigConfig
-    text: str  # as one YAML text, every default and reference written out; load_rig reads `config` back from it
     sources: tuple[Path, ...]  # the files it was read from
+
+    @property
+    def text(self) -> str:
+        """As one YAML text, every default and reference written out; load_rig reads `config` back from it."""
+        head = "# A rig, resolved: every reference and default written out, SI units."
+        return f"{head}\n{dump(self.config.model_dump(mode='json'))}"
 
 
 def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
@@ -62,9 +67,7 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     config = _validate(RigConfig, root, state)
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
-    text = dump(config.model_dump(mode="json"))
-    text = f"# A rig, resolved: every reference and default written out, SI units.\n{text}"
-    return LoadedRig(config, text, tuple(dict.fromkeys(state.sources)))
+    return LoadedRig(config, tuple(dict.fromkeys(state.sources)))
 
 
 def _require_limits(config: RigConfig, file: RigConfig) -> None:

@@ -151,12 +151,12 @@ def parse_override(text: str, state: LoadState) -> Override | None:
 
 def apply(root: Node, annotation: Any, override: Override, state: LoadState) -> Node:
     """The tree with the override, references in its value expanded."""
-    return expand(_put(root, annotation, override, 0, state), annotation, state)
+    return _put(root, annotation, override, 0, state)
 
 
 def _put(node: Node, annotation: Any, override: Override, depth: int, state: LoadState) -> Node:
     if depth == len(override.path):
-        return override.value
+        return expand(override.value, annotation, state, ".".join(override.path))
     if node.broken:
         return node
     step = override.path[depth]

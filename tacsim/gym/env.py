@@ -6,7 +6,7 @@ tacsim.gym.plugin); from sources, ``gymnasium.make("tacsim.gym.env:tacsim/Squeez
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from tacsim.interface import Needs, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
+from tacsim.models.sensor import SensorModel
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
@@ -34,10 +35,12 @@ Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """What differs from one episode to the next: the goal, and the body between the gels."""
+    """What differs from one episode to the next: the goal, what is between the gels, and how sensors see it."""
 
     task: TaskConfig
     scene: Scene
+    sensors: Mapping[str, SensorModel]
+    drawn: str = ""  # in words, for the record
 
 
 class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
@@ -49,13 +52,14 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     task's steps, or when the simulation diverges (info["diverged"] says why; the observation is the last good one).
 
     info: distance [m], is_success, score, body_height [m], and the rig's diagnostics; with variants also `variant`, the
-    number of the one that is played.
+    number of the one that is played, and at reset `drawn`, what it consists of.
 
     Args:
         space: of the observations; None: the rig is reset once to learn the shapes.
         encoder: of the features that a learned policy sees; None: the environment shows all that there is.
         variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
         stage: what the rig simulates, where a reset may exchange its scene.
+        wear: gives the sensors of the rig other light, texture and noise.
 
     Raises IncompatibleRig when the rig lacks what the task needs.
     """
@@ -72,6 +76,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
         stage: Stage | None = None,
+        wear: Callable[[Mapping[str, SensorModel]], None] = lambda models: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -80,7 +85,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._view = encode.FlatView() if encoder is None else encoder
         rig.require(self._view.needs, "a choice of features")
         self.rig, self.task, self.render_mode = rig, task, render_mode
-        self._variants, self._stage = tuple(variants), stage
+        self._variants, self._stage, self._wear = tuple(variants), stage, wear
         self._played: int | None = None  # the variant
         if space is None:
             self._begin(seed=0)
@@ -111,7 +116,10 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         super().reset(seed=seed)
         self._choose(dict(options or {}))
         self._begin(seed=int(self.np_random.integers(2**31)))
-        return self._flat, self._judged()[1]
+        info = self._judged()[1]
+        if self._played is not None:
+            info["drawn"] = self._variants[self._played].drawn
+        return self._flat, info
 
     def _choose(self, options: dict[str, Any]) -> None:
         """The task and the scene of the next episode."""
@@ -125,6 +133,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             if not 0 <= played < len(self._variants):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
             chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
+            if played != self._played:
+                self._wear(self._variants[played].sensors)
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
         if "task" in chosen:

@@ -65,6 +65,11 @@ class SimSensor:
             self._untouched = self._render(surface), self._sample(surface)
         return deepcopy(self._untouched)  # nobody writes into what is kept
 
+    def wear(self, render: Callable[[GelSurface], NDArray[np.uint8]], noise: NoiseSource | None) -> None:
+        """Other light and another camera, from the next frame on."""
+        self._render, self._noise = render, noise
+        self._newest = self._untouched = None
+
     def restart(self, episode: int = 0) -> None:
         """Counts frames from zero again; `episode` seeds the noise."""
         self._newest, self._index, self._episode = None, 0, episode

@@ -1,0 +1,62 @@
+"""Environments whose episodes are drawn from distributions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacsim.config import ConfigError, load_rig, names
+from tacsim.config.load import load
+from tacsim.models.randomisation import Randomisation
+from tests.tacsim.gym.small import assert_equal, make
+
+DRAWN: dict[str, Any] = {
+    "draws": 3,
+    "values": {
+        "task.goal": {"uniform": ["1.5 mm", "2.5 mm"]},
+        "scene.body.material.yield_stress": {"log_uniform": ["5 kPa", "20 kPa"]},
+        "sensors.lower.model.lighting.shininess": {"uniform": [2, 30]},
+        "sensors.upper.model.texture": {"choice": ["2 um", "20 um"]},
+    },
+}
+PUSH = np.array([1.0, -1.0], np.float32)
+
+
+def test_episodes_differ_as_drawn_and_come_again_by_their_seed() -> None:
+    env = make(variants=(), randomise=DRAWN)
+    seen = {}
+    for seed in range(16):
+        flat, info = env.reset(seed=seed)
+        assert info["drawn"].startswith("task.goal=") and "sensors.lower.model.lighting.shininess=" in info["drawn"]
+        assert float(info["drawn"].split("=")[1].split()[0]) == pytest.approx(1e3 * env.task.config.goal)
+        seen.setdefault(info["variant"], []).append((seed, flat, info["drawn"], env.step(PUSH)[0]))
+    assert len(seen) == 3 and len({each[0][2] for each in seen.values()}) == 3
+    pictures = [each[0][3]["tactile_lower"] for each in seen.values()]
+    assert any((pictures[0] != other).any() for other in pictures[1:])  # lit otherwise
+    for (seed, flat, drawn, after), *_ in seen.values():
+        again, info = env.reset(seed=seed)
+        assert info["drawn"] == drawn
+        assert_equal(again, flat)
+        assert_equal(env.step(PUSH)[0], after)
+
+
+def test_what_cannot_be_is_refused_with_its_key_before_anything_is_simulated() -> None:
+    with pytest.raises(ConfigError, match=r"scene\.friction\.upper.*-0\.\d+"):
+        make(variants=(), randomise={"values": {"scene.friction.upper": {"uniform": [-0.5, -0.1]}}})
+    with pytest.raises(ConfigError, match="frictoin"):
+        make(variants=(), randomise={"values": {"scene.frictoin.upper": {"uniform": [0.1, 0.5]}}})
+    with pytest.raises(ValueError, match="not both"):
+        make(randomise=DRAWN)
+    with pytest.raises(ValueError, match=r"variant 0 may change nothing but scene, task, and light"):
+        make(variants=(), randomise={"values": {"sensors.lower.model.geometry.width": {"choice": [24, 32]}}})
+    with pytest.raises(ConfigError, match=r"no randomisation 'squeez'; allowed: .*did you mean 'squeeze'"):
+        make(variants=(), randomise="squeez")
+
+
+@pytest.mark.parametrize("name", names("randomisation"))
+def test_every_shipped_one_fits_its_task(name: str) -> None:
+    found = load(Randomisation, name)
+    for overrides in found.drawn()[:3]:
+        assert load_rig("sim", task=name, overrides=overrides).config.scene is not None

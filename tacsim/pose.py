@@ -5,11 +5,16 @@
 
 from __future__ import annotations
 
+import math
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from tacsim.interface import FloatArray, Pose
+
+if TYPE_CHECKING:  # imported where something really turns: it brings all of scipy.spatial, 0.2 s
+    from scipy.spatial.transform import Rotation
 
 # Pose of the upper sensor's axes as seen from the lower one's: z turned down, nothing mirrored.
 HALF_TURN_X = Pose(quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
@@ -17,11 +22,38 @@ HALF_TURN_X = Pose(quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
 
 def rotation(pose: Pose) -> Rotation:
     """The rotation of a pose."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_quat(np.array(pose.quaternion))  # a copy: SciPy refuses read-only arrays
+
+
+def matrix(pose: Pose) -> FloatArray:
+    """The rotation matrix (3, 3) of a pose."""
+    x, y, z, w = _unit(*pose.quaternion.tolist())
+    xx, yy, zz, ww, xy, zw, xz, yw, yz, xw = x * x, y * y, z * z, w * w, x * y, z * w, x * z, y * w, y * z, x * w
+    rows = (
+        (xx - yy - zz + ww, 2 * (xy - zw), 2 * (xz + yw)),
+        (2 * (xy + zw), -xx + yy - zz + ww, 2 * (yz - xw)),
+        (2 * (xz - yw), 2 * (yz + xw), -xx - yy + zz + ww),
+    )
+    return np.array(rows)
+
+
+def _unit(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return x / length, y / length, z / length, w / length
+
+
+def _apply(turn: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(n, 3) vectors turned by a matrix (3, 3)."""
+    turned: FloatArray = np.einsum("jk,ik->ij", turn, vectors)
+    return turned
 
 
 def from_rotation_vector(position: ArrayLike, vector: ArrayLike) -> Pose:
     """The pose at `position` (3,) [m], turned by |vector| [rad] about `vector` (3,)."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_rotvec(np.array(vector, dtype=np.float64))
     return Pose(np.array(position, dtype=np.float64), turn.as_quat())
 
@@ -31,6 +63,8 @@ def from_matrix(matrix: ArrayLike) -> Pose:
 
     Raises ValueError when its last row is not 0 0 0 1, or its rotation is not orthonormal or mirrors (within 1e-6).
     """
+    from scipy.spatial.transform import Rotation
+
     given = np.array(matrix, dtype=np.float64)
     if given.shape != (4, 4) or not np.isfinite(given).all() or not np.allclose(given[3], [0, 0, 0, 1], atol=1e-9):
         raise ValueError(f"from_matrix: need 4 x 4 finite numbers with last row 0 0 0 1, got {given.tolist()}")
@@ -46,17 +80,23 @@ def from_matrix(matrix: ArrayLike) -> Pose:
 
 def to_matrix(pose: Pose) -> FloatArray:
     """Homogeneous matrix (4, 4) [m]."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation(pose).as_matrix()
-    matrix[:3, 3] = pose.position
-    return matrix
+    whole = np.eye(4)
+    whole[:3, :3] = matrix(pose)
+    whole[:3, 3] = pose.position
+    return whole
 
 
 def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
     """a_from_c."""
-    turn = rotation(a_from_b)
-    position = a_from_b.position + turn.apply(np.array(b_from_c.position))
-    return Pose(position, (turn * rotation(b_from_c)).as_quat())
+    position = a_from_b.position + _apply(matrix(a_from_b), b_from_c.position[None])[0]
+    (ax, ay, az, aw), (bx, by, bz, bw) = (_unit(*each.quaternion.tolist()) for each in (a_from_b, b_from_c))
+    turn = _unit(
+        aw * bx + bw * ax + (ay * bz - az * by),
+        aw * by + bw * ay + (az * bx - ax * bz),
+        aw * bz + bw * az + (ax * by - ay * bx),
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+    return Pose(position, np.array(turn))
 
 
 def along_z(pose: Pose, distance: float) -> Pose:
@@ -66,8 +106,9 @@ def along_z(pose: Pose, distance: float) -> Pose:
 
 def inverse(a_from_b: Pose) -> Pose:
     """b_from_a."""
-    back = rotation(a_from_b).inv()
-    return Pose(-back.apply(np.array(a_from_b.position)), back.as_quat())
+    x, y, z, w = _unit(*a_from_b.quaternion.tolist())
+    back = Pose(quaternion=np.array([-x, -y, -z, w]))
+    return Pose(-_apply(matrix(back), a_from_b.position[None])[0], back.quaternion)
 
 
 def relative(a: Pose, b: Pose) -> Pose:
@@ -83,8 +124,7 @@ def transform(a_from_b: Pose, points: ArrayLike) -> FloatArray:
 def rotate(a_from_b: Pose, vectors: ArrayLike) -> FloatArray:
     """(..., 3) directions, velocities or forces in the axes of b -> the same in the axes of a."""
     given = np.array(vectors, dtype=np.float64)
-    turned: FloatArray = rotation(a_from_b).apply(given.reshape(-1, 3)).reshape(given.shape)
-    return turned
+    return _apply(matrix(a_from_b), given.reshape(-1, 3)).reshape(given.shape)
 
 
 def transform_wrench(a_from_b: Pose, wrench: ArrayLike) -> FloatArray:
@@ -119,6 +159,8 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
     """
     if not 0.0 <= s <= 1.0:
         raise ValueError(f"interpolate: s must lie within 0 and 1, got {s}")
+    from scipy.spatial.transform import Rotation
+
     motion = s * difference(a, b)
     return Pose(a.position + motion[:3], (Rotation.from_rotvec(motion[3:]) * rotation(a)).as_quat())
 
@@ -126,7 +168,7 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
 def two_columns(pose: Pose) -> FloatArray:
     """(6,) first, then second column of the rotation matrix: continuous everywhere (Zhou et al. 2019), as no rotation
     vector and no set of angles is."""
-    return np.ascontiguousarray(rotation(pose).as_matrix()[:, :2].T).ravel()
+    return np.ascontiguousarray(matrix(pose)[:, :2].T).ravel()
 
 
 def from_two_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
@@ -134,6 +176,8 @@ def from_two_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
 
     Raises ValueError when they are parallel or zero.
     """
+    from scipy.spatial.transform import Rotation
+
     first, second = np.array(columns, dtype=np.float64).reshape(2, 3)
     area = float(np.linalg.norm(np.cross(first, second)))
     if not area > 1e-9:
@@ -141,5 +185,5 @@ def from_two_columns(position: ArrayLike, columns: ArrayLike) -> Pose:
     x = first / np.linalg.norm(first)
     y = second - (second @ x) * x
     y /= np.linalg.norm(y)
-    matrix = np.stack([x, y, np.cross(x, y)], axis=1)
-    return Pose(np.array(position, dtype=np.float64), Rotation.from_matrix(matrix).as_quat())
+    turn = np.stack([x, y, np.cross(x, y)], axis=1)
+    return Pose(np.array(position, dtype=np.float64), Rotation.from_matrix(turn).as_quat())

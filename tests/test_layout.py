@@ -109,6 +109,21 @@ def test_importing_is_light() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_a_press_and_an_environment_are_ready_without_scipy_and_matplotlib() -> None:
+    """They take as long to import as a press takes."""
+    program = """
+import sys
+import robot.studies.press, robot.rig.sim_env
+from tacsim.physics.world import make_world
+from tacsim.config import load_scene
+loaded = {"scipy", "matplotlib", "pandas"} & {name.partition(".")[0] for name in sys.modules}
+make_world(load_scene("squeeze", ["preset=draft"])).surface("lower")
+assert not loaded | ({"scipy"} & set(sys.modules)), loaded
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("package", API)
 def test_public_names_are_those_of_the_list(package: str) -> None:
     """A name leaves tests/api_surface.json only with a line in CHANGELOG.md."""

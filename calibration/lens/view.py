@@ -12,8 +12,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from calibration.errors import CalibrationError
 from calibration.lens.board import Points
@@ -155,6 +153,8 @@ def fit_lens(pictures: Mapping[str, Points], image_shape: tuple[int, int]) -> tu
             f"{MAX_RESIDUAL:g} at most (worst: {worst}, {found[worst]:.2f} px). Is the board flat, its size right, "
             "and the focus fixed?"
         )
+    from scipy.spatial.transform import Rotation
+
     normals = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2]
     mean = normals.mean(axis=0)
     mean /= np.linalg.norm(mean)
@@ -334,6 +334,8 @@ def _distorted(on_board: FloatArray, pixels: FloatArray, image_shape: tuple[int,
             lens, plane = lens_and_plane(p)
             off: FloatArray = (lens.project(_seen(plane, on_board)) - pixels).ravel()
             return off
+
+        from scipy.optimize import least_squares
 
         fit = least_squares(missed, start[: 8 + terms], x_scale="jac", method="lm")
         # left-out residuals of a linear fit (Allen's PRESS): r / (1 - leverage)

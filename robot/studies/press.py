@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from tacsim import pose as se3
 from tacsim.geometry.shapes import distance, extent
@@ -22,6 +21,7 @@ from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
 from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.press import PressWorld
+from tacsim.report.height_picture import write_height_picture
 
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
 MAX_TWIST = math.radians(3600.0)
@@ -95,8 +95,8 @@ def _targets(start: Pose, geometry: Shape, motion: PressMotion) -> list[Pose]:
         targets.append(Pose(down + np.append(motion.slide, 0.0), start.quaternion))
     pieces = math.ceil(abs(motion.twist) / QUARTER_TURN)
     for piece in range(1, pieces + 1):
-        turned = Rotation.from_rotvec([0.0, 0.0, motion.twist * piece / pieces]) * se3.rotation(start)
-        targets.append(Pose(targets[-1].position, turned.as_quat()))
+        turn = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, motion.twist * piece / pieces])
+        targets.append(Pose(targets[-1].position, se3.compose(turn, start).quaternion))
     return targets
 
 
@@ -142,27 +142,9 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
 
 def write(folder: Path, pressed: PressResult, config: dict[str, Any]) -> None:
     """Writes rgb.png, height.npy (float32 [m], one value a pixel), height.png and press.json. Raises OSError."""
-    from matplotlib.image import imsave
+    from PIL import Image
 
-    imsave(folder / "rgb.png", pressed.image)
+    Image.fromarray(pressed.image).save(folder / "rgb.png")
     np.save(folder / "height.npy", pressed.height.astype(np.float32), allow_pickle=False)
-    _write_height_picture(folder / "height.png", pressed, config["pixel_pitch"])
+    write_height_picture(folder / "height.png", pressed.height, pressed.contact, config["pixel_pitch"])
     (folder / "press.json").write_text(json.dumps(config, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _write_height_picture(path: Path, pressed: PressResult, pitch: float) -> None:
-    """Height map in false colours with a scale, contact outlined, as PNG. Raises OSError."""
-    from tacsim.report.figure import canvas, plain, save
-
-    rows, columns = pressed.height.shape
-    half = (columns * pitch * 5e2, rows * pitch * 5e2)  # [mm]
-    figure = canvas(8.0, 7.0 * rows / columns + 0.6)
-    figure.set_layout_engine("constrained")
-    axes = plain(figure.add_subplot(), "height into the gel; contact outlined", "x [mm]", "y [mm]")
-    axes.grid(False)
-    extent_mm = (-half[0], half[0], half[1], -half[1])
-    shown = axes.imshow(pressed.height * 1e6, cmap="viridis", extent=extent_mm)
-    if pressed.contact.any() and not pressed.contact.all():
-        axes.contour(pressed.contact, levels=[0.5], colors="white", linewidths=1, extent=extent_mm, origin="upper")
-    figure.colorbar(shown, ax=axes, label="µm", shrink=0.9)
-    save(figure, path)

@@ -2,15 +2,19 @@
 
 Compiled kernels are kept on disk, but Taichi looks them up by what its front end makes of them. Most of that time went
 to what nobody reads: each node of the syntax tree had its place drawn for an error message, with a line of carets; each
-function had the file of its caller looked for among all modules, and its own text read again wherever it is inlined.
+function had the file of its caller looked for among all modules, and its own text read and parsed again wherever it is
+inlined.
 Nothing here changes what is compiled: cached kernels are found as before (tests/tacsim/compute/test_front_end.py).
 """
 
+import ast
 import inspect
 import sys
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 
@@ -26,18 +30,37 @@ def without_module_search() -> Iterator[None]:
         inspect.getmodule = search
 
 
-def quicken(kernel_impl: Any, context: Any) -> None:
+def quicken(kernel_impl: Any, context: Any, builder: Any) -> None:
     """Puts quicker functions in the place of Taichi's own; to be called before any of our kernels is defined.
 
-    kernel_impl: module taichi.lang.kernel_impl; context: class ASTTransformerContext. What another version of Taichi
-    does not have stays as it is: slower, not broken.
+    kernel_impl: module taichi.lang.kernel_impl; context, builder: classes ASTTransformerContext and Builder. What
+    another version of Taichi does not have stays as it is: slower, not broken.
     """
     if hasattr(kernel_impl, "_inside_class"):
         kernel_impl._inside_class = _inside_class
     if hasattr(kernel_impl, "getsourcelines"):
         kernel_impl.getsourcelines = lru_cache(maxsize=None)(kernel_impl.getsourcelines)
+    if hasattr(kernel_impl, "getsourcefile"):
+        kernel_impl.getsourcefile = lru_cache(maxsize=None)(kernel_impl.getsourcefile)
+    if hasattr(kernel_impl, "ast") and hasattr(kernel_impl, "textwrap"):
+        # No tree is changed where it is read, as bodies of static loops show, which are read many times.
+        kernel_impl.ast = SimpleNamespace(**{**vars(ast), "parse": lru_cache(maxsize=None)(ast.parse)})
+        kept = {"fill": lru_cache(maxsize=None)(textwrap.fill), "dedent": lru_cache(maxsize=None)(textwrap.dedent)}
+        kernel_impl.textwrap = SimpleNamespace(**{**vars(textwrap), **kept})
     if hasattr(context, "get_pos_info"):
         context.get_pos_info = _place
+    if "__call__" in vars(builder):
+        builder.__call__ = _by_statement(builder.__call__)
+
+
+def _by_statement(build: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
+    """Builder.__call__, which notes where a node stands, for statements alone: what is in one stands where it does."""
+
+    def build_node(self: Any, context: Any, node: ast.AST) -> Any:
+        method = None if isinstance(node, ast.stmt) else getattr(self, f"build_{type(node).__name__}", None)
+        return build(self, context, node) if method is None else method(context, node)
+
+    return build_node
 
 
 def _place(context: Any, node: Any) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from tacsim.geometry.shapes import FloatArray, distance, extent, nearest_surface, no_particle, particles
 from tacsim.models.scene import Body, Shape
@@ -53,6 +52,8 @@ def scattered(geometry: Shape, spacing: float, seed: int) -> FloatArray:
 
 def _repulsion(points: FloatArray, reach: float) -> FloatArray:
     """Step of each particle (n, 3) away from those within `reach`."""
+    from scipy.spatial import KDTree
+
     pairs = KDTree(points).query_pairs(reach, output_type="ndarray")
     apart = points[pairs[:, 0]] - points[pairs[:, 1]]
     length = np.linalg.norm(apart, axis=1)

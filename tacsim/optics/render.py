@@ -209,8 +209,8 @@ def texture_gradient(grid: PixelGrid, gel_size: tuple[float, float], deviation: 
     noise *= deviation * 20.0 / 11.0
     value_x, slope_x = line_matrices(grid.x / TEXTURE_PITCH + (nodes_x - 1) / 2, nodes_x)
     value_y, slope_y = line_matrices(grid.y / TEXTURE_PITCH + (nodes_y - 1) / 2, nodes_y)
-    by_x = (value_y @ noise) @ slope_x.T
-    by_y = (slope_y @ noise) @ value_x.T
+    by_x = (slope_x @ (value_y @ noise).T).T
+    by_y = (value_x @ (slope_y @ noise).T).T
     gradient = np.stack([by_x, by_y], axis=-1) / TEXTURE_PITCH
     gradient[~grid.within(gel_size)] = 0.0
     return np.ascontiguousarray(gradient, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The C1 quadratic B-spline surface over a lattice of control values: at single points, and as matrices for lines.
+"""The C1 quadratic B-spline surface over a lattice of control values: at single points, and along lines.
 
 With s the position in lattice spacings, i the nearest node and f = s - i in [-1/2, 1/2], the weights of the nodes
 i-1, i, i+1 are (1/2 - f)^2 / 2, 3/4 - f^2, (1/2 + f)^2 / 2 (de Boor 1978). At the rim the outermost control value
@@ -7,9 +7,10 @@ repeats; beyond it the surface continues unchanged.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from tacsim.models.scene import GelSurface
 
@@ -40,12 +41,24 @@ def displacement_and_jacobian(surface: GelSurface, points: Float64) -> tuple[Flo
     return value, np.stack([by_x, by_y], axis=-1)
 
 
-def line_matrices(position: Float64, nodes: int) -> tuple[csr_array, csr_array]:
-    """Two sparse (n, nodes) matrices: control values along a line -> spline and its derivative by the position, at
-    `position` (n,) in lattice spacings."""
-    index, weight, slope = spline_weights(position, nodes)
-    row = np.arange(len(position))[:, None].repeat(3, axis=1)
-    shape = (len(position), nodes)
-    value = csr_array((weight.astype(np.float32).ravel(), (row.ravel(), index.ravel())), shape=shape)
-    derivative = csr_array((slope.astype(np.float32).ravel(), (row.ravel(), index.ravel())), shape=shape)
-    return value, derivative
+@dataclass(frozen=True, slots=True, eq=False)
+class LineMatrix:
+    """A matrix (n, nodes) of three numbers a row: three products of whole rows are quicker than SciPy's import."""
+
+    index: NDArray[np.intp]  # (3, n) columns
+    weight: NDArray[np.float32]  # (3, n, 1)
+
+    def __matmul__(self, control: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(nodes, m) -> (n, m)"""
+        terms = [weight * control[index] for index, weight in zip(self.index, self.weight, strict=True)]
+        terms[0] += terms[1]
+        terms[0] += terms[2]
+        return terms[0]
+
+
+def line_matrices(position: Float64, nodes: int) -> tuple[LineMatrix, LineMatrix]:
+    """Two (n, nodes) matrices: control values along a line -> spline and its derivative by the position, at `position`
+    (n,) in lattice spacings."""
+    index, *weights = spline_weights(position, nodes)
+    value, derivative = (each.T[..., None].astype(np.float32) for each in weights)
+    return LineMatrix(index.T, value), LineMatrix(index.T, derivative)

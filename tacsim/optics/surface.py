@@ -21,14 +21,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from tacsim.interface import SurfaceMap
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
-from tacsim.optics.spline import displacement_and_jacobian, line_matrices
+from tacsim.optics.spline import LineMatrix, displacement_and_jacobian, line_matrices
 
 Float32 = NDArray[np.float32]
 
@@ -209,18 +208,17 @@ def _table(surface: GelSurface) -> tuple[Float32, Float32]:
 
 
 @lru_cache(maxsize=16)
-def _table_matrices(nodes: int, points: int) -> tuple[csr_array, csr_array]:
+def _table_matrices(nodes: int, points: int) -> tuple[LineMatrix, LineMatrix]:
     return line_matrices(np.arange((nodes - 1) * points + 1) / points, nodes)
 
 
-def _product(along_y: csr_array, control: Float32, along_x: csr_array) -> Float32:
-    """(3, rows, columns): both matrices applied to (nx, ny, 3) control values. Sparse: dense products would wake the
-    threads of BLAS, which cost more than they give on matrices this small."""
+def _product(along_y: LineMatrix, control: Float32, along_x: LineMatrix) -> Float32:
+    """(3, rows, columns): both matrices applied to (nx, ny, 3) control values."""
     nx, ny, _ = control.shape
-    rows, columns = along_y.shape[0], along_x.shape[0]
-    in_x = (along_x @ control.reshape(nx, ny * 3)).reshape(columns, ny, 3)
+    in_x = (along_x @ control.reshape(nx, ny * 3)).reshape(-1, ny, 3)
+    columns = len(in_x)
     in_xy = along_y @ np.ascontiguousarray(in_x.transpose(1, 2, 0)).reshape(ny, 3 * columns)
-    product: Float32 = in_xy.reshape(rows, 3, columns).transpose(1, 0, 2)
+    product: Float32 = in_xy.reshape(-1, 3, columns).transpose(1, 0, 2)
     return product
 
 

@@ -5,7 +5,6 @@ Lengths in mm, as in kernels.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from tacsim.physics.gel.gel import GelParams
 
@@ -22,6 +21,8 @@ def gel_overlap(params: GelParams, tops: Floats, rotations: Floats, origins: Flo
     half = np.array(params.half)
     if _apart(half, tops, rotations, origins):
         return 0.0
+    from scipy.ndimage import map_coordinates
+
     at = np.stack(np.meshgrid(*[np.arange(n) * params.spacing for n in tops.shape[1:3]], indexing="ij"), axis=-1) - half
     deepest = 0.0
     for here, there in ((0, 1), (1, 0)):

@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.physics.failure.health import LaunchSpan
 from tacsim.physics.units import MM
@@ -79,6 +79,8 @@ class Path:
         for index, a in enumerate(self.start):
             moved = self._displacements(index, knots)
             if moved[:, 3:].any():
+                from scipy.spatial.transform import Rotation  # slow to import, and most motions turn nothing
+
                 turned = Rotation.from_rotvec(moved[:, 3:]) * Rotation.from_quat(a.quaternion)
                 out[:, index, :3] = turned[1:].as_matrix()
                 out[:, index, 5] = (turned[1:] * turned[:-1].inv()).as_rotvec() / self.step
@@ -106,6 +108,8 @@ class Path:
         for index, (name, a) in enumerate(zip(names, self.start, strict=True)):
             moved, quaternion = self._displacements(index, at)[0], a.quaternion
             if moved[3:].any():
+                from scipy.spatial.transform import Rotation
+
                 quaternion = (Rotation.from_rotvec(moved[3:]) * Rotation.from_quat(quaternion)).as_quat()
             poses[name] = Pose(a.position + moved[:3] / MM, quaternion)
         return LaunchSpan(words if self.substeps else "in the hold after the motion", poses)
@@ -114,8 +118,7 @@ class Path:
 @lru_cache(maxsize=64)
 def _matrix(*quaternion: float) -> NDArray[np.float64]:
     """Rotation matrix (3, 3) of a frame that does not turn: most never do."""
-    matrix: NDArray[np.float64] = Rotation.from_quat(quaternion).as_matrix()
-    return matrix
+    return se3.matrix(Pose(quaternion=np.array(quaternion)))
 
 
 def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
@@ -123,6 +126,8 @@ def displacement_between(a: Pose, b: Pose) -> NDArray[np.float64]:
     displacement = np.zeros(6)
     displacement[:3] = (b.position - a.position) * MM
     if not np.array_equal(a.quaternion, b.quaternion):  # most motions turn nothing, and that is seen at once
+        from scipy.spatial.transform import Rotation
+
         displacement[3:] = (Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()).as_rotvec()
     return displacement
 
@@ -142,7 +147,7 @@ def path_length(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> flo
 def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> float:
     """What of it goes along the surface of the first frame, a sensor, turns included [mm]."""
     displacements = np.array([displacement_between(a, b) for a, b in zip(start, end, strict=True)])
-    normal = Rotation.from_quat(start[0].quaternion).apply([0.0, 0.0, 1.0])
+    normal = se3.matrix(start[0])[:, 2]
     displacements[:, :3] -= np.outer(displacements[:, :3] @ normal, normal)
     return of_fastest_point(displacements, lever)
 

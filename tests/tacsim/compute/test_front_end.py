@@ -82,6 +82,6 @@ def test_a_mistake_in_a_kernel_is_told_with_its_place(tmp_path: Path) -> None:
 
 
 def test_another_taichi_stays_as_it_is() -> None:
-    module, context = SimpleNamespace(renamed=1), SimpleNamespace()
-    quicken(module, context)
-    assert vars(module) == {"renamed": 1} and vars(context) == {}
+    module, context, builder = SimpleNamespace(renamed=1), SimpleNamespace(), SimpleNamespace()
+    quicken(module, context, builder)
+    assert vars(module) == {"renamed": 1} and vars(context) == {} and vars(builder) == {}

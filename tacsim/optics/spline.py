@@ -50,10 +50,10 @@ class LineMatrix:
 
     def __matmul__(self, control: NDArray[np.float32]) -> NDArray[np.float32]:
         """(nodes, m) -> (n, m)"""
-        terms = [weight * control[index] for index, weight in zip(self.index, self.weight, strict=True)]
-        terms[0] += terms[1]
-        terms[0] += terms[2]
-        return terms[0]
+        product: NDArray[np.float32] = self.weight[0] * control[self.index[0]]
+        for index, weight in zip(self.index[1:], self.weight[1:], strict=True):
+            product += weight * control[index]
+        return product
 
 
 def line_matrices(position: Float64, nodes: int) -> tuple[LineMatrix, LineMatrix]:

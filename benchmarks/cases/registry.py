@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.cases import (
+    cylinder,
     environments,
     incline,
     large_strain,
     materials,
-    presets,
+    oracles,
     press,
     random_steps,
     scenes,
@@ -38,12 +39,13 @@ CASES: tuple[Case, ...] = (
     *press.CASES,
     *squeeze.CASES,
     *random_steps.CASES,
-    *presets.CASES,
     *large_strain.CASES,
     *incline.CASES,
     *materials.CASES,
     *scenes.CASES,
     *environments.CASES,
+    *oracles.CASES,
+    *cylinder.CASES,
 )
 
 CPU_ONLY = "it runs on the CPU only"

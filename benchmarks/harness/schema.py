@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-Group = Literal["press", "squeeze", "materials", "scenes", "real", "robot"]
+Group = Literal["press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
 GROUPS: tuple[Group, ...] = get_args(Group)  # real needs frames that are not shipped; robot is asked for by name
 
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.cases.registry import description
 from benchmarks.harness.schema import Machine, Report, Row
-from benchmarks.pages import targets
+from benchmarks.pages import oracles, targets
 from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
 
 GROUP_WORDS = {
@@ -15,6 +15,7 @@ GROUP_WORDS = {
     "squeeze": "Squeeze: plasticine between two gels",
     "materials": "Materials: laws, elements, transfers, and what a substep costs",
     "scenes": "Scenes: cost by what is in them",
+    "oracles": "Oracles: ours beside solvers that share nothing with it",
     "real": "Real: frames of real sensors, and what they cost",
 }
 COLUMNS = ("case", "method", "resolution", "seconds", "CPU s", "error", "MB", "substeps")
@@ -115,7 +116,8 @@ def markdown(report: Report, devices: Sequence[Report] = ()) -> str:
     for group, words in GROUP_WORDS.items():
         rows = [row for row in report.results if row.group == group]
         if rows:
-            parts += [f"## {words}", table(COLUMNS, map(cells, rows)), *_remarks(rows)]
+            shown = table(*oracles.lines(rows)) if group == "oracles" else table(COLUMNS, map(cells, rows))
+            parts += [f"## {words}", shown, *_remarks(rows)]
         if group == "real" and rows:
             parts.append(f"![Contact radius against depth: real, ours, and simpler theories](images/{RADII})")
     if report.failures:

@@ -11,7 +11,7 @@ import typer
 from robot.cli.errors import UNUSABLE, complain
 from robot.cli.output import busy, notes
 
-Group = Literal["all", "press", "squeeze", "materials", "scenes", "real", "robot"]
+Group = Literal["all", "press", "squeeze", "materials", "scenes", "oracles", "real", "robot"]
 
 
 def bench(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.cases import presets, squeeze
+from benchmarks.cases import squeeze
 from tacsim.models.scene import Box, Scene
 
 SIDE = 6e-3
@@ -55,11 +55,3 @@ def test_a_body_between_sensors_that_part_sideways_goes_half_way() -> None:
     (row,) = squeeze.reposition("draft", "hybrid", 1)
     assert row.note == "" and row.error < 0.02  # mm
     assert row.figures["travel_mm"] == pytest.approx(1.5, abs=0.02)
-
-
-def test_a_cylinder_at_learn_is_measured_against_independent_elements() -> None:
-    rows = presets.cylinder("learn", 1)
-    assert [row.variant for row in rows] == ["closed by 1 mm", "closed by 2 mm", "closed by 3 mm"]
-    for row in rows:
-        assert row.note == "" and 0.0 < row.error < 20.0  # % of force
-        assert abs(row.figures["height_error_percent"]) < 1.0

@@ -1,0 +1,113 @@
+"""A clay cylinder between two gels, squeezed and cycled, beside a solver that shares nothing with ours."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from benchmarks.cases.oracles import FINE, RESOLUTIONS, beside, once
+from benchmarks.cases.squeeze import close, normal_forces
+from benchmarks.harness.measure import Measurement
+from benchmarks.harness.runner import Case
+from benchmarks.truth import finite_elements as truth
+from tacsim.physics.failure.diagnosis import particle_volumes
+from tacsim.physics.world import World, make_world
+
+HEIGHT = 10.0  # [mm]
+LOW, HIGH = 2.0, 2.3  # closed in turn [mm]
+CYCLES = (1, 2, 5, 10)  # whose force is shown
+FLOWING = (2, 200, 700)
+STEPS = 3  # that flow from LOW to HIGH
+
+
+def squeezed(resolution: str, repeat: int) -> list[Measurement]:
+    """A clay cylinder of 10 x 10 mm between gels, closed by 1, 2 and 3 mm from touch, each settled."""
+    world, rows = _world(resolution), []
+    for by, (force, height) in truth.CYLINDER.items():
+        timing, settled = once(partial(_close, world, by))
+        body = world.truth()
+        assert body is not None
+        what, note = f"cylinder squeezed by {by:g} mm", _note(settled)
+        rows.append(beside(timing, f"{what}: force", "n", _force(world), force, note))
+        rows.append(beside(timing, f"{what}: height", "mm", body.height * 1e3, height, note))
+    return rows
+
+
+def cycled(resolution: str, repeat: int) -> list[Measurement]:
+    """The same cylinder closed by 2.0 and 2.3 mm in turn, each settled: force at 2.3 mm."""
+    world, rows = _world(resolution), []
+    for number in range(1, max(CYCLES) + 1):
+        _close(world, LOW)
+        timing, settled = once(partial(_close, world, HIGH))
+        if number in CYCLES:
+            what = f"cylinder led from 2.0 to 2.3 mm, time {number}: force"
+            rows.append(beside(timing, what, "n", _force(world), truth.CYCLED, _note(settled), _volumes(world)))
+    return rows
+
+
+def flowing_cycles(resolution: str, repeat: int) -> list[Measurement]:
+    """The cylinder led from 2.0 to 2.3 mm and back in flowing steps of 0.1 mm: what the force at 2.3 mm loses, and how
+    far an elastic volume ratio is from one."""
+    world, rows, second = _world(resolution), [], 0.0
+    _close(world, HIGH)
+    way = np.linspace(HIGH, LOW, STEPS + 1)[1:]
+
+    def lead(times: int) -> None:
+        for by in [*way, *way[-2::-1], HIGH] * times:
+            _close(world, by, flow=True)
+
+    done = 0
+    for number in FLOWING:
+        timing, _ = once(partial(lead, number - done))
+        done, force, volumes = number, _force(world), _volumes(world)
+        second = second or force
+        what, figures = f"{number} cycles", {"force_n": force, **volumes}
+        rows.append(
+            Measurement(timing, abs(force / second - 1) * 100, "% of the second's force", "shakedown", what,
+                        figures=figures)
+        )  # fmt: skip
+    return rows
+
+
+def _world(resolution: str) -> World:
+    from tacsim.config import load_scene
+
+    fine = ["particle_spacing=0.125 mm", "element_size=0.25 mm"]
+    shape = "body.geometry={shape: cylinder, radius: 5 mm, height: 10 mm}"
+    return make_world(load_scene("squeeze", [shape, *(fine if resolution == FINE else [f"preset={resolution}"])]))
+
+
+def _close(world: World, by: float, *, flow: bool = False) -> bool:
+    """Leads the sensors to where they are `by` [mm] nearer to one another than at first touch; whether that settled."""
+    apart = float((world.pose("upper").position - world.pose("lower").position)[2])
+    return close(world, apart - (HEIGHT - by) * 1e-3, flow=flow).settled
+
+
+def _force(world: World) -> float:
+    return float(normal_forces(world).mean())
+
+
+def _volumes(world: World) -> dict[str, float]:
+    volumes = particle_volumes(world.snapshot())
+    assert volumes is not None
+    low, high = float(volumes.min()), float(volumes.max())
+    return {"volume_low": low, "volume_high": high, "volume_off": max(1 - low, high - 1)}
+
+
+def _note(settled: bool) -> str:
+    return "" if settled else "not settled"
+
+
+CASES = (
+    *(
+        Case("oracles", "squeezed", "tacsim", each, partial(squeezed, each), long=each in ("standard", FINE))
+        for each in RESOLUTIONS
+    ),
+    *(
+        Case("oracles", "cycled", "tacsim", each, partial(cycled, each), long=each == "standard")
+        for each in RESOLUTIONS
+        if each != FINE
+    ),
+    Case("squeeze", "flowing_cycles", "tacsim", "draft", partial(flowing_cycles, "draft"), long=True),
+)

@@ -1,0 +1,102 @@
+"""Rigid indenters beside a solver that shares nothing with ours: balls, punches, twists, slides."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TypeVar
+
+from benchmarks.harness.measure import Measurement, Timing
+from benchmarks.harness.runner import Case
+from benchmarks.truth import finite_elements as truth
+from robot.studies.press import PressMotion, PressResult, press
+from tacsim.models.scene import Cylinder, Indenter, Scene, Shape, Sphere
+
+T = TypeVar("T")
+
+FINE = "h 0.25 mm"  # no preset: half of standard's spacings
+RESOLUTIONS = ("learn", "draft", "standard", FINE)
+
+
+def balls(resolution: str, repeat: int) -> list[Measurement]:
+    """Balls pressed without friction, and deep with it: force and contact radius, as `tacsim press` gives them."""
+    rows = []
+    for (radius, depth), (force, contact) in truth.BALLS.items():
+        what = f"ball R {radius:g} mm, {depth:g} mm deep"
+        timing, found = _press(resolution, Sphere(radius=radius * 1e-3), 0.0, PressMotion(depth * 1e-3))
+        rows.append(beside(timing, f"{what}: force", "n", _force(found), force, _note(found)))
+        rows.append(beside(timing, f"{what}: contact radius", "mm", found.contact_radius * 1e3, contact, _note(found)))
+    for depth, force in truth.RUBBED_BALL.items():
+        timing, found = _press(resolution, Sphere(radius=4e-3), 0.6, PressMotion(depth * 1e-3))
+        what = f"ball R 4 mm, {depth:g} mm deep, friction 0.6: force"
+        rows.append(beside(timing, what, "n", _force(found), force, _note(found)))
+    return rows
+
+
+def punches(resolution: str, repeat: int) -> list[Measurement]:
+    """Flat punches 0.1 mm deep: force without friction, and the moment of one that sticks and turns by a degree."""
+    rows, depth, angle = [], 0.1e-3, math.radians(1.0)
+    for radius, force in truth.PUNCHES.items():
+        shape = Cylinder(radius=radius * 1e-3, height=4e-3)
+        timing, found = _press(resolution, shape, 0.0, PressMotion(depth))
+        rows.append(beside(timing, f"flat punch R {radius:g} mm: force", "n", _force(found), force, _note(found)))
+    for radius, share in truth.TWISTS.items():
+        shape = Cylinder(radius=radius * 1e-3, height=4e-3)
+        timing, found = _press(resolution, shape, 5.0, PressMotion(depth, twist=angle))
+        moment = share * 16 / 3 * truth.SHEAR_MODULUS * radius**3 * angle  # [N mm]
+        what = f"flat punch R {radius:g} mm, twisted by a degree: moment"
+        rows.append(beside(timing, what, "nmm", found.wrench[5] * 1e3, moment, _note(found)))
+    return rows
+
+
+def slides(resolution: str, repeat: int) -> list[Measurement]:
+    """A ball R 4 mm, 0.5 mm deep, slid by 2 mm at the default speed: drag over normal force."""
+    rows = []
+    for friction, ratio in truth.SLIDES.items():
+        motion = PressMotion(0.5e-3, slide=(2e-3, 0.0))
+        timing, found = _press(resolution, Sphere(radius=4e-3), friction, motion)
+        what = f"ball slid by 2 mm, friction {friction:g}: drag over normal force"
+        rows.append(beside(timing, what, "ratio", found.wrench[0] / _force(found), ratio, _note(found)))
+    return rows
+
+
+def beside(
+    timing: Timing, what: str, unit: str, found: float, true: float, note: str = "",
+    figures: Mapping[str, float] | None = None,
+) -> Measurement:  # fmt: skip
+    """A row of the table that pages/oracles.py makes: what we find and what is true, in `unit`."""
+    both = {f"found_{unit}": float(found), f"truth_{unit}": true, **(figures or {})}
+    return Measurement(timing, abs(found / true - 1) * 100, "%", truth.WORDS, what, figures=both, note=note)
+
+
+def once(run: Callable[[], T]) -> tuple[Timing, T]:
+    """What `run` takes, with kernels that may have to be loaded first: here errors count, not seconds."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = run()
+    return Timing((time.perf_counter() - wall,), time.process_time() - cpu), result
+
+
+def _press(resolution: str, shape: Shape, friction: float, motion: PressMotion) -> tuple[Timing, PressResult]:
+    from tacsim.config import load_sensor
+
+    fineness = {"element_size": 0.25e-3} if resolution == FINE else {"preset": resolution}
+    indenter = Indenter(geometry=shape, friction=friction)
+    scene = Scene.model_validate({"body": None, "indenter": indenter, **fineness})
+    return once(lambda: press(scene, load_sensor("ideal"), motion))
+
+
+def _force(found: PressResult) -> float:
+    return -float(found.wrench[2])
+
+
+def _note(found: PressResult) -> str:
+    return "" if all(move.settled for move in found.moves) else "not settled"
+
+
+CASES = tuple(
+    Case("oracles", measure.__name__, "tacsim", resolution, partial(measure, resolution), long=resolution == FINE)
+    for measure in (balls, punches, slides)
+    for resolution in RESOLUTIONS
+)

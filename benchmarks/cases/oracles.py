@@ -6,13 +6,15 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from benchmarks.harness.measure import Measurement, Timing
 from benchmarks.harness.runner import Case
 from benchmarks.truth import finite_elements as truth
-from robot.studies.press import PressMotion, PressResult, press
 from tacsim.models.scene import Cylinder, Indenter, Scene, Shape, Sphere
+
+if TYPE_CHECKING:
+    from robot.studies.press import PressResult
 
 T = TypeVar("T")
 
@@ -25,11 +27,11 @@ def balls(resolution: str, repeat: int) -> list[Measurement]:
     rows = []
     for (radius, depth), (force, contact) in truth.BALLS.items():
         what = f"ball R {radius:g} mm, {depth:g} mm deep"
-        timing, found = _press(resolution, Sphere(radius=radius * 1e-3), 0.0, PressMotion(depth * 1e-3))
+        timing, found = _press(resolution, Sphere(radius=radius * 1e-3), 0.0, depth * 1e-3)
         rows.append(beside(timing, f"{what}: force", "n", _force(found), force, _note(found)))
         rows.append(beside(timing, f"{what}: contact radius", "mm", found.contact_radius * 1e3, contact, _note(found)))
     for depth, force in truth.RUBBED_BALL.items():
-        timing, found = _press(resolution, Sphere(radius=4e-3), 0.6, PressMotion(depth * 1e-3))
+        timing, found = _press(resolution, Sphere(radius=4e-3), 0.6, depth * 1e-3)
         what = f"ball R 4 mm, {depth:g} mm deep, friction 0.6: force"
         rows.append(beside(timing, what, "n", _force(found), force, _note(found)))
     return rows
@@ -40,11 +42,11 @@ def punches(resolution: str, repeat: int) -> list[Measurement]:
     rows, depth, angle = [], 0.1e-3, math.radians(1.0)
     for radius, force in truth.PUNCHES.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
-        timing, found = _press(resolution, shape, 0.0, PressMotion(depth))
+        timing, found = _press(resolution, shape, 0.0, depth)
         rows.append(beside(timing, f"flat punch R {radius:g} mm: force", "n", _force(found), force, _note(found)))
     for radius, share in truth.TWISTS.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)
-        timing, found = _press(resolution, shape, 5.0, PressMotion(depth, twist=angle))
+        timing, found = _press(resolution, shape, 5.0, depth, twist=angle)
         moment = share * 16 / 3 * truth.SHEAR_MODULUS * radius**3 * angle  # [N mm]
         what = f"flat punch R {radius:g} mm, twisted by a degree: moment"
         rows.append(beside(timing, what, "nmm", found.wrench[5] * 1e3, moment, _note(found)))
@@ -55,8 +57,7 @@ def slides(resolution: str, repeat: int) -> list[Measurement]:
     """A ball R 4 mm, 0.5 mm deep, slid by 2 mm at the default speed: drag over normal force."""
     rows = []
     for friction, ratio in truth.SLIDES.items():
-        motion = PressMotion(0.5e-3, slide=(2e-3, 0.0))
-        timing, found = _press(resolution, Sphere(radius=4e-3), friction, motion)
+        timing, found = _press(resolution, Sphere(radius=4e-3), friction, 0.5e-3, slide=2e-3)
         what = f"ball slid by 2 mm, friction {friction:g}: drag over normal force"
         rows.append(beside(timing, what, "ratio", found.wrench[0] / _force(found), ratio, _note(found)))
     return rows
@@ -78,13 +79,16 @@ def once(run: Callable[[], T]) -> tuple[Timing, T]:
     return Timing((time.perf_counter() - wall,), time.process_time() - cpu), result
 
 
-def _press(resolution: str, shape: Shape, friction: float, motion: PressMotion) -> tuple[Timing, PressResult]:
+def _press(
+    resolution: str, shape: Shape, friction: float, depth: float, slide: float = 0.0, twist: float = 0.0
+) -> tuple[Timing, PressResult]:
+    from robot.studies.press import PressMotion, press  # loads Taichi
     from tacsim.config import load_sensor
 
     fineness = {"element_size": 0.25e-3} if resolution == FINE else {"preset": resolution}
     indenter = Indenter(geometry=shape, friction=friction)
     scene = Scene.model_validate({"body": None, "indenter": indenter, **fineness})
-    return once(lambda: press(scene, load_sensor("ideal"), motion))
+    return once(lambda: press(scene, load_sensor("ideal"), PressMotion(depth, (slide, 0.0), twist)))
 
 
 def _force(found: PressResult) -> float:

@@ -57,7 +57,7 @@ def test_the_table_has_a_line_a_case_and_a_column_a_resolution() -> None:
         )  # fmt: skip
 
     header, lines = page.lines(
-        [row("a", "draft", 2.02), row("b", "draft", 1.0, "not settled"), row("a", "standard", 1.999)]
+        [row("a", "draft", 2.02), row("b", "draft", 1.0, "not settled"), row("a", "standard", 1.98)]
     )
     assert header == ["case", "oracle", "draft", "standard"]
-    assert lines == [["a", "2 N", "2.02 (+1.0 %)", "1.999 (-0.1 %)"], ["b", "2 N", "1 (-50.0 %), not settled", ""]]
+    assert lines == [["a", "2 N", "2.02 (+1.0 %)", "1.98 (-1.0 %)"], ["b", "2 N", "1 (-50.0 %), not settled", ""]]

@@ -65,7 +65,9 @@ def test_the_worst_row_counts() -> None:
 def test_figures_of_a_row_and_units() -> None:
     step = row(case="plasticine_alone", figures={"wall_per_particle_substep_ns": 76.0})
     assert judged("plasticine step, 64,000 particles, wall: plasticine alone", [step]) == (76.0, "missed")
-    control = row(case="control_step", variant="0.1 mm, flowing, and two images", seconds=0.02)
+    control = row(
+        case="control_step", variant="0.1 mm, flowing, and two images", seconds=0.02, resolution="particles 0.5 mm"
+    )
     assert judged("control step, draft, two images: flowing", [control]) == (pytest.approx(20.0), "met")
     assert judged("control step, draft, two images: each one settled", [control])[1] == "not measured"
 
@@ -118,6 +120,10 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
     variants = ["", "tolerance", "two speeds, Mach 0.03 and 0.015", "not settled", "settled to 1 %",
                 "force balance", "overlap", "0.1 mm, flowing", "0.1 mm, settled",
                 "gap", "sensors closed by 80 %", "by 67 %", "by 80 %",
+                "settled", "flowing at Mach 0.01, the default", "flowing, heights and forces: a step of 16",
+                "settled, heights and forces: a step of 16", "flowing, two pictures of 160 x 120: a step of 16",
+                "flowing, two pictures of 160 x 120: a reset", "a ball: force", "a ball: contact radius",
+                "0.5 mm, friction 0.6", "time 10: force", "700 cycles",
                 "its centre", "its farthest particle", "stick limit", "lattice, 3 mm", "random, 3 mm",
                 "R 3 mm, 1 mm deep: image", "R 3 mm, 1 mm deep: pressure",
                 "THUsight: picture", "THUsight: normals", "Taxim: picture", "FOTS: picture", "R 3 mm: height",
@@ -125,6 +131,7 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
                 "pictures: rho, gradient", "pictures: rho, height",
                 "surfaces: rho, gradient", "surfaces: rho, height"]  # fmt: skip
     names = ["wall_per_particle_substep_ns", "cpu_per_element_substep_ns", "second_ms", "momentum", "angular_momentum"]
+    names += ["worst_percent", "env_steps_per_s", "volume_off"]
     names += ["kept_percent", "kept_in_picture_percent", "jitter_px"]
     names += ["ncc", "ssim", "whole_percent", "auc_low", "extra_deg", "bound_ratio"]
     figures = {**dict.fromkeys(names, 1.0), "depth_mm": 1.0}

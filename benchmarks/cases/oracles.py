@@ -54,11 +54,11 @@ def punches(resolution: str, repeat: int) -> list[Measurement]:
 
 
 def slides(resolution: str, repeat: int) -> list[Measurement]:
-    """A ball R 4 mm, 0.5 mm deep, slid by 2 mm at the default speed: drag over normal force."""
+    """A ball R 4 mm, slid by 2 mm at the default speed: drag over normal force."""
     rows = []
-    for friction, ratio in truth.SLIDES.items():
-        timing, found = _press(resolution, Sphere(radius=4e-3), friction, 0.5e-3, slide=2e-3)
-        what = f"ball slid by 2 mm, friction {friction:g}: drag over normal force"
+    for (depth, friction), ratio in truth.SLIDES.items():
+        timing, found = _press(resolution, Sphere(radius=4e-3), friction, depth * 1e-3, slide=2e-3)
+        what = f"ball slid {depth:g} mm deep, friction {friction:g}: drag over normal force"
         rows.append(beside(timing, what, "ratio", found.wrench[0] / _force(found), ratio, _note(found)))
     return rows
 

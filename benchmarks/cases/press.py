@@ -42,8 +42,6 @@ FORCE_DEPTHS = (0.1e-3, 0.3e-3)
 FORCE_RATIOS = (0.45, 0.49)  # Poisson
 SLIDE, SLIDES = 0.5e-3, 20  # a plate slides so far at a time [m], and so often at most
 SLIDE_SLOW = {"draft": 0.001, "standard": 0.002}  # Mach number at which speed plays no part
-DRAG = {0.3: 0.32, 0.6: 0.647, 1.0: 1.098}  # by friction: drag over normal force of the ball that slides everywhere
-DRAG_TRUTH = "axisymmetric finite elements of second order"
 STAYS = 1e-3  # relative change of the force ratio in one slide
 
 
@@ -178,13 +176,10 @@ def sliding_force(element: float, repeat: int) -> list[Measurement]:
 
 
 def slid_ball(preset: str, repeat: int) -> list[Measurement]:
-    """A ball R 4 mm, 0.5 mm deep in the shipped gel, dragged along it: drag over normal force where it slides
-    everywhere, and where a part of the contact still sticks."""
+    """A ball R 4 mm, 0.5 mm deep in the shipped gel, dragged along it by 0.5 mm, so that a part of the contact still
+    sticks: drag over normal force."""
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
-    for friction, ratio in DRAG.items():
-        timing, (found, stats) = timed(partial(_drag, preset, friction, 2e-3), repeat)
-        rows.append(_drag_row(timing, found, stats, ratio, DRAG_TRUTH, f"2 mm, friction {friction:g}"))
     for friction in (0.3, 0.6, 1.0, 1.5):
         timing, (found, stats) = timed(partial(_drag, preset, friction, SLIDE), 1, warm=lambda: None)
         truth, _ = _drag(preset, friction, SLIDE, **settled)

@@ -73,6 +73,7 @@ def run_trials(
     with ProcessPoolExecutor(workers, context, _start_worker, (steps,)) as pool:
         try:
             with outside_working_folder():
+                stop()  # once asked, a signal waits for its answer: it breaks no process off that is being started
                 running = {trial: pool.submit(_work, *trial) for trial in wanted}
             while not all(future.done() for future in running.values()):
                 if stop():

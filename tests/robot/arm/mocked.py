@@ -57,11 +57,11 @@ def config(host: str = HOST, *, realtime: bool = False, **changes: object) -> Ur
     return made.model_copy(update={"watchdog": 1.0, **changes})
 
 
-def until(done: Callable[[], bool], what: str, pause: float = 1e-3) -> float:
-    """Waits; returns when it was seen to be so, by the monotonic clock [s]."""
+def until(done: Callable[[], bool], what: str, pause: float = 1e-3, why: Callable[[], str] = str) -> float:
+    """Waits; returns when it was seen to be so, by the monotonic clock [s]. `why` tells how things stand, if not."""
     deadline = time.monotonic() + PATIENCE
     while not done():
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE} s"
+        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE} s; {why()}"
         time.sleep(pause)
     return time.monotonic()
 
@@ -78,7 +78,7 @@ def go(arm: URArm, target: Pose) -> None:
         assert not arm.status().is_fault, arm.explain()
         return arm.arrived(sent)
 
-    until(there, "arrival")
+    until(there, "arrival", why=lambda: f"{arm.explain()} at {arm.state()}; {sent} was asked")
 
 
 def in_motion(arm: URArm, target: Pose) -> float:

@@ -19,22 +19,27 @@ from tests.robot.cli.terminal import Terminal
 QUESTION = "Is the body in its place before the sensor, and everybody out of reach of the arm?"
 ASKING = f"""
 import time
+from pathlib import Path
 from robot.cli.output import busy, notes, progress
 from robot.cli.question import ask
 from robot.cli.interrupt import Interrupt
-def asked():
+def wait(moment):
+    while not Path(moment).exists():
+        time.sleep(0.01)
+def asked(moment):
     notes.print("on the way")
-    time.sleep(0.3)
+    wait(moment)
     notes.print("SAID " + str(ask({QUESTION!r})))
 with Interrupt() as interrupt:
     with progress() as bar:
         row = bar.add_task("starting slowly", total=12)
-        asked()
+        asked("started")
         for step in range(12):
             bar.update(row, description="the episode", completed=step)
             time.sleep(0.05)
+        wait("seen")
     with busy("tapping"):
-        asked()
+        asked("seen")
 """
 
 
@@ -49,11 +54,13 @@ def stays(screen: Terminal, words: str) -> None:
 def test_a_question_stays_on_the_screen_and_the_bar_goes_on_after_it(tmp_path: Path, columns: int) -> None:
     with Terminal(program=ASKING, folder=tmp_path, columns=columns) as screen:
         screen.wait_for("starting")
+        (tmp_path / "started").touch()
         screen.wait_for(f"{QUESTION} [y/N]:")
         stays(screen, f"{QUESTION} [y/N]:")
         screen.type("y\n")
         screen.wait_for("SAID True")
         screen.wait_for("the episode")
+        (tmp_path / "seen").touch()
         screen.until(lambda: screen.text.count("[y/N]:") == 2, "the second question")
         stays(screen, "[y/N]: ")
         screen.type("n\n")
@@ -67,6 +74,7 @@ def test_a_question_stays_on_the_screen_and_the_bar_goes_on_after_it(tmp_path: P
     ids=["Ctrl-C", "end of input", "nonsense, then Enter"],
 )
 def test_what_is_no_yes_ends_the_question(tmp_path: Path, typed: str, said: str) -> None:
+    (tmp_path / "started").touch()
     with Terminal(program=ASKING, folder=tmp_path) as screen:
         screen.wait_for(f"{QUESTION} [y/N]:")
         for part in re.findall(r"[^\n]*\n|[^\n]+", typed):
@@ -79,6 +87,7 @@ def test_a_yes_typed_before_the_question_is_no_answer(tmp_path: Path) -> None:
     with Terminal(program=ASKING, folder=tmp_path) as screen:
         screen.wait_for("on the way")
         screen.type("y\n")
+        (tmp_path / "started").touch()
         screen.wait_for(f"{QUESTION} [y/N]:")
         stays(screen, f"{QUESTION} [y/N]:")
         assert not screen.shows("SAID")

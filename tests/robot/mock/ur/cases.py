@@ -115,7 +115,8 @@ class Robot:
     def again(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """The second answer: the library returns at once what the registers held before."""
         call(*arguments)
-        time.sleep(0.3)
+        begun = self.receive.getTimestamp()
+        self.until(lambda: self.receive.getTimestamp() > begun + 0.2)
         return call(*arguments)
 
     @contextlib.contextmanager

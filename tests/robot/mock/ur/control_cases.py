@@ -114,7 +114,7 @@ def speeds(robot: Robot) -> None:
 
 @case(CONTROL, "setWatchdog kickWatchdog")
 def watchdog(robot: Robot) -> None:
-    assert robot.control.setWatchdog(2.0)
+    assert robot.control.setWatchdog(1.0)
     for _ in range(20):
         assert robot.control.kickWatchdog()
         time.sleep(0.05)

@@ -28,7 +28,7 @@ import json, os, time
 from rtde_receive import RTDEReceiveInterface
 from rtde_control import RTDEControlInterface
 found = {}
-def ends(receive, test, limit=20):
+def ends(receive, test, limit=60):
     end = time.monotonic() + limit
     while not test():
         assert time.monotonic() < end, "not in time"
@@ -90,7 +90,9 @@ def test_control_moves_and_answers(mock: MockUR) -> None:
         found["trans"], found["steady"] = c.poseTrans([1, 0, 0, 0, 0, 0], [0, 2, 0, 0, 0, 0]), c.isSteady()
         def second(call, *arguments):
             # The wheel does not wait for the answers of these: it returns what the registers held before.
-            call(*arguments); time.sleep(0.2)
+            call(*arguments)
+            begun = r.getTimestamp()
+            ends(r, lambda: r.getTimestamp() > begun + 0.2)
             return call(*arguments)
         found["flange"], found["step"] = second(c.getActualToolFlangePose), second(c.getStepTime)
         found["torque"], found["history"] = second(c.getJointTorques), second(c.getActualJointPositionsHistory, 10)

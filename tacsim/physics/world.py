@@ -26,6 +26,10 @@ class World(Protocol):
         """world_from_sensor (or world_from_indenter for "indenter")."""
         ...
 
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        """Puts the named frames elsewhere at once, at rest: for a world in which nothing touches, here or there."""
+        ...
+
     def move(
         self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
         *, flow: bool = False,

@@ -16,8 +16,9 @@ from tacsim.sim.clock import SimClock
 from tacsim.sim.sensor import SimSensor
 from tacsim.sim.stage import Stage, StatePool
 
-CLEARANCE = 0.05e-3  # gap that the first, fast part of an approach leaves [m]
-FIRST_STEP = 0.1e-3  # of the slow part [m]
+CLEARANCE = 0.05e-3  # gap that an approach begins at [m]
+FIRST_TOUCH = 0.01e-3  # its first step, beyond that gap: flat bodies then press with about 0.05 N [m]
+FIRST_STEP = 0.1e-3  # its longest [m]
 TOUCH_TOLERANCE = 0.2  # the touch force may be exceeded by this fraction
 MOST_MOVES = 80  # of one approach
 SMALLEST_STEP = 1e-8  # an approach that needs finer steps has met something that never gives a gentle force [m]
@@ -54,7 +55,7 @@ class SimReset:
         if self._offset.any():
             shift = np.append(self._offset, 0.0)
             poses = {name: stage.pose(name) for name in stage.sensors}
-            stage.move({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
+            stage.place({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
         self._clock.restart()
         for sensor in self._sensors.values():
             sensor.restart(seed)
@@ -78,19 +79,19 @@ class SimReset:
 def approach_force(world: World, touch_force: float) -> MoveStats | None:
     """Moves all sensors along their own z until the least normal force is at least `touch_force` [N].
 
-    A fast part closes the known gaps; small steps follow. A step after which a force exceeds
+    Known gaps are closed at once; small steps follow. A step after which a force exceeds
     touch_force * (1 + TOUCH_TOLERANCE) is undone by restoring the world, so that the body keeps no trace of it, and its
     end bounds the steps that follow. Returns how the last move went, None if there was none. Raises NoTouch.
     """
     most = touch_force * (1 + TOUCH_TOLERANCE)
-    stats = _close_gaps(world, most)
+    begins, stats = _close_gaps(world, most), None
     here, bound = 0.0, math.inf  # travelled by each sensor; where the force is too large [m]
     tried = [(here, _least_force(world))]  # (distance, force) of every state tried
     step = 0.0
     for _ in range(MOST_MOVES):
         if tried[-1][0] == here and tried[-1][1] >= touch_force:
             return stats
-        step = _next_distance(tried, here, bound, touch_force * (1 + TOUCH_TOLERANCE / 2)) - here
+        step = _next_distance(tried, here, bound, touch_force * (1 + TOUCH_TOLERANCE / 2), begins) - here
         if step < SMALLEST_STEP:
             break
         before = world.snapshot()
@@ -108,26 +109,32 @@ def approach_force(world: World, touch_force: float) -> MoveStats | None:
     )
 
 
-def _next_distance(tried: list[tuple[float, float]], here: float, bound: float, wanted: float) -> float:
+def _next_distance(
+    tried: list[tuple[float, float]], here: float, bound: float, wanted: float, begins: float | None
+) -> float:
     """The distance [m] at which the force `wanted` [N] is expected, between `here` and `bound`: on the secant through
-    the last two states in contact. With one such state, contact is taken to begin half-way to it."""
+    the last two states in contact. One of them may be that in which contact `begins`; where that is not known, it is
+    taken to be half-way to the first state in contact."""
     farthest = min(bound, here + FIRST_STEP)
     contacts = [(distance, force) for distance, force in tried if force > 0][-2:]
     if not contacts:
-        return farthest
+        return farthest if begins is None or here > 0.0 else min(farthest, begins + FIRST_TOUCH)
+    if len(contacts) == 1 and begins is not None and contacts[0][0] > begins:
+        contacts.insert(0, (begins, 0.0))
     x, force = contacts[-1]
     if len(contacts) == 2 and (force - contacts[0][1]) * (x - contacts[0][0]) > 0:
         aim = x + (wanted - force) * (x - contacts[0][0]) / (force - contacts[0][1])
     else:
         aim = here + (x - here) * (0.5 + 0.5 * wanted / force) if force > wanted else farthest
-    margin = 0.05 * (farthest - here)
+    margin = 0.01 * (farthest - here)
     return min(max(aim, here + margin), farthest if bound > farthest else farthest - margin)
 
 
-def _close_gaps(world: World, most: float) -> MoveStats | None:
-    """Drives each sensor to CLEARANCE before the body's nearest particle, if there is a body and a gap.
+def _close_gaps(world: World, most: float) -> float | None:
+    """Puts each sensor at CLEARANCE before the body's nearest particle, if there is a body and a gap.
 
-    Undone if the force exceeds `most` [N]: on a shared grid, contact begins at a distance.
+    Returns how far from there contact begins [m], None where that is not known. Undone if the force exceeds `most` [N]:
+    on a shared grid, contact begins at a distance.
     """
     truth = world.truth()
     if truth is None:
@@ -137,11 +144,11 @@ def _close_gaps(world: World, most: float) -> MoveStats | None:
     if not wanted:
         return None
     before = world.snapshot()
-    stats = _advance(world, wanted)
+    world.place({name: se3.along_z(world.pose(name), gap) for name, gap in wanted.items()})
     if _least_force(world) > most:
         world.restore(before)
         return None
-    return stats
+    return CLEARANCE if len(wanted) == len(gaps) else None
 
 
 def _gap(truth: Truth, sensor: Pose) -> float:
@@ -152,9 +159,9 @@ def _gap(truth: Truth, sensor: Pose) -> float:
     return float(((points - sensor.position) @ axis).min()) - radius
 
 
-def _advance(world: World, steps: Mapping[str, float]) -> MoveStats:
+def _advance(world: World, steps: Mapping[str, float], *, flow: bool = False) -> MoveStats:
     """Moves each named sensor along its own z by its step [m]."""
-    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()})
+    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()}, flow=flow)
 
 
 def _least_force(world: World) -> float:

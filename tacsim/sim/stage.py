@@ -59,6 +59,9 @@ class Stage:
     def pose(self, name: str) -> Pose:
         return self.world().pose(name)
 
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        self.world().place(poses)
+
     def move(
         self, targets: Mapping[str, Pose], loads: Mapping[str, float] | None = None, duration: float | None = None,
         *, flow: bool = False,

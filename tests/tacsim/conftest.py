@@ -55,6 +55,9 @@ class SpringWorld:
     def pose(self, name: str) -> Pose:
         return self.poses[name]
 
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        self.poses |= poses
+
     def move(
         self, targets: Mapping[str, Pose], loads: None = None, duration: float | None = None, *, flow: bool = False
     ) -> MoveStats:

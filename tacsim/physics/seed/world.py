@@ -142,6 +142,10 @@ class SeedWorld(BaseWorld):
         to_sensor = _rotation(self._poses[name]).inv()
         return np.concatenate([to_sensor.apply(reaction[:3]), to_sensor.apply(reaction[3:]) / MM])
 
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        """See World. The gels' particles lie in the world, so it is a motion."""
+        self.move(poses)
+
     def surface(self, name: str) -> GelSurface:
         """Displacement of the top layer of particles, half a layer below the rest surface."""
         nx, ny, _ = self._lattice.count

@@ -105,6 +105,11 @@ class FemWorld(BaseWorld):
         self._poses = restore_arrays({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
         self._use_inertia(self._true if numbers["true_inertia"] else self._scaled)
 
+    def place(self, poses: Mapping[str, Pose]) -> None:
+        """See World. A gel goes along as it is, in its sensor's frame."""
+        self._poses = resolve_targets(self._poses, poses)
+        self._rates[...] = 0.0
+
     def wrench(self, name: str) -> NDArray[np.float64]:
         first = FORCE + 6 * self._sensor(name)
         wrench: NDArray[np.float64] = (

@@ -342,3 +342,21 @@ def test_a_pool_keeps_the_states_used_last() -> None:
     assert pool.find("a") == (state, None)
     pool.keep("c", state, None)
     assert pool.find("b") is None and pool.find("a") is not None and pool.find("c") is not None
+
+
+@pytest.mark.parametrize("shape", ["flat", "ball"])
+def test_an_approach_that_knows_its_gap_takes_few_steps(
+    spring_world: Any, monkeypatch: pytest.MonkeyPatch, shape: str
+) -> None:
+    """A gap is closed at once, for nothing touches. Then contact is sought just behind it: a flat body needs two
+    steps, a ball (force ~ d^1.5) three more."""
+
+    def force(self: Any) -> float:
+        gap = self.poses["upper"].position[2] - self.poses["lower"].position[2]
+        depth = max(0.0, (10e-3 - gap) / 2)
+        return 8e3 * depth if shape == "flat" else 2e4 * depth**1.5
+
+    monkeypatch.setattr(type(spring_world), "force", property(force))
+    approach_force(spring_world, 0.05)
+    assert 0.05 <= spring_world.force <= 0.06
+    assert len(spring_world.moves) <= (2 if shape == "flat" else 5)

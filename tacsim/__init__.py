@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import UrArmConfig as UrArmConfig
     from tacsim.models.hardware import Workspace as Workspace
     from tacsim.models.randomisation import Randomisation as Randomisation
+    from tacsim.models.rig import KneadConfig as KneadConfig
     from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
     from tacsim.models.rig import ReplaySensorConfig as ReplaySensorConfig
     from tacsim.models.rig import RepositionConfig as RepositionConfig
@@ -98,6 +99,7 @@ if TYPE_CHECKING:
     from tacsim.report.report import write_report as write_report
     from tacsim.rig import Reset as Reset
     from tacsim.rig import Rig as Rig
+    from tacsim.tasks import Knead as Knead
     from tacsim.tasks import Outcome as Outcome
     from tacsim.tasks import Reposition as Reposition
     from tacsim.tasks import Squeeze as Squeeze

@@ -36,7 +36,8 @@ def run(
         str, typer.Argument(help="A rig (sim, mock, ur5e, ur5e-one, replay), or the path of its file.")
     ] = "sim",
     task: Annotated[
-        str | None, typer.Option(help="squeeze, reposition, or the path of a task file.", show_default="the rig's own")
+        str | None,
+        typer.Option(help="squeeze, reposition, knead, or the path of a task file.", show_default="the rig's own"),
     ] = None,
     policy: Annotated[
         str | None,

@@ -153,7 +153,7 @@ def _meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
         spec=rig.spec,
         versions=versions(),
         attachments={**setup.attachments, **reference_attachments(rig.references)},
-        goal=None if task is None else task.config.goal,
+        goal=None if task is None else task.goal,
         started=datetime.now().astimezone(),
         wall_offset=time.time_ns() - round(1e9 * rig.now()),
     )

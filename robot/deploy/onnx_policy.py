@@ -50,7 +50,7 @@ class OnnxPolicy:
     Raises PolicyNotFound for a file that is no such policy, IncompatibleRig for one whose maps do not fit the grid.
     """
 
-    def __init__(self, path: Path, canonical: CanonicalGrid, goal: float | tuple[float, float] | None) -> None:
+    def __init__(self, path: Path, canonical: CanonicalGrid, goal: float | tuple[float, ...] | None) -> None:
         self._session = _session(path)
         self.spec = _spec(path, self._session)
         self._name, self._goal = path.name, goal

@@ -34,7 +34,7 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
 
         return Grip(spec)
     if name.endswith(".onnx"):
-        return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.config.goal)
+        return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.goal)
     if ":" not in name:
         allowed = "'scripted', 'grip', 'path/to/file.onnx', or 'package.module:attribute'"
         raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}")

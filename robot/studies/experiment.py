@@ -203,7 +203,7 @@ def _trial(
         reward=[-distance / task.config.reward_scale for distance in distances],
         distance=distances,
         image_difference=differences,
-        goal=task.config.goal,
+        goal=task.goal,
         moments=[moments[k] for k in shown],
         pitch=config.canonical.pitch,
         gel_size=config.scene.gel.size,

@@ -15,7 +15,7 @@ from pydantic_core import core_schema
 
 from tacsim.config.errors import did_you_mean
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
+from tacsim.models.rig import KneadConfig, RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
 from tacsim.models.scene import BodyMaterial, GelMaterial, Scene
 from tacsim.models.sensor import SensorModel
 
@@ -36,7 +36,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind("rig", "rigs", (RigConfig,), RigConfig),
-        Kind("task", "tasks", (SqueezeConfig, RepositionConfig), TaskConfig),
+        Kind("task", "tasks", (SqueezeConfig, RepositionConfig, KneadConfig), TaskConfig),
         Kind("scene", "scenes", (Scene,), Scene),
         Kind("sensor", "sensors", (SensorModel,), SensorModel),
         Kind("randomisation", "randomisations", (Randomisation,), Randomisation),

@@ -64,10 +64,17 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     for override in of_rest:
         root = apply(root, RigConfig, override, state)
     root = _absolute_calibrations(_check_scene(root, own_scene, state))
-    config = _validate(RigConfig, root, state)
+    config = _with_one_scene(_validate(RigConfig, root, state))
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
     return LoadedRig(config, tuple(dict.fromkeys(state.sources)))
+
+
+def _with_one_scene(config: RigConfig) -> RigConfig:
+    """The task speaks of the body that is simulated: where a rig has a scene, its task has the same."""
+    if config.scene is None or config.task is None or config.task.scene == config.scene:
+        return config
+    return config.model_copy(update={"task": config.task.model_copy(update={"scene": config.scene})})
 
 
 def _require_limits(config: RigConfig, file: RigConfig) -> None:

@@ -31,6 +31,7 @@ from tacsim import pose as se3
 from tacsim.features.encoder import FeatureEncoder
 from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.tasks import make_task
 
 Flat = dict[str, NDArray[Any]]
 
@@ -135,7 +136,7 @@ def space_of_features(encoder: FeatureEncoder, config: RigConfig) -> spaces.Spac
         shapes["touch"] = (numbers["touch"],)
     if features.goal:
         assert config.task is not None
-        shapes["goal"] = np.atleast_1d(config.task.goal).shape
+        shapes["goal"] = np.atleast_1d(make_task(config.task).goal).shape
     space: spaces.Space[Any] = spaces.Dict(
         {key: spaces.Box(-FARTHEST, FARTHEST, shape, np.float32) for key, shape in shapes.items()}
     )

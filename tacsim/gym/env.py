@@ -28,6 +28,7 @@ from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
 from tacsim.tasks import make_task
 from tacsim.tasks.action import action_from
+from tacsim.tasks.effort import Effort
 from tacsim.tasks.task import Task, judge
 
 Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
@@ -51,7 +52,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     An episode terminates only when a limit of an arm is exceeded (info["limit"] says which). It is truncated after the
     task's steps, or when the simulation diverges (info["diverged"] says why; the observation is the last good one).
 
-    info: distance [m], is_success, score, body_height [m], and the rig's diagnostics; with variants also `variant`, the
+    info: distance [m], is_success, score, body_height [m], peak_force [N] and work [J] of the arms since reset, the
+    rig's diagnostics, and at the end what else the task measures; with variants also `variant`, the
     number of the one that is played, and at reset `drawn`, what it consists of.
 
     Args:
@@ -152,8 +154,9 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         observation = self.rig.reset(seed)
         self._targets: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}  # last sent there
         self._truth_at_start = self._truth()
+        self._effort = Effort(observation.arms)
         self._count, self.phase = 0, "running"
-        self._flat: encode.Flat = self._view.begin(observation, self.task.config.goal)
+        self._flat: encode.Flat = self._view.begin(observation, self.task.goal)
 
     def _truth(self) -> Truth:
         truth = self.rig.truth()
@@ -215,6 +218,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             self._done = flat, reward, exceeded, not exceeded, info
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
+        self._effort.add(observation.arms)
         self._flat = self._view(observation)
         truncated = self._count >= self.task.config.steps
         if truncated:
@@ -230,9 +234,13 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             "is_success": outcome.success,
             "score": outcome.score,
             "body_height": truth.height,
+            "peak_force": self._effort.peak,
+            "work": self._effort.work,
         }
         if self._played is not None:
             info["variant"] = self._played
+        if self.phase == "over":
+            info |= self.task.measures(truth, self._truth_at_start)
         return outcome.reward, info | dict(self.rig.diagnostics())
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 
-ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposition"}
+ENVIRONMENTS = {"tacsim/Squeeze-v0": "squeeze", "tacsim/Reposition-v0": "reposition", "tacsim/Knead-v0": "knead"}
 
 
 def make_env(**options: Any) -> Any:

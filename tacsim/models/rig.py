@@ -88,7 +88,23 @@ class RepositionConfig(Config):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40
 
 
-TaskConfig = Annotated[SqueezeConfig | RepositionConfig, Field(discriminator="kind")]
+class KneadConfig(Config):
+    """Knead the body to a rod or a ball of its volume: distance = Chamfer's, between them; actions move both sensors
+    along world z, and the upper one in x, y."""
+
+    kind: Literal["knead"]
+    scene: Scene = Scene()
+    shape: Literal["rod", "ball"] = "rod"  # a rod lies along world x
+    slenderness: Annotated[float, Field(ge=0.5, le=10)] = 2.0  # of a rod: length over diameter
+    max_step: Annotated[Length, Field(gt=0)] = 0.5e-3
+    touch_force: Annotated[Force, Field(gt=0)] = 0.2
+    placement: Annotated[Length, Field(ge=0)] = 0.0
+    success: Annotated[Length, Field(gt=0)] = 0.2e-3
+    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
+
+
+TaskConfig = Annotated[SqueezeConfig | RepositionConfig | KneadConfig, Field(discriminator="kind")]
 
 
 SimMotion = Literal["settled", "flowing", "dynamic"]

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from tacsim.models.rig import SqueezeConfig, TaskConfig
+from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, TaskConfig
+from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
 from tacsim.tasks.task import Axis, Outcome, Task, judge, tolerance
 
-__all__ = ["Axis", "Outcome", "Reposition", "Squeeze", "Task", "judge", "make_task", "tolerance"]
+__all__ = ["Axis", "Knead", "Outcome", "Reposition", "Squeeze", "Task", "judge", "make_task", "tolerance"]
 
 
 def make_task(config: TaskConfig) -> Task:
     """The task that `config` describes."""
-    return Squeeze(config) if isinstance(config, SqueezeConfig) else Reposition(config)
+    match config:
+        case SqueezeConfig():
+            return Squeeze(config)
+        case RepositionConfig():
+            return Reposition(config)
+        case KneadConfig():
+            return Knead(config)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,9 +31,20 @@ class Reposition:
     def axes(self) -> tuple[Axis, ...]:
         return (Axis("upper", (1.0, 0.0, 0.0)), Axis("upper", (0.0, 1.0, 0.0)))
 
+    @property
+    def goal(self) -> tuple[float, float]:
+        return self.config.goal
+
     def distance(self, truth: Truth, start: Truth) -> float:
         moved = truth.position[:2] - start.position[:2]
         return math.hypot(moved[0] - self.config.goal[0], moved[1] - self.config.goal[1])
+
+    def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
+        return {}
+
+    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
+        now, then = estimated_position(observation), estimated_position(start)
+        return None if now is None or then is None else float(np.linalg.norm(now - then - np.array(self.config.goal)))
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedReposition(self.config, through)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +28,19 @@ class Squeeze:
     def axes(self) -> tuple[Axis, ...]:
         return (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (0.0, 0.0, 1.0)))
 
+    @property
+    def goal(self) -> float:
+        return self.config.goal
+
     def distance(self, truth: Truth, start: Truth) -> float:
         return abs(truth.height - self.config.goal)
+
+    def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
+        return {}
+
+    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
+        felt = all(touch.contact.any() for touch in observation.tactile.values())
+        return abs(estimated_height(observation) - self.config.goal) if felt else None
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedSqueeze(self.config, through)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from tacsim.interface import Needs, Policy, Truth
+from tacsim.interface import Needs, Observation, Policy, Truth
 from tacsim.models.rig import TaskConfig
 
 
@@ -30,8 +31,22 @@ class Task(Protocol):
 
     @property
     def axes(self) -> tuple[Axis, ...]: ...
+    @property
+    def goal(self) -> float | tuple[float, ...]:
+        """In numbers [m]: what a learned policy is told."""
+        ...
+
     def distance(self, truth: Truth, start: Truth) -> float:
         """Distance of the body from the goal [m]; `start` is the truth just after reset."""
+        ...
+
+    def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
+        """What else is said of the body at the end of an episode."""
+        ...
+
+    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
+        """The same distance by touch alone, as it can be known on hardware; `start` is the first observation of the
+        episode, `pitch` that of the canonical grid [m]. None where nothing is felt that tells it."""
         ...
 
     def scripted(self, *, through: bool = False) -> Policy:

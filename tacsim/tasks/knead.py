@@ -1,0 +1,136 @@
+"""Knead: make a rod or a ball of the body, the gels as hands: both sensors along world z, the upper one in x, y."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tacsim.geometry import shapes
+from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, Truth
+from tacsim.models.rig import KneadConfig
+from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spread
+from tacsim.tasks.squeeze import estimated_height
+from tacsim.tasks.task import Axis
+
+GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
+
+
+@dataclass(frozen=True)
+class Knead:
+    """distance = Chamfer's between the body and the solid, both at one place."""
+
+    config: KneadConfig
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(arms=frozenset({"lower", "upper"}), truth=True)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        return (
+            Axis("lower", (0.0, 0.0, 1.0)),
+            Axis("upper", (0.0, 0.0, 1.0)),
+            Axis("upper", (1.0, 0.0, 0.0)),
+            Axis("upper", (0.0, 1.0, 0.0)),
+        )
+
+    @property
+    def goal(self) -> tuple[float, ...]:
+        """Size of the solid along world x, y, z [m]."""
+        return tuple(float(side) for side in self.solid.size)
+
+    @cached_property
+    def volume(self) -> float:
+        """Of the body [m^3]."""
+        body = self.config.scene.body
+        if body is None:
+            raise ValueError("task 'knead' needs a scene with a body, whose volume its solid has")
+        return shapes.volume(body.geometry)
+
+    @cached_property
+    def solid(self) -> Solid:
+        rod = self.config.shape == "rod"
+        return Solid.rod(self.volume, self.config.slenderness) if rod else Solid.ball(self.volume)
+
+    def distance(self, truth: Truth, start: Truth) -> float:
+        return chamfer(centred(truth.points), self.solid, self.volume)
+
+    def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
+        """How alike body and solid are in other words: `earth_movers` [m], `iou` [-], and of each the improvement
+        since `start`: 0 none (or worse), 1 all."""
+        now, then = (self._measured(each) for each in (truth, start))
+        better = {
+            "chamfer": 1.0 - now["chamfer"] / then["chamfer"],
+            "earth_movers": 1.0 - now["earth_movers"] / then["earth_movers"],
+            "iou": (now["iou"] - then["iou"]) / (1.0 - then["iou"]),
+        }
+        return now | {f"{name}_improvement": max(0.0, share) for name, share in better.items()}
+
+    def _measured(self, truth: Truth) -> dict[str, float]:
+        body = centred(truth.points)
+        return {
+            "chamfer": chamfer(body, self.solid, self.volume),
+            "earth_movers": earth_movers(spread(body), self.solid.spread),
+            "iou": iou(body, self.solid),
+        }
+
+    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
+        return None  # two contacts of one moment do not tell how round or how long a body is
+
+    def scripted(self, *, through: bool = False) -> Policy:
+        return ScriptedKnead(self, through)
+
+
+class ScriptedKnead:
+    """Rolls the body between the gels, a quarter turn to each side, at a light normal force: for a rod across its axis,
+    for a ball in ever other directions. It lets go when the estimated height is that of the solid; with `through` it
+    goes on rolling.
+
+    pressure: the force that it holds, over the face of a cube of the body's volume [Pa]. Well below the yield stress it
+    kneads nothing; clay that is pressed harder is flattened, not rolled.
+    """
+
+    gain = 0.05e-3  # correction of the height for a newton too little or too much [m/N]
+
+    def __init__(self, task: Knead, through: bool, pressure: float = 12e3) -> None:
+        self._task, self._through = task, through
+        self._force = pressure * task.volume ** (2 / 3)
+        # The body turns by half of the sensor's way over its own radius.
+        self._reach = 0.5 * np.pi * task.goal[2]
+        self._start: FloatArray | None = None
+        self._way = 0.0
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(sensors=frozenset({"lower", "upper"}), arms=frozenset({"lower", "upper"}), height=True)
+
+    def reset(self) -> None:
+        self._start, self._way = None, 0.0
+
+    def __call__(self, observation: Observation) -> Action:
+        lower, upper = observation.arms["lower"], observation.arms["upper"]
+        if self._start is None:
+            self._start = np.array(upper.pose.position)
+        longest = self._task.config.max_step
+        self._way += 0.9 * longest
+        force = -0.5 * float(lower.wrench[2] + upper.wrench[2])
+        closer = float(np.clip(self.gain * (self._force - force), -longest, longest))
+        if not self._through and estimated_height(observation) <= self._task.goal[2]:
+            closer = -0.2 * longest
+        beside = np.clip(self._start[:2] + self._path() - upper.pose.position[:2], -longest, longest)
+        return Action(
+            {
+                "lower": Pose(lower.pose.position + [0.0, 0.0, closer], lower.pose.quaternion),
+                "upper": Pose(upper.pose.position + [*beside, -closer], upper.pose.quaternion),
+            }
+        )
+
+    def _path(self) -> FloatArray:
+        """(2,) where the upper sensor is now, from where it began [m]: to and fro through the middle."""
+        strokes, part = divmod(self._way / self._reach, 4.0)
+        there = part if part <= 1.0 else 2.0 - part if part <= 3.0 else part - 4.0
+        turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * strokes
+        return self._reach * there * np.array([np.cos(turn), np.sin(turn)])

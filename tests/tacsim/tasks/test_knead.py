@@ -1,0 +1,112 @@
+"""Kneading: the solid of the body's volume, and a scripted policy that makes it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from robot.open import open_rig
+from tacsim.config import load_rig
+from tacsim.interface import Truth
+from tacsim.models.rig import KneadConfig
+from tacsim.models.scene import Body, Box, Indenter, Scene
+from tacsim.tasks import judge, make_task
+from tacsim.tasks.action import action_from
+
+QUICK = [
+    "scene.preset=learn",
+    "motion=flowing",
+    *(
+        f"sensors.{n}.model.geometry.{w}"
+        for n in ("lower", "upper")
+        for w in ("width=16", "height=16", "pixel_pitch=1 mm")
+    ),
+]
+
+
+def cube(side: float, spacing: float = 0.5e-3) -> Truth:
+    axis = np.arange(spacing / 2, side, spacing)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) + [0.1, 0.2, 0.3]
+    return Truth(side, points.mean(axis=0), points.astype(np.float32), {})
+
+
+def config(**changed: Any) -> KneadConfig:
+    return KneadConfig(kind="knead", scene=Scene(body=Body(geometry=Box(size=(8e-3, 8e-3, 8e-3)))), **changed)
+
+
+def test_the_solid_has_the_bodys_volume_and_its_size_is_the_goal() -> None:
+    length, width, height = make_task(config(slenderness=3.0)).goal  # type: ignore[misc]
+    assert np.pi / 4 * width * height * length == pytest.approx(512e-9)
+    assert length / width == pytest.approx(3.0)
+    assert make_task(config(shape="ball")).goal == pytest.approx([(6 * 512e-9 / np.pi) ** (1 / 3)] * 3)
+
+
+def test_a_rig_with_another_body_kneads_that_one() -> None:
+    loaded = load_rig(
+        "sim", task="knead", overrides=["task.shape=ball", "scene.body.geometry.size=[6 mm, 6 mm, 10 mm]"]
+    )
+    assert loaded.config.task is not None
+    assert make_task(loaded.config.task).goal == pytest.approx([(6 * 360e-9 / np.pi) ** (1 / 3)] * 3)
+
+
+def test_a_cube_is_judged_where_it_lies() -> None:
+    task = make_task(config(shape="ball"))
+    outcome = judge(task, cube(8e-3), cube(8e-3))
+    assert 0 < outcome.distance < 0.1e-3 and outcome.success
+    measures = task.measures(cube(8e-3), cube(8e-3))
+    assert measures["chamfer"] == outcome.distance
+    assert measures["iou"] == pytest.approx(0.726, abs=0.02)  # tests/tacsim/tasks/test_solids.py
+    assert {measures[f"{name}_improvement"] for name in ("chamfer", "earth_movers", "iou")} == {0.0}
+
+
+def test_without_a_body_there_is_nothing_to_knead() -> None:
+    scene = Scene(body=None, indenter=Indenter())
+    with pytest.raises(ValueError, match="needs a scene with a body"):
+        _ = make_task(KneadConfig(kind="knead", scene=scene)).goal
+
+
+def kneaded(steps: int, policy: str, *overrides: str) -> dict[str, float]:
+    """What an episode of so many steps ends with."""
+    loaded = load_rig("sim", task="knead", overrides=[*QUICK, *overrides])
+    assert loaded.config.task is not None
+    task, random = make_task(loaded.config.task), np.random.default_rng(1)
+    with open_rig(loaded) as rig:
+        observation = rig.reset(0)
+        start, acts = rig.truth(), task.scripted(through=True)
+        for _ in range(steps):
+            poses = {name: arm.pose for name, arm in observation.arms.items()}
+            vector = random.uniform(-1, 1, 4) * [0.2, 0.2, 1, 1]
+            action = acts(observation) if policy == "scripted" else action_from(vector, task.axes, 0.5e-3, poses)
+            observation, _ = rig.step(action)
+        truth = rig.truth()
+    assert truth is not None and start is not None
+    return dict(task.measures(truth, start))
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize(
+    ("overrides", "least"),
+    [((), 0.25), (("task.shape=ball", "scene.body.geometry.size=[6 mm, 6 mm, 10 mm]"), 0.5)],
+    ids=["rod", "ball"],
+)
+def test_the_scripted_policy_kneads_where_a_random_one_does_not(overrides: tuple[str, ...], least: float) -> None:
+    scripted, random = (kneaded(100, policy, *overrides)["chamfer_improvement"] for policy in ("scripted", "random"))
+    assert scripted > least
+    assert scripted > 2 * random
+
+
+def test_its_environment_measures_at_the_end() -> None:
+    env = gymnasium.make(
+        "tacsim/Knead-v0", overrides=[*QUICK, "task.steps=2"], features={"grid": {"rows": 8, "columns": 8}}
+    )
+    observation, info = env.reset(seed=1)
+    assert env.action_space.shape == (4,) and observation["goal"].shape == (3,)
+    assert "iou" not in info and info["peak_force"] > 0 and info["work"] == 0.0
+    *_, truncated, info = env.step(np.array([1, -1, 0, 0.5], np.float32))
+    assert not truncated and "iou" not in info and info["work"] > 0
+    *_, truncated, info = env.step(np.array([0, 0, 0, 0.5], np.float32))
+    assert truncated and 0 < info["iou"] < 1 and info["chamfer"] == info["distance"]
+    env.close()

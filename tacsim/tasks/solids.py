@@ -1,4 +1,4 @@
-"""How far a kneaded body is from a solid of equal volume: Chamfer distance, earth mover's distance, and intersection over union (IoU).
+"""How far a kneaded body is from a solid of equal volume: Chamfer and earth mover's distance, intersection over union.
 
 A body is a cloud of particles (n, 3) [m], each of the volume V / n. It is compared with its centre of mass at the
 solid's. Of the three measures Huang et al. 2021 (PlasticineLab) report the IoU, Lin et al. 2022 (DiffSkill) the

@@ -49,8 +49,10 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     Actions: Box(-1, 1), one component for each free axis of the task, in units of its max_step from where the arm was
     last sent.
 
-    An episode terminates only when a limit of an arm is exceeded (info["limit"] says which). It is truncated after the
-    task's steps, or when the simulation diverges (info["diverged"] says why; the observation is the last good one).
+    An episode terminates only when a limit of an arm, or the task's force_limit, is exceeded (info["limit"] says
+    which). Its last reward then stands for all steps that are left too, each at most -1: no end is better than going
+    on. It is truncated after the task's steps, or when the simulation diverges (info["diverged"] says why; the
+    observation is the last good one).
 
     info: distance [m], is_success, score, body_height [m], peak_force [N] and work [J] of the arms since reset, the
     rig's diagnostics, and at the end what else the task measures; with variants also `variant`, the
@@ -215,16 +217,24 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             reward, info = self._judged()
             flat = {key: value.copy() for key, value in self._flat.items()}
             info |= {"limit" if exceeded else "diverged": str(self._failure)}
-            self._done = flat, reward, exceeded, not exceeded, info
+            self._done = flat, self._for_all_left(reward) if exceeded else reward, exceeded, not exceeded, info
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
         self._effort.add(observation.arms)
         self._flat = self._view(observation)
-        truncated = self._count >= self.task.config.steps
-        if truncated:
+        most, peak = self.task.config.force_limit, self._effort.peak
+        failed = most is not None and peak > most
+        truncated = not failed and self._count >= self.task.config.steps
+        if failed or truncated:
             self.phase = "over"
         reward, info = self._judged()
-        self._done = self._flat, reward, False, truncated, info
+        if failed:
+            info |= {"limit": f"a normal force of {peak:.2f} N, beyond the task's force_limit of {most:g} N"}
+            info["is_success"], reward = False, self._for_all_left(reward)
+        self._done = self._flat, reward, failed, truncated, info
+
+    def _for_all_left(self, reward: float) -> float:
+        return reward + (self.task.config.steps - self._count) * min(reward, -1.0)
 
     def _judged(self) -> tuple[float, dict[str, Any]]:
         truth = self._truth()

@@ -68,6 +68,7 @@ class SqueezeConfig(Config):
     placement: Annotated[Length, Field(ge=0)] = 0.0  # reset starts at most this far beside the body, by the seed [m]
     success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3  # reward = -distance / reward_scale
+    force_limit: Annotated[Force, Field(gt=0)] | None = None  # of a normal force: beyond it an episode has failed
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
 
 
@@ -85,6 +86,7 @@ class RepositionConfig(Config):
     placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.1e-3
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
+    force_limit: Annotated[Force, Field(gt=0)] | None = None
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40
 
 
@@ -101,6 +103,7 @@ class KneadConfig(Config):
     placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.2e-3
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
+    force_limit: Annotated[Force, Field(gt=0)] | None = None
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
 
 

@@ -198,7 +198,10 @@ def test_a_file_that_is_not_there_lists_the_names() -> None:
     )
     assert complaint(load_rig, "my/rig.yaml") == "my/rig.yaml: there is no file 'my/rig.yaml'"
     wrong_task = complaint(load_rig, "sim", task="sqeeze")
-    assert wrong_task == "--task sqeeze: task: no task 'sqeeze'; allowed: reposition, squeeze; did you mean 'squeeze'?"
+    assert (
+        wrong_task
+        == "--task sqeeze: task: no task 'sqeeze'; allowed: knead, reposition, squeeze; did you mean 'squeeze'?"
+    )
 
 
 # Hostile files

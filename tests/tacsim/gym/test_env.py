@@ -133,6 +133,26 @@ def test_divergence_truncates_and_says_why(open_springs: Any, monkeypatch: pytes
     assert env.step(STILL)[3] is False
 
 
+def test_too_much_force_fails_the_task_and_no_end_is_better_than_going_on(open_springs: Any) -> None:
+    env = TacsimEnv(open_springs(), make_task(SqueezeConfig(kind="squeeze", steps=20, force_limit=1.0)))
+    env.reset(seed=0)
+    count = 0
+    terminated = False
+    while not terminated:
+        count += 1
+        flat, reward, terminated, truncated, info = env.step(np.array([1.0, -1.0], np.float32))
+        if not terminated:
+            assert info["peak_force"] <= 1.0 and "limit" not in info
+            assert reward == pytest.approx(-info["distance"] / 1e-3)
+    assert count < 20 and not truncated and info["peak_force"] > 1.0
+    assert "beyond the task's force_limit of 1 N" in info["limit"] and info["is_success"] is False
+    assert -flat["wrench_upper"][2] == pytest.approx(info["peak_force"])
+    now = -info["distance"] / 1e-3
+    assert reward == pytest.approx(now + (20 - count) * min(now, -1.0))
+    with pytest.raises(ResetNeeded):
+        env.step(STILL)
+
+
 def test_a_limit_that_is_exceeded_ends_the_episode_and_says_which(open_springs: Any) -> None:
     box = "workspace: {lower: [-1 m, -1 m, -1 m], upper: [1 m, 1 m, 1 m]}"
     rig = open_springs("squeeze", f"arms.upper.limits={{{box}, force: 1 N}}")

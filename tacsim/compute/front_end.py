@@ -44,7 +44,7 @@ def quicken(kernel_impl: Any, context: Any, builder: Any) -> None:
         kernel_impl.getsourcefile = cache(kernel_impl.getsourcefile)
     if hasattr(kernel_impl, "ast") and hasattr(kernel_impl, "textwrap"):
         kernel_impl.ast = SimpleNamespace(**{**vars(ast), "parse": _parse})
-        kept = {"fill": cache(textwrap.fill), "dedent": lru_cache(maxsize=None)(textwrap.dedent)}
+        kept = {"fill": cache(textwrap.fill), "dedent": cache(textwrap.dedent)}
         kernel_impl.textwrap = SimpleNamespace(**{**vars(textwrap), **kept})
     if hasattr(context, "get_pos_info"):
         context.get_pos_info = _place

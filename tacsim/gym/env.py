@@ -20,8 +20,9 @@ from tacsim.gym import encode
 from tacsim.gym.plugin import register_envs
 from tacsim.interface import Needs, Pose, Truth
 from tacsim.limits import LimitExceeded
-from tacsim.models.rig import RigConfig, TaskConfig
+from tacsim.models.rig import TaskConfig
 from tacsim.models.scene import Scene
+from tacsim.models.sensor import SensorModel
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
@@ -39,7 +40,7 @@ class Variant:
 
     task: TaskConfig
     scene: Scene
-    rig: RigConfig | None  # light and noise of its sensors, errors and delays; None: as the environment's
+    sensors: Mapping[str, SensorModel]
     drawn: str = ""  # in words, for the record
 
 
@@ -62,7 +63,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         encoder: of the features that a learned policy sees; None: the environment shows all that there is.
         variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
         stage: what the rig simulates, where a reset may exchange its scene.
-        wear: gives sensors and arms of the rig what `Variant.rig` says of them.
+        wear: gives the sensors of the rig other light, texture and noise.
 
     Raises IncompatibleRig when the rig lacks what the task needs.
     """
@@ -79,7 +80,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
         stage: Stage | None = None,
-        wear: Callable[[RigConfig], None] = lambda config: None,
+        wear: Callable[[Mapping[str, SensorModel]], None] = lambda models: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -136,9 +137,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             if not 0 <= played < len(self._variants):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
             chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
-            worn = self._variants[played].rig
-            if worn is not None and played != self._played:
-                self._wear(worn)
+            if played != self._played:
+                self._wear(self._variants[played].sensors)
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
         if "task" in chosen:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,28 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 
 State = Mapping[str, NDArray[Any]]  # arrays by name, in kernel units [mm, wave speed 1]
+
+
+class Kept(Mapping[str, NDArray[Any]]):
+    """A state that is fetched when somebody looks into it."""
+
+    def __init__(self, fetch: Callable[[], State]) -> None:
+        self._fetch = fetch
+        self._state: State | None = None
+
+    def _whole(self) -> State:
+        if self._state is None:
+            self._state = self._fetch()
+        return self._state
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._whole()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._whole())
+
+    def __len__(self) -> int:
+        return len(self._whole())
 
 
 def copies(arrays: State) -> dict[str, NDArray[Any]]:

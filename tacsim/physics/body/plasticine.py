@@ -156,26 +156,37 @@ class BodyState:
         self.reference(environment)[...] = self.x(environment)
         self.gradient(environment)[...] = 0.0
 
-    def fit(self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray) -> None:
+    def extents(self, environment: int) -> np.ndarray:
+        """Lowest and highest places on the grid of each part's particles [mm], (COPIES, 2, 3); of a part without any,
+        infinity and minus infinity."""
+        x, found = self.reference(environment), np.empty((COPIES, 2, 3), np.float32)
+        for part in range(COPIES):
+            own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x))]
+            found[part] = bounds(own) if len(own) else ([[np.inf] * 3, [-np.inf] * 3])
+        return found
+
+    def fit(
+        self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray,
+        extents: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """Lays the grid of one environment round its particles' places on it, so no index is ever clamped.
 
-        margin [mm]: what is left free round them. Writes origin, node counts and the parts' slabs of node planes into
-        `params` and `counts` (tacsim.physics.exec.layout).
+        margin [mm]: what is left free round them; extents: those of `extents`, if they are known. Writes origin, node
+        counts and the parts' slabs of node planes into `params` and `counts` (tacsim.physics.exec.layout).
 
         The memory of all environments grows if this one needs more; what stands in it lasts no longer than a substep.
         Raises MemoryError, with that memory as it was, where there is none.
         """
-        x = self.reference(environment)
-        origin, shape = fit_grid(x, cell, margin)
+        extents = self.extents(environment) if extents is None else extents
+        origin, shape = fit_grid(*bounds_of(extents), cell, margin)
         params[environment, layout.ORIGIN : layout.ORIGIN + 3] = origin
         counts[environment, layout.GRID : layout.GRID + 3] = shape
-        counts[environment, layout.PARTICLES] = len(x)
-        for part in range(COPIES):
-            own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x)), 0]
+        counts[environment, layout.PARTICLES] = self.counts[environment]
+        for part, (lowest, highest) in enumerate(extents[:, :, 0].tolist()):
             low, high = 0, 0
-            if own.size:
-                low = max(math.floor((float(own.min()) - margin - float(origin[0])) / cell) - 1, 0)
-                high = min(math.ceil((float(own.max()) + margin - float(origin[0])) / cell) + 3, shape[0])
+            if lowest <= highest:
+                low = max(math.floor((lowest - margin - float(origin[0])) / cell) - 1, 0)
+                high = min(math.ceil((highest + margin - float(origin[0])) / cell) + 3, shape[0])
             counts[environment, layout.SLAB + 2 * part : layout.SLAB + 2 * part + 2] = low, high
         # three planes for what particles off the grid would add
         strips = (shape[0] + 3) * shape[1] * shape[2] // NODES
@@ -213,12 +224,18 @@ def centre_of(x: np.ndarray) -> np.ndarray:
     return np.array([x[:, d].mean(dtype=np.float64) for d in range(x.shape[1])])
 
 
-def fit_grid(x: np.ndarray, cell: float, margin: float) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """Origin and node counts of a grid round the particles (n, 3) [mm]; whole strips along z.
+def bounds_of(extents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates (3,) over all parts, (COPIES, 2, 3)."""
+    return extents[:, 0].min(axis=0), extents[:, 1].max(axis=0)
+
+
+def fit_grid(
+    least: np.ndarray, most: np.ndarray, cell: float, margin: float
+) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """Origin and node counts of a grid round particles from `least` to `most` (3,) [mm]; whole strips along z.
 
     The middle of the body is a node: what is symmetric about it stays so. margin: at least a cell.
     """
-    least, most = bounds(x)
     middle, reach = (least + most) / 2, np.ceil(((most - least) / 2 + margin) / cell).astype(int)
     counts = 2 * reach + 2
     return (middle - reach * cell).astype(np.float32), (

@@ -188,7 +188,7 @@ def with_margins(shape: tuple[int, ...], margin: int) -> tuple[np.ndarray, np.nd
     return memory, memory[margin:-margin].reshape(shape)
 
 
-def gel_surface(params: GelParams, state: GelState, environment: int, gel: int) -> GelSurface:
-    top = state.u[environment, gel, :, :, -1] / np.float32(MM)
+def gel_surface(params: GelParams, top: np.ndarray) -> GelSurface:
+    """top: displacement of the surface's nodes (nx + 1, ny + 1, 3) [mm]."""
     half = params.half
-    return GelSurface(np.ascontiguousarray(top), params.spacing / MM, (-half[0] / MM, -half[1] / MM))
+    return GelSurface(np.ascontiguousarray(top / np.float32(MM)), params.spacing / MM, (-half[0] / MM, -half[1] / MM))

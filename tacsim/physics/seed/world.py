@@ -231,7 +231,7 @@ class SeedWorld(BaseWorld):
         drive, good = path.drive(first, last), copies(self.arrays())
         self._launch(drive, path.step, x0, y0, seen[0])
         health = Health.read(seen, path.step / self._smallest_cell(drive))
-        check_launch(self.arrays(), good, health, where)
+        check_launch(self.arrays, good, health, where)
         backing = self._backing[:, :3].astype(np.float64)
         left = int(self._aside.sum()) - aside
         if not len(self._body_points()):

@@ -4,26 +4,17 @@ Threads of a device cannot meet inside a loop, so each phase of a substep is a l
 substeps. What happens to one particle or node stands in the functions that the CPU's kernels call too; here are only
 the loops round them. Sums are atomic, so their order, and the last bits, differ from run to run.
 
-Arrays stay on the device. What has changed is brought back after a launch, so everybody else works on with NumPy,
-and before the next one only what differs from it is sent there (distances from meshes once they have another version).
+Where its arrays are: tacsim.physics.worlds.device_state.
 """
 
-import inspect
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-
-from tacsim.compute.runtime import launching, ti
-from tacsim.physics.body.plasticine import BodyState
+from tacsim.compute.runtime import ti
 from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
-from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.contact.indenter import POINTS, Indenter, Pressure, Slip, Values, carry, indent
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_least
-from tacsim.physics.exec.lanes import LANES, PARTS, lanes, smallest_lane, strip, vec3, vec4
+from tacsim.physics.exec.graph import Graph
+from tacsim.physics.exec.lanes import LANES, PARTS, smallest_lane, strip
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
-from tacsim.physics.gel.gel import GelState
 from tacsim.physics.gel.kernels import (
     Lattice,
     gel_advance,
@@ -34,12 +25,11 @@ from tacsim.physics.gel.kernels import (
     surface_row,
 )
 from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, gel_contact, grid_update
+from tacsim.physics.worlds.survey import BLOCKS
+from tacsim.physics.worlds.survey_kernels import Sums
 
 # (2,) number of this substep, for all loops but the last, which counts it on; the same for the last.
 Clock = ti.types.ndarray(dtype=ti.i32, ndim=1)
-Sums = ti.types.ndarray(dtype=ti.f32, ndim=3)  # (environments, 3, BLOCKS) of the particles' velocities
-BLOCKS = 256  # of a body's particles, for their sum
-MANY = 20  # substeps in a call: those of most launches
 # (environments, gels, 2) height of the highest surface node [mm], at least 0, in even substeps and in odd ones.
 Ceiling = ti.types.ndarray(dtype=ti.f32, ndim=3)
 
@@ -217,148 +207,5 @@ def gather_of_hybrid(
             clock[0] += 1
 
 
-class Substeps:
-    """Kernels that make one substep, called many times by one call: Python's share of a call is longer than a GPU's."""
-
-    def __init__(self, *kernels: Any) -> None:
-        self._kernels = kernels
-        self._graphs: dict[int, Any] = {}  # by the number of substeps in a call
-
-    def run(self, count: int, arguments: Mapping[str, Any]) -> None:
-        """`count` substeps; arguments: arrays of the device and numbers, by the names of the kernels' parameters."""
-        for each, times in ((MANY, count // MANY), (1, count % MANY)):
-            for _ in range(times):
-                if each not in self._graphs:
-                    self._graphs[each] = self._graph(each)
-                self._graphs[each].run(arguments)
-
-    def _graph(self, count: int) -> Any:
-        builder = ti.graph.GraphBuilder()
-        substep = builder.create_sequential()
-        for kernel in self._kernels:
-            parameters = inspect.signature(kernel).parameters.values()
-            substep.dispatch(kernel, *(_graph_argument(each.name, each.annotation) for each in parameters))
-        for _ in range(count):
-            builder.append(substep)
-        return builder.compile()
-
-
-def _graph_argument(name: str, declared: Any) -> Any:
-    if declared is ti.i32:
-        return ti.graph.Arg(ti.graph.ArgKind.SCALAR, name, ti.i32)
-    return ti.graph.Arg(ti.graph.ArgKind.NDARRAY, name, declared.dtype, declared.ndim)
-
-
-press_substeps = Substeps(press_substep)
-hybrid_substeps = Substeps(elements_of_hybrid, scatter_of_hybrid, gather_of_hybrid)
-
-
-class DeviceArrays:
-    """Arrays on the device, by name: made when first asked for, and anew when a shape changes."""
-
-    def __init__(self) -> None:
-        self._there: dict[str, Any] = {}
-        self._known: dict[str, np.ndarray] = {}  # what these hold, where that has been sent or brought back last
-        self._versions: dict[str, int] = {}
-
-    def allocate(self, name: str, dtype: Any, shape: tuple[int, ...]) -> Any:
-        """An array that only the device uses; zeros at first."""
-        there = self._there.get(name)
-        if there is None or there.shape != shape:
-            self._there[name] = there = ti.ndarray(dtype, shape)
-            there.fill(0)
-            self._known.pop(name, None)
-        return there
-
-    def upload(self, name: str, host: np.ndarray, dtype: Any) -> Any:
-        """A copy of `host`, whose last axis is the vector if dtype is one. Sent only where a bit of it differs from
-        what the device holds: anybody may write to it between launches, few do, and to compare takes a twentieth."""
-        there = self.allocate(name, dtype, host.shape[:-1] if isinstance(dtype, type(vec4)) else host.shape)
-        known = self._known.get(name)
-        if known is None or not np.array_equal(known.view(np.int32), host.view(np.int32)):  # as bits: NaN equals NaN
-            self._known[name] = host.copy()
-            there.from_numpy(self._known[name])
-        return there
-
-    def upload_if_changed(self, name: str, host: np.ndarray, dtype: Any, version: int) -> Any:
-        """The same of an array that seldom changes: copied only if it has another `version` than what is there."""
-        if self._versions.get(name) != version:
-            self.upload(name, host, dtype)
-            self._versions[name] = version
-        return self._there[name]
-
-    def download(self, **hosts: np.ndarray) -> None:
-        """Copies back into these arrays what the device has by their names."""
-        for name, host in hosts.items():
-            self._known[name] = self._there[name].to_numpy().reshape(host.shape)
-            host[...] = self._known[name]
-
-    def forget(self, *names: str) -> None:
-        """Of arrays that kernels will change: unless brought back, also by an interruption, they are sent again."""
-        for name in names:
-            self._known.pop(name, None)
-
-    def upload_gels(self, gels: GelState) -> dict[str, Any]:
-        """What every kernel with gels takes."""
-        nodes, surface, contact_force, corners, lattice = gels.arguments()
-        return {
-            "nodes": self.upload("nodes", nodes, ti.f32), "surface": self.upload("surface", surface, ti.f32),
-            "contact_force": self.allocate("contact_force", ti.f32, contact_force.shape),
-            "corners": self.allocate("corners", ti.f32, corners.shape),
-            "lattice": self.upload("lattice", lattice, lanes), "layers": gels.nodes.shape[4] - 1,
-        }  # fmt: skip
-
-    def upload_numbers(self, numbers: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
-        """params, counts, partial; and a clock that says 0."""
-        params, counts, partial = numbers
-        clock = self.allocate("clock", ti.i32, (2,))
-        clock.fill(0)
-        return {
-            "params": self.upload("params", params, ti.f32), "counts": self.upload("counts", counts, ti.i32),
-            "partial": self.upload("partial", partial, ti.f32), "clock": clock,
-        }  # fmt: skip
-
-
-@launching()
-def run_press(
-    arrays: DeviceArrays, drive: np.ndarray, gels: GelState, slip: np.ndarray, pressure: np.ndarray,
-    values: np.ndarray, version: int, numbers: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> None:  # fmt: skip
-    """One launch; the arrays are those of `PressState`. version: another whenever `values` has changed; numbers:
-    params, counts, partial."""
-    arguments = {
-        "drive": arrays.upload("drive", drive, ti.f32), "slip": arrays.upload("slip", slip, vec3),
-        "pressure": arrays.upload("pressure", pressure, ti.f32),
-        "values": arrays.upload_if_changed("values", values, ti.f32, version),
-        **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
-    }  # fmt: skip
-    arrays.forget("nodes", "surface", "slip", "pressure", "partial")
-    press_substeps.run(drive.shape[1], arguments)
-    nodes, surface = gels.arguments()[:2]
-    arrays.download(nodes=nodes, surface=surface, slip=slip, pressure=pressure, partial=numbers[2])
-
-
-@launching()
-def run_hybrid(
-    arrays: DeviceArrays, drive: np.ndarray, gels: GelState, body: BodyState, contact_history: np.ndarray,
-    numbers: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> None:  # fmt: skip
-    """One launch; the arrays are those of `HybridState`. numbers: params, counts, partial."""
-    rows, masses, velocities = body.arguments()
-    counts = numbers[1]
-    highest = np.maximum(gels.surface[:, :, 0, :, :, 2].max(axis=(2, 3)), 0.0)  # surfaces before the first substep
-    grid = arrays.allocate("masses", strip, masses.shape[:-1])
-    grid.fill(0)  # also where particles that left the grid have been added
-    arguments = {
-        "drive": arrays.upload("drive", drive, ti.f32), "particles": arrays.upload("particles", rows, ti.f32),
-        "masses": grid,
-        "velocities": arrays.allocate("velocities", strip, velocities.shape[:-1]),
-        "histories": arrays.upload("histories", contact_history, ContactHistory),
-        "ceiling": arrays.upload("ceiling", np.stack([highest, 0.0 * highest], axis=-1), ti.f32),
-        "sums": arrays.allocate("sums", ti.f32, (len(counts), 3, BLOCKS)), "most_particles": max(body.counts),
-        "most_nodes": int(counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max()),
-        **arrays.upload_gels(gels), **arrays.upload_numbers(numbers),
-    }  # fmt: skip
-    arrays.forget("nodes", "surface", "particles", "histories", "ceiling", "partial")
-    hybrid_substeps.run(drive.shape[1], arguments)
-    arrays.download(nodes=gels.arguments()[0], particles=rows, histories=contact_history, partial=numbers[2])
+press_substeps = Graph(press_substep)
+hybrid_substeps = Graph(elements_of_hybrid, scatter_of_hybrid, gather_of_hybrid)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,23 +31,43 @@ from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
 from tacsim.physics.motion.path import Path, path_along, path_length, plan, plan_flow, resolve_targets
 from tacsim.physics.move import MoveCommand
-from tacsim.physics.snapshot import restore_arrays, snapshot_of
+from tacsim.physics.snapshot import Kept, State, copies, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
 from tacsim.physics.worlds.base import BaseWorld
+
+if TYPE_CHECKING:  # a device's kernels
+    from tacsim.physics.worlds.device_state import DeviceState
+    from tacsim.physics.worlds.survey import Survey
 
 # zeta in alpha = zeta c / thickness, the damping of a gel: while anything is driven, when it makes the gel lag, and
 # what yields or slides remembers that; while held
 ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0
 
 
-class FemState(Protocol):
-    """Arrays of several environments (HybridState, PressState)."""
+class FemState(ABC):
+    """Arrays of several environments (HybridState, PressState). Those on a device come back when they are asked for."""
 
-    gels: GelState
+    device: DeviceState | None = None  # where they are computed, if that is not the CPU
     params: NDArray[np.float32]
     partial: NDArray[np.float32]
+    _gels: GelState
 
-    def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None: ...
+    @abstractmethod
+    def advance(self, drives: Mapping[int, NDArray[np.float32]]) -> None:
+        """One launch; drives: (n, frames, 6, 3) of the environments that move, each with its own n."""
+
+    def _bring_back(self) -> None:
+        if self.device is not None:
+            self.device.bring_back()
+
+    @property
+    def gels(self) -> GelState:
+        self._bring_back()
+        return self._gels
+
+    def tops(self, index: int) -> NDArray[np.float32]:
+        """Displacements of an environment's gel surfaces [mm], (gels, nx + 1, ny + 1, 3)."""
+        return self._gels.u[index, :, :, :, -1] if self.device is None else self.device.surfaces()[index]
 
 
 def stack_drives(drives: Mapping[int, NDArray[np.float32]], counts: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -119,7 +139,34 @@ class FemWorld(BaseWorld):
         return wrench
 
     def surface(self, name: str) -> GelSurface:
-        return gel_surface(self._gel, self._state.gels, self._index, self._sensor(name))
+        return gel_surface(self._gel, self._state.tops(self._index)[self._sensor(name)])
+
+    def _survey(self) -> Survey | None:
+        device = self._state.device
+        return None if device is None else device.survey(self._index)
+
+    def _keep(self) -> State:
+        device = self._state.device
+        if device is None:
+            return self.snapshot()
+        device.keep(self._index)
+        sums = {"sums": self._state.partial[self._index]}
+        return self._kept(device, "motion", snapshot_of({**sums, **self._scalars()}, self._poses))
+
+    def _before_launch(self) -> State:
+        device = self._state.device
+        if device is None:
+            return copies(self.arrays())
+        return self._kept(device, "launch", copies({"sums": self._state.partial[self._index]}))
+
+    def _kept(self, device: DeviceState, moment: str, also: State) -> State:
+        """This world's arrays as the device has kept them before the last "motion" or "launch", and `also`."""
+
+        def fetch() -> State:
+            with device.as_kept(moment):
+                return {**copies(self.arrays()), **also}
+
+        return Kept(fetch)
 
     # ---------------------------------------------------------------- inertia
 
@@ -145,7 +192,8 @@ class FemWorld(BaseWorld):
         """
         step = float(self._state.params[self._index, STEP])
         with np.errstate(all="ignore"):  # check_launch reports what is not finite
-            shortest = self._state.gels.shortest(self._index, self._gel.spacing)
+            seen = self._survey()
+            shortest = seen.shortest if seen else self._state.gels.shortest(self._index, self._gel.spacing)
             if shortest * LARGEST_COURANT < step:
                 shortest = float(element_lengths(self.arrays(), self._gel.thickness).min())
         return step / max(shortest, 1e-6 * self._gel.spacing)

@@ -1,7 +1,10 @@
 """Two gels (FEM in their sensor frames) round a plasticine body (MLS-MPM), coupled by contact with friction memory."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,17 +13,18 @@ from tacsim.geometry.sampling import body_points
 from tacsim.geometry.shapes import extent, volume
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import Scene
+from tacsim.physics.body.moments import Moments, moments_of
 from tacsim.physics.body.plasticine import (
     BORDER,
     BodyParams,
     BodyState,
     body_params,
-    bounds,
+    bounds_of,
     centre_of,
 )
 from tacsim.physics.body.surface import surface_points, tangent_planes
 from tacsim.physics.contact.contact import ContactHistory
-from tacsim.physics.contact.gel_overlap import gel_overlap
+from tacsim.physics.contact.gel_overlap import apart, gel_overlap
 from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
 from tacsim.physics.exec.layout import (
     BACKING,
@@ -52,12 +56,13 @@ from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, c
 from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
-from tacsim.physics.snapshot import copies
 from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.device import DeviceArrays, run_hybrid
-from tacsim.physics.worlds.fem import ZETA_GEL, ZETA_GEL_HELD, FemWorld, stack_drives
+from tacsim.physics.worlds.fem import ZETA_GEL, ZETA_GEL_HELD, FemState, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
 from tacsim.pose import HALF_TURN_X
+
+if TYPE_CHECKING:
+    from tacsim.physics.worlds.device_state import DeviceHybrid
 
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
 COURANT = 0.5
@@ -68,27 +73,69 @@ LARGEST_GREEN = 0.3  # norm of F^T F - I since the reference of the body's grid:
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
 
-class HybridState:
+class HybridState(FemState):
     """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
 
     Environments share the gels' lattice; each has its own body, materials, friction and settling.
     """
 
+    device: DeviceHybrid | None = None
+
     def __init__(self, scenes: Sequence[Scene]) -> None:
         """Raises ValueError for gels that are not cut alike."""
         start()
         self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        self.gels = GelState(common_lattice(self.gel), len(scenes), 2)
+        self._gels = GelState(common_lattice(self.gel), len(scenes), 2)
         placed = [_body_at_start(scene) for scene in scenes]
         self.body = [body for body, _, _ in placed]
-        self.particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
+        self._particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
         # of the contact law [mm]
-        self.contact_history = np.zeros((len(scenes), 2, max(self.particles.counts), ContactHistory.n), np.float32)
+        self._contact_history = np.zeros((len(scenes), 2, max(self._particles.counts), ContactHistory.n), np.float32)
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._device_arrays = DeviceArrays()
+        if ON_DEVICE:
+            from tacsim.physics.worlds.device_state import DeviceHybrid
+
+            numbers = self.params, self.counts, self.partial
+            self.device = DeviceHybrid(self._gels, numbers, self._particles, lambda: self._contact_history)
+
+    @property
+    def particles(self) -> BodyState:
+        self._bring_back()
+        return self._particles
+
+    @property
+    def contact_history(self) -> np.ndarray:
+        self._bring_back()
+        return self._contact_history
+
+    def extents(self, index: int) -> np.ndarray:
+        """See `BodyState.extents`; what follows is likewise of one environment, wherever its arrays are."""
+        return self._particles.extents(index) if self.device is None else self.device.survey(index).extents
+
+    def fit(self, index: int, cell: float, extents: np.ndarray) -> None:
+        """Lays its grid. Raises MemoryError."""
+        self._particles.fit(index, cell, cell, self.params, self.counts, extents)
+
+    def moments(self, index: int) -> Moments:
+        return moments_of(self._particles, index) if self.device is None else self.device.moments(index)
+
+    def centre(self, index: int) -> np.ndarray:
+        """Of the particles (3,) [mm]."""
+        return centre_of(self._particles.x(index)) if self.device is None else self.device.moments(index).centre
+
+    def outside(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [mm] and tangent planes [1/mm] of the particles, (n, 3) both."""
+        if self.device is not None:
+            return self.device.outside(index)
+        return self._particles.x(index), self._particles.plane(index)
+
+    @property
+    def most_nodes(self) -> int:
+        """Of a grid, see `BodyState.most`."""
+        return self._particles.most
 
     def place(self, index: int, scene: Scene) -> None:
         """One environment as it is at the construction of another scene. Raises ValueError for gels cut otherwise."""
@@ -100,23 +147,21 @@ class HybridState:
         self.particles.place(index, points, planes)
         missing = max(self.particles.counts) - self.contact_history.shape[2]
         if missing > 0:
-            self.contact_history = np.pad(self.contact_history, ((0, 0), (0, 0), (0, missing), (0, 0)))
+            self._contact_history = np.pad(self.contact_history, ((0, 0), (0, 0), (0, missing), (0, 0)))
         self.contact_history[index], self.params[index], self.partial[index] = 0.0, 0.0, 0.0
         self.counts[index] = 0
         self.counts[index, ELEMENTS : ELEMENTS + 3] = gel.elements
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
-        """One launch; drives: (n, 2, 6, 3) of the environments that move, each with its own n."""
         drive = stack_drives(drives, self.counts)
-        self.gels.refresh()
-        if ON_DEVICE:
-            numbers = self.params, self.counts, self.partial
-            run_hybrid(self._device_arrays, drive, self.gels, self.particles, self.contact_history, numbers)
-        else:
-            run_team(
-                substeps, drive, self.gels.arguments(), self.particles.arguments(), self.contact_history, self.params,
-                self.counts, self.partial, active=list(drives),
-            )  # fmt: skip
+        if self.device is not None:
+            self.device.run(drive)
+            return
+        self._gels.refresh()
+        run_team(
+            substeps, drive, self._gels.arguments(), self._particles.arguments(), self._contact_history, self.params,
+            self.counts, self.partial, active=list(drives),
+        )  # fmt: skip
 
 
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
@@ -154,7 +199,7 @@ class HybridWorld(FemWorld):
         housing = scene.gel.housing
         # Inertia is scaled, weight is not: rho g [1e-9 N/mm^3] over the kernel's density, the P-wave modulus [MPa].
         self._body_force = scene.body.material.density * np.array(scene.gravity) * MPA / MM  # [N/mm^3]
-        self._weight = self._body_force * self._body.volume * len(self._state.particles.x(index))  # [N]
+        self._weight = self._body_force * self._body.volume * self._state.particles.counts[index]  # [N]
         params = {
             **self._gel.params(), **self._body.params(),
             FRICTION: scene.friction["lower"], FRICTION + 1: scene.friction["upper"],
@@ -227,7 +272,7 @@ class HybridWorld(FemWorld):
         }  # fmt: skip
 
     def truth(self) -> Truth:
-        x, planes = self._state.particles.x(self._index), self._state.particles.plane(self._index)
+        x, planes = self._state.outside(self._index)
         height = float(np.ptp(surface_points(x, planes)[:, 2])) / MM
         return Truth(height, x.mean(axis=0, dtype=np.float64) / MM, (x / MM).astype(np.float32), dict(self._poses))
 
@@ -238,44 +283,42 @@ class HybridWorld(FemWorld):
         state, index, path = self._state, self._index, launch.path
         drive = path.drive(launch.first, launch.last)
         span = path.span(self._poses, launch.first, launch.last)
-        particles, cell = state.particles, self._body.cell
+        cell = self._body.cell
         if state.partial[index, :, GREEN].max() > LARGEST_GREEN**2:
-            particles.move_reference(index)
-        low, high = bounds(particles.reference(index))
-        require_room(low - BORDER * cell, high + BORDER * cell, cell, span, particles.most)
+            state.particles.move_reference(index)
+        extents = state.extents(index)
+        low, high = bounds_of(extents)
+        require_room(low - BORDER * cell, high + BORDER * cell, cell, span, state.most_nodes)
         try:
-            particles.fit(index, cell, cell, state.params, state.counts)
+            state.fit(index, cell, extents)
         except MemoryError as error:
             raise SimulationDiverged(f"no memory for the grid round the particles ({error})", span, NO_ROOM) from None
-        before = copies(self.arrays())
+        before = self._before_launch()
         state.params[index, STEP] = path.step
-        self._write_body_inertia()
+        self._write_body_inertia(state.moments(index))
         self._write_inertia(launch)
         Health.clear(state.partial[index])
         return PreparedLaunch(launch, drive, span, before)
 
-    def _write_body_inertia(self) -> None:
+    def _write_body_inertia(self, moments: Moments) -> None:
         """Centre, inverse moment of inertia and mean motion of the particles since their reference, for the kernels."""
-        params, x = self._state.params[self._index], self._state.particles.x(self._index)
-        reference = self._state.particles.reference(self._index)
-        centre, reference_centre = centre_of(x), centre_of(reference)
-        arms = (reference - reference_centre).T
-        moved = (x - centre).T - arms
-        params[REFERENCE_CENTRE : REFERENCE_CENTRE + 3] = reference_centre
+        params = self._state.params[self._index]
+        params[REFERENCE_CENTRE : REFERENCE_CENTRE + 3] = moments.reference_centre
         params[CARRIED : CARRIED + 9] = (
-            moved @ arms.T @ np.linalg.pinv(arms @ arms.T, rcond=1e-6, hermitian=True)
+            moments.moved @ np.linalg.pinv(moments.reference_second, rcond=1e-6, hermitian=True)
         ).ravel()
-        arms = x.T - centre[:, None]
-        second = arms @ arms.T * float(params[BODY_MASS])
+        second = moments.second * float(params[BODY_MASS])
         inertia = np.trace(second) * np.eye(3) - second
         inverse = _pseudo_inverse(inertia)
-        params[CENTRE : CENTRE + 3] = centre
+        params[CENTRE : CENTRE + 3] = moments.centre
         params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
-        health = check_launch(self.arrays(), prepared.before, Health.read(partial, self._courant()), prepared.span)
+        seen = self._survey()
+        health = Health.read(partial, self._courant(), sound=seen is not None and seen.sound)
+        check_launch(self.arrays, prepared.before, health, prepared.span)
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
         force, moment = sums[:, FORCE : FORCE + 12].sum(axis=0).reshape(2, 2, 3).swapaxes(0, 1)
@@ -283,7 +326,7 @@ class HybridWorld(FemWorld):
         backing += sums[:, HOUSING_FORCE : HOUSING_FORCE + 6].sum(axis=0).reshape(2, 3)
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
-        centre = centre_of(self._state.particles.x(self._index))
+        centre = self._state.centre(self._index)
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
         gel_overlap = self._gel_overlap(prepared)
@@ -296,7 +339,10 @@ class HybridWorld(FemWorld):
     def _gel_overlap(self, prepared: PreparedLaunch) -> float:
         """How deep the two gels lie in one another, without feeling it [mm]. Raises SimulationDiverged if too deep."""
         last = prepared.drive[-1].astype(np.float64)
-        found = gel_overlap(self._gel, self._state.gels.u[self._index, :, :, :, -1], last[:, :3], last[:, 3])
+        seen = self._survey()
+        if seen is not None and apart(self._gel, seen.tops[1], float(seen.tops[0, 3]), last[:, :3], last[:, 3]):
+            return 0.0
+        found = gel_overlap(self._gel, self._state.tops(self._index), last[:, :3], last[:, 3])
         most = GEL_OVERLAP * self._gel.thickness
         if found > most:
             raise SimulationDiverged(

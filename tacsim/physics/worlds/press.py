@@ -67,10 +67,8 @@ from tacsim.physics.gel.kernels import (
 )
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
-from tacsim.physics.snapshot import copies
 from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.device import DeviceArrays, run_press
-from tacsim.physics.worlds.fem import ZETA_GEL, FemWorld, stack_drives
+from tacsim.physics.worlds.fem import ZETA_GEL, FemState, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
@@ -142,7 +140,7 @@ def relative_drive(sensor: np.ndarray, indenter: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(out, np.float32)
 
 
-class PressState:
+class PressState(FemState):
     """Arrays of E environments that one launch of `press_substeps` advances; each environment is a PressWorld.
 
     Environments share the gel's lattice; each has its own indenter, materials, friction and settling.
@@ -153,19 +151,35 @@ class PressState:
         start()
         self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
         lattice = common_lattice(self.gel)
-        self.gels = GelState(lattice, len(scenes), 1)
+        self._gels = GelState(lattice, len(scenes), 1)
         nx, ny, _ = lattice.elements
-        self.slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
-        self.pressure = np.zeros(self.slip.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
+        self._slip = np.zeros((len(scenes), nx * POINTS, ny * POINTS, 3), np.float32)
+        self._pressure = np.zeros(self._slip.shape[:3], np.float32)  # of the contact points, as remembered [MPa]
         self.params = np.zeros((len(scenes), PARAMS), np.float32)
         self.counts = np.zeros((len(scenes), COUNTS), np.int32)
         self.counts[:, ELEMENTS : ELEMENTS + 3] = lattice.elements
         self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        self._device_arrays = DeviceArrays()
         self._values = np.zeros((len(scenes), 2, 2, 2), np.float32)
         self._covered = 0  # how often they have changed: a device keeps its copy of them until they do
         self.meshes = [self._set_shape(index, scene) for index, scene in enumerate(scenes)]
         self._tiles: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # first and end of those filled in
+        if ON_DEVICE:
+            from tacsim.physics.worlds.device_state import DevicePress
+
+            numbers = self.params, self.counts, self.partial
+            self.device = DevicePress(
+                self._gels, numbers, self._slip, self._pressure, lambda: (self._values, self._covered)
+            )
+
+    @property
+    def slip(self) -> np.ndarray:
+        self._bring_back()
+        return self._slip
+
+    @property
+    def pressure(self) -> np.ndarray:
+        self._bring_back()
+        return self._pressure
 
     def _set_shape(self, index: int, scene: Scene) -> TiledDistance | None:
         """Writes one environment's indenter into params and counts; returns the distances of a mesh."""
@@ -209,20 +223,15 @@ class PressState:
         self._covered += 1
 
     def advance(self, drives: Mapping[int, np.ndarray]) -> None:
-        """One launch; drives: (n, 1, 6, 3) of the environments that move, each with its own n."""
         drive = stack_drives(drives, self.counts)
-        self.gels.refresh()
-        if ON_DEVICE:
-            run_press(
-                self._device_arrays, drive, self.gels, self.slip, self.pressure, self._values,
-                self._covered,
-                (self.params, self.counts, self.partial),
-            )  # fmt: skip
-        else:
-            run_team(
-                press_substeps, drive, self.gels.arguments(), self.slip, self.pressure, self._values,
-                self.params, self.counts, self.partial, active=list(drives),
-            )  # fmt: skip
+        if self.device is not None:
+            self.device.run(drive)
+            return
+        self._gels.refresh()
+        run_team(
+            press_substeps, drive, self._gels.arguments(), self._slip, self._pressure, self._values,
+            self.params, self.counts, self.partial, active=list(drives),
+        )  # fmt: skip
 
 
 class PressWorld(FemWorld):
@@ -290,7 +299,7 @@ class PressWorld(FemWorld):
         except MemoryError as error:
             cause = f"no memory for the distances from the indenter's mesh ({error})"
             raise SimulationDiverged(cause, span, TOO_MUCH, retry=False) from None
-        before = copies(self.arrays())
+        before = self._before_launch()
         self._state.params[self._index, STEP] = path.step
         Health.clear(self._state.partial[self._index])
         return PreparedLaunch(launch, drive, span, before)
@@ -309,7 +318,7 @@ class PressWorld(FemWorld):
 
     def _surface_nodes(self) -> np.ndarray:
         """Where the nodes of the gel's surface are (n, 3) [mm], sensor frame."""
-        top = self._state.gels.u[self._index, 0, :, :, -1].astype(np.float64)
+        top = self._state.tops(self._index)[0].astype(np.float64)
         axes = (self._gel.spacing * (np.arange(n) - (n - 1) / 2) for n in top.shape[:2])
         top[..., :2] += np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         return top.reshape(-1, 3)
@@ -317,7 +326,9 @@ class PressWorld(FemWorld):
     def outcome(self, prepared: PreparedLaunch) -> ForceReading:
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
-        health = check_launch(self.arrays(), prepared.before, Health.read(partial, self._courant()), prepared.span)
+        seen = self._survey()
+        health = Health.read(partial, self._courant(), sound=seen is not None and seen.sound)
+        check_launch(self.arrays, prepared.before, health, prepared.span)
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]

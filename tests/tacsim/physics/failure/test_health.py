@@ -71,7 +71,7 @@ class Particles(BaseWorld):
     def launch(self, change: Callable[[dict[str, np.ndarray]], Any], seen: Health = WELL) -> Health:
         good = copies(self.state)
         change(self.state)
-        return check_launch(self.state, good, seen, HERE)
+        return check_launch(self.arrays, good, seen, HERE)
 
 
 def set_to(name: str, index: tuple[int, ...], value: float) -> Callable[[dict[str, np.ndarray]], None]:

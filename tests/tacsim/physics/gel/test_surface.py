@@ -64,7 +64,7 @@ def test_contact_and_renderer_see_the_same_surface(seed: int, size: float) -> No
     found = np.zeros((len(points), 3, 4), np.float32)
     evaluate(state.surface.reshape(-1), points, found, SECOND, GEL.spacing, NX, NY)
 
-    surface = gel_surface(GEL, state, 0, SECOND)
+    surface = gel_surface(GEL, state.u[0, SECOND, :, :, -1])
     drawn, jacobian = displacement_and_jacobian(surface, surface.origin + points.astype(np.float64) * surface.spacing)
     value, by_x, by_y = found[:, 0, :3].astype(np.float64), found[:, 1, :3], found[:, 2, :3]
     largest = float(np.abs(state.u).max())  # [mm]

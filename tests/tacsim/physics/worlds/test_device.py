@@ -20,13 +20,13 @@ import pytest
 from tacsim.compute.runtime import available
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Mesh, Scene, Shape, Sphere
+from tacsim.physics.exec.device_arrays import DeviceArrays
 from tacsim.physics.exec.layout import SHAPE_FIRST
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.motion.controller import Launch
 from tacsim.physics.move import MoveStats
 from tacsim.physics.world import World
 from tacsim.physics.worlds.batch import Batch
-from tacsim.physics.worlds.device import DeviceArrays
 from tacsim.physics.worlds.hybrid import HybridWorld
 from tacsim.physics.worlds.press import PressWorld
 
@@ -85,7 +85,7 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     interrupted.move(closer(interrupted, 0.05e-3))
     here = interrupted.snapshot()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(DeviceArrays, "download", lambda self, **hosts: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(DeviceArrays, "look", lambda self, name: (_ for _ in ()).throw(KeyboardInterrupt))
         with contextlib.suppress(KeyboardInterrupt):
             interrupted.move(closer(interrupted, 0.1e-3))  # on a device its launch ends, and is never brought back
     interrupted.restore(here)
@@ -119,7 +119,32 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
         first.restore(before)
     assert isinstance(ends[1], MoveStats)
     note("rests", outcome(second, ends[1]))
+    note("learned", episodes())
     return found
+
+
+def episodes() -> dict[str, Any]:
+    """What two environments of a batch return: two steps of both, one of the first after it was reset."""
+    import gymnasium
+
+    import tacsim.gym.env  # noqa: F401  registers
+
+    small = [
+        "scene.gel.size=[8 mm, 8 mm, 4 mm]", "scene.preset=learn", "scene.body.geometry.size=[4 mm, 4 mm, 4 mm]",
+        "scene.settling.mach=0.05", "scene.settling.tolerance=0.1", "motion=flowing", "task.goal=3 mm",
+        *(f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in ("width=16", "height=16")),
+    ]  # fmt: skip
+    many = gymnasium.make_vec("tacsim/Squeeze-v0", 2, autoreset_mode="Disabled", overrides=small)
+    many.reset(seed=[1, 2])
+    found = [many.step(np.array([[0.5, 1.0], [1.0, 0.2]], np.float32)) for _ in range(2)]
+    many.reset(options={"reset_mask": np.array([True, False])})
+    found.append(many.step(np.array([[1.0, 1.0], [0.5, 0.5]], np.float32)))
+    many.close()
+    return {
+        **{name: np.array([flats[name] for flats, *_ in found]) for name in ("wrench_lower", "height_upper")},
+        "body_height": np.array([info["body_height"] for *_, info in found]),
+        "reward": np.array([reward for _, reward, *_ in found]),
+    }  # fmt: skip
 
 
 def run(device: str, out: Path) -> dict[str, Any]:
@@ -194,6 +219,19 @@ def test_one_that_rests_keeps_its_bits(pair: tuple[dict[str, Any], dict[str, Any
 
 @pytest.mark.deep
 @pytest.mark.timeout(3 * SECONDS)
+def test_environments_of_a_batch_return_the_same(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    cpu, there = pair
+    names = [name for name in cpu if name.startswith("learned.")]
+    assert len(names) == 4
+    for name in names:
+        scale = np.abs(cpu[name]).max()
+        assert np.abs(there[name] - cpu[name]).max() < 2e-3 * scale, name
+    pressed = -cpu["learned.wrench_lower"][..., 2]  # (steps, environments)
+    assert pressed.max(axis=0).min() > 0.05 and np.ptp(pressed, axis=1).min() > 0.01
+
+
+@pytest.mark.deep
+@pytest.mark.timeout(3 * SECONDS)
 def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]]) -> None:
     for found in pair:
         assert str(found["race.words"]).startswith("a particle moves at")
@@ -202,8 +240,8 @@ def test_what_is_unphysical_is_seen(pair: tuple[dict[str, Any], dict[str, Any]])
 
 SENT = """
 import numpy as np
-from tacsim.physics.worlds.device import DeviceArrays
 from tacsim.compute.runtime import start, ti
+from tacsim.physics.exec.device_arrays import DeviceArrays
 start()
 arrays, host = DeviceArrays(), np.ones((2, 3), np.float32)
 for version in (0, 0, 1):

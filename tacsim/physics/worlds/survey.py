@@ -1,0 +1,70 @@
+"""What kernels find in a state on a device (survey_kernels.py), so that nobody need bring its arrays back to look at
+them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.physics.body.moments import Moments
+from tacsim.physics.failure.health import FASTEST, SMALLEST_VOLUME_RATIO
+
+BLOCKS = 256  # of a body's particles, for their sums
+
+# The numbers of one environment: float32
+NOT_FINITE = 0  # how many entries are not
+NODE_SPEED = 1  # largest component
+SHORTEST = 2  # by how much the shortest edge of an element is longer than at rest [mm]
+CORNER = 3  # smallest volume ratio at the elements' corners
+TOP = 4  # of the surface of gel 0, gel 1: largest |x|, largest |y|, lowest z, highest z of its displacements [mm]
+SQUARED_VOLUME = 12  # smallest det b_e of a particle
+LOW, HIGH = 13, 16  # of the particles' places on the grid: x, y, z [mm]
+# Sums over the particles, of r their place on the grid less `base`, d = x - place, x their place in space less `base`:
+# d, r, x x^T and r r^T (xx, yy, zz, xy, xz, yz), d r^T (row by row)
+SUMS = 19
+MOVED, REFERENCE, SECOND, REFERENCE_SECOND, MOVED_REFERENCE = 0, 3, 6, 12, 18
+MOMENTS = 27
+NUMBERS = SUMS + MOMENTS
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Of one environment's state."""
+
+    finite: bool  # all its numbers are
+    sound: bool  # and no gel node is too fast, no particle crushed: see `tacsim.physics.failure.health`
+    shortest: float  # edge of a gel element, along its direction at rest [mm]
+    smallest_corner: float  # volume ratio
+    tops: NDArray[np.float32]  # (gels, 4) largest |x|, |y|, lowest and highest z of the surfaces' displacements [mm]
+    extents: NDArray[np.float32]  # (1, 2, 3) lowest and highest places of the particles on their grid [mm]
+    moments: Moments | None = None  # of a body
+
+
+def survey_of(numbers: NDArray[np.float32], spacing: float, particles: int = 0, base: Any = 0.0) -> Survey:
+    """Of an environment's numbers (NUMBERS,) as the kernels leave them; spacing: of its gels [mm]."""
+    finite = not numbers[NOT_FINITE]
+    sound = bool(
+        finite and numbers[NODE_SPEED] <= FASTEST and numbers[SQUARED_VOLUME] > (2.0 * SMALLEST_VOLUME_RATIO) ** 2
+    )
+    return Survey(
+        finite, sound, spacing + float(numbers[SHORTEST]), float(numbers[CORNER]), numbers[TOP : TOP + 8].reshape(2, 4),
+        numbers[LOW : LOW + 6].reshape(1, 2, 3),
+        _moments(numbers[SUMS:].astype(np.float64), particles, np.asarray(base, np.float64)) if particles else None,
+    )  # fmt: skip
+
+
+def _moments(sums: NDArray[np.float64], particles: int, base: NDArray[np.float64]) -> Moments:
+    moved, reference = sums[MOVED : MOVED + 3] / particles, sums[REFERENCE : REFERENCE + 3] / particles
+
+    def second(first: int, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+        about_base: NDArray[np.float64] = sums[first + np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
+        return about_base - particles * np.outer(mean, mean)
+
+    moved_reference = sums[MOVED_REFERENCE : MOVED_REFERENCE + 9].reshape(3, 3)
+    return Moments(
+        base + reference + moved, base + reference, second(SECOND, reference + moved),
+        second(REFERENCE_SECOND, reference), moved_reference - particles * np.outer(moved, reference),
+    )  # fmt: skip

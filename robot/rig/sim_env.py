@@ -15,8 +15,9 @@ from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_alike
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.features import Features
+from tacsim.models.hardware import Placement
 from tacsim.models.rig import RigConfig, SimSensorConfig
-from tacsim.models.sensor import Lighting, SensorModel
+from tacsim.models.sensor import Lighting
 from tacsim.sim.stage import StatePool, require_same_gels
 from tacsim.tasks import make_task
 
@@ -85,8 +86,8 @@ def _variants(episodes: Episodes) -> list[Variant]:
     for number, (config, words) in enumerate(episodes[1:]):
         if _unchanging(config) != kept:
             raise ValueError(
-                f"variant {number} may change nothing but scene, task, and light, texture and noise of the sensors; "
-                "make another environment for it"
+                f"variant {number} may change nothing but scene, task, light, texture, noise and delay of the sensors, "
+                "error and delay of the arms; make another environment for it"
             )
         assert first.scene is not None and first.task is not None and config.scene is not None
         assert config.task is not None
@@ -95,23 +96,24 @@ def _variants(episodes: Episodes) -> list[Variant]:
             require_alike(first.task, config.task)
         except ValueError as error:
             raise ValueError(f"variant {number}: {error}") from None
-        variants.append(Variant(config.task, config.scene, _models(config), words))
-    if all(variant.sensors == _models(first) for variant in variants):
-        variants = [replace(variant, sensors={}) for variant in variants]  # nothing to change at a reset
+        variants.append(Variant(config.task, config.scene, config, words))
+    if all(_worn(config) == _worn(first) for config, _ in episodes):
+        variants = [replace(variant, rig=None) for variant in variants]  # nothing to change at a reset
     return variants
 
 
-def _models(config: RigConfig) -> dict[str, SensorModel]:
-    return {name: each.model for name, each in config.sensors.items() if isinstance(each, SimSensorConfig)}
+def _worn(config: RigConfig) -> tuple[object, object]:
+    """What `Simulation.wear` takes of a rig."""
+    return config.sensors, config.arms
 
 
 def _unchanging(config: RigConfig) -> RigConfig:
     """What of a rig is the same in all episodes of an environment; the rest is left out."""
     look = {"lighting": Lighting(), "photometric": None, "texture": 0.0, "texture_seed": 0, "noise": None, "name": ""}
-    sensors = {
-        name: each.model_copy(update={"model": each.model.model_copy(update=look)})
-        if isinstance(each, SimSensorConfig)
-        else each
-        for name, each in config.sensors.items()
-    }
-    return config.model_copy(update={"scene": None, "task": None, "sensors": sensors})
+    sensors, arms = {}, {}
+    for name, sensor in config.sensors.items():
+        assert isinstance(sensor, SimSensorConfig)
+        sensors[name] = sensor.model_copy(update={"model": sensor.model.model_copy(update=look), "delay": 0})
+    for name, arm in config.arms.items():
+        arms[name] = arm.model_copy(update={"error": Placement(), "delay": 0})
+    return config.model_copy(update={"scene": None, "task": None, "sensors": sensors, "arms": arms})

@@ -11,7 +11,8 @@ from robot.rig import CannotOpen
 from tacsim.compute.threads import map_parallel, map_serial
 from tacsim.control.gel_monitor import GelMonitor
 from tacsim.control.load_controller import load_controller
-from tacsim.interface import Arm, SensorSpec
+from tacsim.interface import Pose, SensorSpec
+from tacsim.models.hardware import Placement
 from tacsim.models.rig import RigConfig, SimArmConfig, SimSensorConfig
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
@@ -35,12 +36,17 @@ class Simulation:
     clock: SimClock
     stage: Stage
     sensors: Mapping[str, SimSensor]
+    arms: Mapping[str, SimArm]
 
-    def wear(self, models: Mapping[str, SensorModel]) -> None:
-        """Light, texture and noise of the sensors from the next episode on; their geometry and markers are those they
-        were made with."""
-        for name, model in models.items():
-            self.sensors[name].wear(*_pictures(model, name, self.stage.scene))
+    def wear(self, config: RigConfig) -> None:
+        """From the next episode on light, texture, noise and delay of the sensors, and error and delay of the arms, are
+        those of `config`; all else is that of the rig they were made with."""
+        for name, sensor in config.sensors.items():
+            assert isinstance(sensor, SimSensorConfig)
+            self.sensors[name].wear(*_pictures(sensor.model, name, self.stage.scene), sensor.delay)
+        for name, arm in config.arms.items():
+            assert isinstance(arm, SimArmConfig)
+            self.arms[name].believe(_error(arm), arm.delay)
 
 
 def open_sim(config: RigConfig) -> Rig:
@@ -76,14 +82,15 @@ def simulate(
     world = Stage(scene, make_world if make is None else make)
     clock = SimClock(world, config.period, config.motion)
     sensors = {name: _sim_sensor(world, clock, name, sensor, config) for name, sensor in models.items()}
-    arms: dict[str, Arm] = {}
+    arms: dict[str, SimArm] = {}
     for name, arm in config.arms.items():
         assert isinstance(arm, SimArmConfig)
         limits = arm.limits
         speed = arm.speed if limits is None else min(arm.speed, limits.speed)
         turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
         apart = [(frames[other], distance) for other, distance in config.kept_out(name).items()]
-        arms[name] = SimArm(world, clock, frames[name], speed * config.period, turn_rate * config.period, limits, apart)
+        longest, turn = speed * config.period, turn_rate * config.period
+        arms[name] = SimArm(world, clock, frames[name], longest, turn, limits, apart, _error(arm), arm.delay)
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
     rig = Rig(
@@ -102,7 +109,11 @@ def simulate(
         on_tactile=_gel_monitor(config, sensors),
         load_control=load_controller(config.task),
     )
-    return Simulation(rig, clock, world, sensors)
+    return Simulation(rig, clock, world, sensors, arms)
+
+
+def _error(arm: SimArmConfig) -> Pose | None:
+    return None if arm.error == Placement() else arm.error.pose
 
 
 def _gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> GelMonitor | None:
@@ -145,7 +156,7 @@ def _sim_sensor(world: World, clock: SimClock, name: str, config: SimSensorConfi
     spec = SensorSpec(shape, height=True, flow=model.markers is not None, arm=config.arm)
     sample = partial(surface_map, grid=rig.canonical, markers=model.markers)
     render, noise = _pictures(model, name, rig.scene)
-    return SimSensor(world, clock, name, spec, render, sample, noise)
+    return SimSensor(world, clock, name, spec, render, sample, noise, config.delay)
 
 
 def _pictures(model: SensorModel, name: str, scene: Scene) -> tuple[Renderer, NoiseSource | None]:

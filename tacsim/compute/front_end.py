@@ -13,8 +13,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from copy import copy
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -40,31 +39,17 @@ def quicken(kernel_impl: Any, context: Any, builder: Any) -> None:
     if hasattr(kernel_impl, "_inside_class"):
         kernel_impl._inside_class = _inside_class
     if hasattr(kernel_impl, "getsourcelines"):
-        kernel_impl.getsourcelines = lru_cache(maxsize=None)(kernel_impl.getsourcelines)
+        kernel_impl.getsourcelines = cache(kernel_impl.getsourcelines)
     if hasattr(kernel_impl, "getsourcefile"):
-        kernel_impl.getsourcefile = lru_cache(maxsize=None)(kernel_impl.getsourcefile)
+        kernel_impl.getsourcefile = cache(kernel_impl.getsourcefile)
     if hasattr(kernel_impl, "ast") and hasattr(kernel_impl, "textwrap"):
         kernel_impl.ast = SimpleNamespace(**{**vars(ast), "parse": _parse})
-        kept = {"fill": lru_cache(maxsize=None)(textwrap.fill), "dedent": lru_cache(maxsize=None)(textwrap.dedent)}
+        kept = {"fill": cache(textwrap.fill), "dedent": cache(textwrap.dedent)}
         kernel_impl.textwrap = SimpleNamespace(**{**vars(textwrap), **kept})
     if hasattr(context, "get_pos_info"):
         context.get_pos_info = _place
     if "__call__" in vars(builder):
         builder.__call__ = _by_statement(builder.__call__)
-
-
-_tree = lru_cache(maxsize=None)(ast.parse)
-
-
-def _parse(source: str) -> ast.Module:
-    """A function's syntax tree. None is changed where it is read, as bodies of static loops show, which are read many
-    times, but for the function itself: its decorators, and a kernel's parameters, which it is to keep for other types.
-    """
-    (function,) = _tree(source).body
-    assert isinstance(function, ast.FunctionDef)
-    function = copy(function)
-    function.args = copy(function.args)
-    return ast.Module([function], [])
 
 
 def _by_statement(build: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
@@ -75,6 +60,20 @@ def _by_statement(build: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, 
         return build(self, context, node) if method is None else method(context, node)
 
     return build_node
+
+
+def _parse(text: str) -> ast.Module:
+    """The tree of a function, parsed once. Taichi reads it again and again, as it does the bodies of static loops; all
+    that it takes out of it are a kernel's arguments, which are put back."""
+    tree, arguments = _parsed(text)
+    tree.body[0].args.args = list(arguments)  # type: ignore[attr-defined]
+    return tree
+
+
+@cache
+def _parsed(text: str) -> tuple[ast.Module, tuple[ast.arg, ...]]:
+    tree = ast.parse(text)
+    return tree, tuple(tree.body[0].args.args)  # type: ignore[attr-defined]
 
 
 def _place(context: Any, node: Any) -> str:

@@ -20,9 +20,8 @@ from tacsim.gym import encode
 from tacsim.gym.plugin import register_envs
 from tacsim.interface import Needs, Pose, Truth
 from tacsim.limits import LimitExceeded
-from tacsim.models.rig import TaskConfig
+from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
-from tacsim.models.sensor import SensorModel
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
@@ -40,7 +39,7 @@ class Variant:
 
     task: TaskConfig
     scene: Scene
-    sensors: Mapping[str, SensorModel]
+    rig: RigConfig | None  # light and noise of its sensors, errors and delays; None: as the environment's
     drawn: str = ""  # in words, for the record
 
 
@@ -63,7 +62,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         encoder: of the features that a learned policy sees; None: the environment shows all that there is.
         variants: each reset draws one of them, from its seed; none: the rig and the task stay as they are.
         stage: what the rig simulates, where a reset may exchange its scene.
-        wear: gives the sensors of the rig other light, texture and noise.
+        wear: gives sensors and arms of the rig what `Variant.rig` says of them.
 
     Raises IncompatibleRig when the rig lacks what the task needs.
     """
@@ -80,7 +79,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         encoder: FeatureEncoder | None = None,
         variants: Sequence[Variant] = (),
         stage: Stage | None = None,
-        wear: Callable[[Mapping[str, SensorModel]], None] = lambda models: None,
+        wear: Callable[[RigConfig], None] = lambda config: None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -137,8 +136,9 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             if not 0 <= played < len(self._variants):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")
             chosen = {"task": self._variants[played].task, "scene": self._variants[played].scene}
-            if played != self._played:
-                self._wear(self._variants[played].sensors)
+            worn = self._variants[played].rig
+            if worn is not None and played != self._played:
+                self._wear(worn)
         elif "variant" in options:
             raise ValueError("options: give a variant (of an environment that has some), or a task and a scene")
         if "task" in chosen:

@@ -7,10 +7,20 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from tacsim.models.hardware import ArmLimits, CameraSensorConfig, KeepOut, Name, ResetConfig, UrArmConfig
+from tacsim.models.hardware import (
+    ArmLimits,
+    CameraSensorConfig,
+    KeepOut,
+    Name,
+    Placement,
+    ResetConfig,
+    UrArmConfig,
+)
 from tacsim.models.quantity import Config, Force, Length, Speed, Time
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, SensorModel
+
+Delay = Annotated[int, Field(ge=0, le=20)]
 
 
 class SimArmConfig(Config):
@@ -22,6 +32,9 @@ class SimArmConfig(Config):
     # Those of the real arm, so that a policy meets them in simulation too: workspace, planes, speed, turn_rate, force,
     # torque, depth, shear. Accelerations and joints are not simulated; limits are checked once a period.
     limits: ArmLimits | None = None
+    # Where the arm believes its sensor to be, seen from where it is: what a calibration leaves of error.
+    error: Placement = Placement()
+    delay: Delay = 0  # its states are those of so many control periods ago
 
 
 class ReplayArmConfig(Config):
@@ -37,6 +50,7 @@ class SimSensorConfig(Config):
     driver: Literal["sim"]
     arm: Name
     model: SensorModel = SensorModel()
+    delay: Delay = 0  # its pictures are those of so many control periods ago
 
 
 class ReplaySensorConfig(Config):

@@ -11,7 +11,7 @@ from tacsim.interface import ArmState, FloatArray, Pose
 from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_step
 from tacsim.models.hardware import ArmLimits
 from tacsim.physics.world import World
-from tacsim.sim.clock import SimClock
+from tacsim.sim.clock import Delayed, SimClock
 
 
 class SimArm:
@@ -22,6 +22,8 @@ class SimArm:
         limits: guards the arm as a real one is guarded (robot.arm.ur), by the same functions: targets are shortened at
             the faces of its workspace, and too much force or torque stops it. None: no guard.
         keep_out: frames to stay away from, and how far [m]; targets are shortened at these spheres.
+        error: where it believes its frame to be, seen from where it is; None: it knows.
+        delay: its states are those of so many periods ago.
     """
 
     def __init__(
@@ -33,21 +35,37 @@ class SimArm:
         max_turn: float,
         limits: ArmLimits | None = None,
         keep_out: Iterable[tuple[str, float]] = (),
+        error: Pose | None = None,
+        delay: int = 0,
     ) -> None:
         self._world, self._clock, self._frame = world, clock, frame
         self._max_step, self._max_turn = max_step, max_turn
         self._limits, self._keep_out = limits, tuple(keep_out)
         self._region = None if limits is None else limits.region
+        self.believe(error, delay)
+
+    def believe(self, error: Pose | None, delay: int) -> None:
+        """Another error and delay, from the next episode on."""
+        self._error, self._past = error, Delayed[ArmState](delay)
 
     def state(self, at: float | None = None) -> ArmState:
-        """The state now: simulated pictures and arms are of one instant, so `at` makes no difference."""
+        """The state now, or `delay` periods ago. Simulated pictures and arms are of one instant, so `at` makes no
+        difference."""
+        return self._past(self._clock, self._state)
+
+    def _state(self) -> ArmState:
+        wrench = self._wrench()
         return ArmState(
-            pose=self._world.pose(self._frame),
+            pose=self._believed(),
             twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
-            wrench=self._wrench(),
+            wrench=wrench if self._error is None else se3.transform_wrench(se3.inverse(self._error), wrench),
             joints=None,
             time=self._clock.now(),
         )
+
+    def _believed(self) -> Pose:
+        here = self._world.pose(self._frame)
+        return here if self._error is None else se3.compose(here, self._error)
 
     def _wrench(self) -> FloatArray:
         """(6,) on the sensor; on the indenter, the reaction of all sensors. About its origin, in its axes [N, N m]."""
@@ -66,10 +84,11 @@ class SimArm:
         self._check_wrench()
         if target is None:
             return None
-        now = self._world.pose(self._frame)
+        now = self._believed()
         allowed, _ = clip_to_region(target, now, self._region, self._spheres())
         allowed = limit_step(allowed, now, self._max_step, self._max_turn)
-        self._clock.command(self._frame, allowed, limited=allowed is not target)
+        real = allowed if self._error is None else se3.compose(allowed, se3.inverse(self._error))
+        self._clock.command(self._frame, real, limited=allowed is not target)
         return allowed
 
     def stop(self) -> None:

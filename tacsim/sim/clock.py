@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
+from typing import Generic, TypeVar
 
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.rig import SimMotion
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.world import World
+
+Value = TypeVar("Value")
+
+
+class Delayed(Generic[Value]):
+    """What was seen `delay` periods ago; in the first periods of an episode, what was seen first."""
+
+    def __init__(self, delay: int) -> None:
+        self._past: deque[Value] = deque(maxlen=delay + 1)
+        self._version = -1
+
+    def __call__(self, clock: SimClock, look: Callable[[], Value]) -> Value:
+        """`look` is called once for each state of the world."""
+        if self._version != clock.version or not self._past:
+            if clock.now() == 0.0:
+                self._past.clear()
+            self._past.append(look())
+            self._version = clock.version
+        return self._past[0]
+
+    def forget(self) -> None:
+        self._past.clear()
 
 
 class SimClock:

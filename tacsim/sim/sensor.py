@@ -12,7 +12,7 @@ from tacsim.interface import SensorSpec, SurfaceMap, TactileFrame
 from tacsim.models.scene import GelSurface
 from tacsim.optics.noise import NoiseSource
 from tacsim.physics.world import World
-from tacsim.sim.clock import SimClock
+from tacsim.sim.clock import Delayed, SimClock
 
 
 class SimSensor:
@@ -22,6 +22,7 @@ class SimSensor:
         render: gel surface -> (H, W, 3) uint8 RGB.
         sample: gel surface -> height, gradient and flow on the canonical grid.
         noise: of its camera, drawn from the seed of the episode and the index of the frame; None: no noise.
+        delay: its pictures are those of so many periods ago.
     """
 
     def __init__(
@@ -33,29 +34,30 @@ class SimSensor:
         render: Callable[[GelSurface], NDArray[np.uint8]],
         sample: Callable[[GelSurface], SurfaceMap],
         noise: NoiseSource | None = None,
+        delay: int = 0,
     ) -> None:
         self._world, self._clock, self._frame, self.spec = world, clock, frame, spec
         self._render, self._sample, self._noise = render, sample, noise
-        self._newest: TactileFrame | None = None
+        self._past = Delayed[TactileFrame](delay)
         self._untouched: tuple[NDArray[np.uint8], SurfaceMap] | None = None
-        self._version = -1  # of the world in the newest frame
         self._index = self._episode = 0
 
     def read(self, timeout: float) -> TactileFrame:
-        """The picture of the world now; `timeout` makes no difference."""
-        if self._newest is None or self._version != self._clock.version:
-            image, seen = self._look(self._world.surface(self._frame))
-            if self._noise is not None:
-                image = self._noise(image, self._index, self._episode)
-            self._newest = TactileFrame(
-                image=image,
-                time=self._clock.now(),
-                index=self._index,
-                surface=seen,
-                stats=self._clock.diagnostics(),
-            )
-            self._version, self._index = self._clock.version, self._index + 1
-        return self._newest
+        """The picture of the world now, or `delay` periods ago; `timeout` makes no difference."""
+        return self._past(self._clock, self._frame_now)
+
+    def _frame_now(self) -> TactileFrame:
+        image, seen = self._look(self._world.surface(self._frame))
+        if self._noise is not None:
+            image = self._noise(image, self._index, self._episode)
+        self._index += 1
+        return TactileFrame(
+            image=image,
+            time=self._clock.now(),
+            index=self._index - 1,
+            surface=seen,
+            stats=self._clock.diagnostics(),
+        )
 
     def _look(self, surface: GelSurface) -> tuple[NDArray[np.uint8], SurfaceMap]:
         """Picture without noise, and heights. Those of an untouched gel, with which each episode begins, are kept."""
@@ -65,14 +67,15 @@ class SimSensor:
             self._untouched = self._render(surface), self._sample(surface)
         return deepcopy(self._untouched)  # nobody writes into what is kept
 
-    def wear(self, render: Callable[[GelSurface], NDArray[np.uint8]], noise: NoiseSource | None) -> None:
-        """Other light and another camera, from the next frame on."""
+    def wear(self, render: Callable[[GelSurface], NDArray[np.uint8]], noise: NoiseSource | None, delay: int) -> None:
+        """Other light and another camera, from the next episode on."""
         self._render, self._noise = render, noise
-        self._newest = self._untouched = None
+        self._past, self._untouched = Delayed[TactileFrame](delay), None
 
     def restart(self, episode: int = 0) -> None:
         """Counts frames from zero again; `episode` seeds the noise."""
-        self._newest, self._index, self._episode = None, 0, episode
+        self._past.forget()
+        self._index, self._episode = 0, episode
 
     def close(self) -> None:
         """Nothing is held open."""

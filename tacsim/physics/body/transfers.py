@@ -40,6 +40,7 @@ from tacsim.physics.exec.lanes import (
     add_to,
     bounded,
     copy_of,
+    filled,
     four,
     largest_lane,
     load_rows,
@@ -181,16 +182,16 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
     slab = ti.static(slab_of(env, part, (env.index * COPIES + copy_of(part)) * env.count(layout.CAPACITY)))
     float_zero = ti.cast(zero, ti.f32)  # 0, but a 0 that the compiler knows would make a lane unlike its neighbours
     lost, spare = 0, opaque(zero, 16)
-    place = ti.Matrix.zero(ti.f32, 3, LANES)  # on the grid
-    carried = ti.Matrix.zero(ti.f32, 9, LANES)  # displacement gradient
-    old = ti.Matrix.zero(ti.f32, 7, LANES)  # elastic strain, plastic strain
-    new = ti.Matrix.zero(ti.f32, 7, LANES)
-    stress = ti.Matrix.zero(ti.f32, 6, LANES)
-    rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
-    momentum = ti.Matrix.zero(ti.f32, 17, LANES)
-    grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
-    shares = ti.Matrix.zero(ti.f32, 9, LANES)  # of the stencil's lines
-    indices = ti.Matrix.zero(ti.i32, INDICES, LANES)
+    place = filled(0.0, 3, LANES)  # on the grid
+    carried = filled(0.0, 9, LANES)  # displacement gradient
+    old = filled(0.0, 7, LANES)  # elastic strain, plastic strain
+    new = filled(0.0, 7, LANES)
+    stress = filled(0.0, 6, LANES)
+    rate = filled(0.0, 12, LANES)  # velocity, affine velocity
+    momentum = filled(0.0, 17, LANES)
+    grid = filled(0.0, STENCIL, LANES)
+    shares = filled(0.0, 9, LANES)  # of the stencil's lines
+    indices = filled(0, INDICES, LANES)
     for lane in range(LANES):
         momentum[MOMENTUM + 3, lane] = mass
     for block in range(first_block, last_block):
@@ -306,17 +307,17 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
     first_block, last_block = block_range(env, part)
     stride = env.count(layout.STRIDE)
     slab = ti.static(slab_of(env, part, env.index * env.count(layout.CAPACITY)))
-    place = ti.Matrix.zero(ti.f32, 6, LANES)  # tangent plane, position
-    reference = ti.Matrix.zero(ti.f32, 3, LANES)  # place on the grid
-    carried = ti.Matrix.zero(ti.f32, 9, LANES)  # displacement gradient
-    strain = ti.Matrix.zero(ti.f32, 6, LANES)
-    rate = ti.Matrix.zero(ti.f32, 12, LANES)  # velocity, affine velocity
-    grid = ti.Matrix.zero(ti.f32, STENCIL, LANES)
-    indices = ti.Matrix.zero(ti.i32, INDICES, LANES)
-    sums = ti.Matrix.zero(ti.f32, 12, LANES)  # SUM, BY_X, BY_Y, BY_Z: three numbers each
-    nodes = ti.Matrix.zero(ti.f32, 4, 4 * NODES)  # the same of one particle, by nodes of a strip
+    place = filled(0.0, 6, LANES)  # tangent plane, position
+    reference = filled(0.0, 3, LANES)  # place on the grid
+    carried = filled(0.0, 9, LANES)  # displacement gradient
+    strain = filled(0.0, 6, LANES)
+    rate = filled(0.0, 12, LANES)  # velocity, affine velocity
+    grid = filled(0.0, STENCIL, LANES)
+    indices = filled(0, INDICES, LANES)
+    sums = filled(0.0, 12, LANES)  # SUM, BY_X, BY_Y, BY_Z: three numbers each
+    nodes = filled(0.0, 4, 4 * NODES)  # the same of one particle, by nodes of a strip
     # fastest, sum of velocities, smallest volume of a step, largest Green strain
-    extremes = ti.Matrix.zero(ti.f32, 8, LANES)
+    extremes = filled(0.0, 8, LANES)
     for lane in range(LANES):
         extremes[6, lane] = 1e9
     for block in range(first_block, last_block):

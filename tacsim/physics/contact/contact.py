@@ -10,7 +10,7 @@ flutter.
 from tacsim.compute.runtime import ti
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_more, record_most
-from tacsim.physics.exec.lanes import ON_DEVICE, add_four, slot_of, vec2, vec3, vec4
+from tacsim.physics.exec.lanes import ON_DEVICE, add_four, filled, slot_of, vec2, vec3, vec4
 from tacsim.physics.gel.kernels import surface_at, surface_row
 
 ContactHistory = ti.types.vector(6, ti.f32)  # what contact remembers of a particle and a gel
@@ -45,7 +45,7 @@ def surface_sum(gels: ti.template(), row, i, j, wx, wy):
             total += (wx[p] * wy[q]) * vec4([gels.surface[at + c] for c in range(4)])
         return total
     else:
-        sums = ti.Matrix.zero(ti.f32, 4, 1)
+        sums = filled(0.0, 4, 1)
         for c in range(4):
             total = 0.0
             for p, q in ti.static(ti.ndrange(3, 3)):
@@ -64,7 +64,7 @@ def surface_sums(gels: ti.template(), row, i, j, wx, wy, dx, dy):
             surface_sum(gels, row, i, j, wx, dy),
         )
     else:
-        sums = ti.Matrix.zero(ti.f32, 3, 4)
+        sums = filled(0.0, 3, 4)
         for c in range(4):
             value, by_x, by_y = 0.0, 0.0, 0.0
             for p in ti.static(range(3)):

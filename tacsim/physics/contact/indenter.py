@@ -18,6 +18,7 @@ from tacsim.physics.exec.lanes import (
     ON_DEVICE,
     add_four,
     copy_of,
+    filled,
     part_range,
     slot_of,
     vec3,
@@ -201,7 +202,7 @@ def patch_sums(gels: ti.template(), row, i, j, points: ti.template()):
 @ti.func
 def hand_on(gels: ti.template(), forces, i, j, pushes: ti.template()):
     """Adds what the points of cell (i, j) push, `pushes` (9, 4), to its 4 x 4 nodes: the other way round."""
-    nodes = ti.Matrix.zero(ti.f32, 16, 4)
+    nodes = filled(0.0, 16, 4)
     for c in range(4):
         at = [[pushes[POINTS * x + y, c] for y in range(POINTS)] for x in range(POINTS)]
         for q in ti.static(range(4)):
@@ -265,8 +266,8 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
     deepest = 0.0
     row, forces = surface_row(env, gels, 0), contact_force_start(env, gels, copy_of(part), 0)
     first_cell, last_cell, low, high = 0, 0, 0, ny
-    points = ti.Matrix.zero(ti.f32, 2 * POINTS * POINTS, 4)  # of one cell: what its points feel, and what they push
-    pushes = ti.Matrix.zero(ti.f32, POINTS * POINTS, 4)
+    points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: what its points feel, and what they push
+    pushes = filled(0.0, POINTS * POINTS, 4)
     if ti.static(ON_DEVICE):
         first_cell, low = part // ny, part % ny
         last_cell, high = first_cell + 1, low + 1

@@ -56,6 +56,13 @@ def aligned_zeros(*shape: int) -> np.ndarray:
 
 
 @ti.func
+def filled(value, rows: ti.template(), columns: ti.template()):
+    """A matrix (rows, columns) full of one number. In place of Matrix.zero, whose every zero is a constant of its own:
+    Taichi compiles for as long as there are constants, squared (docs/decisions/0017)."""
+    return ti.Matrix(ti.static([[value] * columns] * rows))
+
+
+@ti.func
 def overwrite(zero, old, new):
     """Returns `new`. `old` is used in name only (`zero` is 0, which the compiler cannot know): LLVM makes vectors of a
     value stored over the one just read."""

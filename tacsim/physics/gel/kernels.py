@@ -12,6 +12,7 @@ from tacsim.physics.exec.lanes import (
     ON_DEVICE,
     PARTS,
     bounded,
+    filled,
     lanes,
     load_lanes,
     opaque,
@@ -102,7 +103,7 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
     layer = blocks * LANES
     axis = (layers + 1) * layer
     u = margin(gels) + (env.index * gels.number + g) * 9 * axis
-    rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
+    rows = filled(0.0, ROWS, LANES)
     for lane in range(LANES):
         rows[SMALLEST, lane] = 1e9
     for k in range(layers + 1):
@@ -126,8 +127,8 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
 def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, forces, axis, zero):
     """Adds the contact forces of all parts to those on a gel's surface nodes, `first` to `last` by blocks, and leaves
     zeros for the next substep. forces: where those along x begin, `axis` the distance to those along y and z."""
-    push = ti.Matrix.zero(ti.f32, 4 * LANES, 1)
-    turned = ti.Matrix.zero(ti.f32, 4, LANES)
+    push = filled(0.0, 4 * LANES, 1)
+    turned = filled(0.0, 4, LANES)
     for block in range(first, last):
         for c in range(4 * LANES):
             total = 0.0

@@ -36,3 +36,14 @@ def action_from(
     for axis, value in zip(axes, values, strict=True):
         positions[axis.arm] += value * max_step * np.array(axis.direction)
     return Action({arm: Pose(position, poses[arm].quaternion) for arm, position in positions.items()})
+
+
+def vector_of(action: Action, axes: Sequence[Axis], max_step: float, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
+    """The vector that asks for `action` from `poses`: the inverse of `action_from`. What is longer than max_step is cut
+    to it, and what is not along an axis is left out; an arm that holds has zeros."""
+    vector = np.zeros(len(axes), np.float32)
+    for number, axis in enumerate(axes):
+        target = action.tool.get(axis.arm)
+        if target is not None:
+            vector[number] = (target.position - poses[axis.arm].position) @ np.array(axis.direction) / max_step
+    return vector.clip(-1.0, 1.0)

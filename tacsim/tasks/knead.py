@@ -80,6 +80,9 @@ class Knead:
     def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
         return None  # two contacts of one moment do not tell how round or how long a body is
 
+    def expert(self, truth: Truth, start: Truth) -> None:
+        return None
+
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedKnead(self, through)
 

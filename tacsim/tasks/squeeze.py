@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacsim.interface import Action, Needs, Observation, Policy, Pose, TactileObservation, Truth
+from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
 from tacsim.models.rig import SqueezeConfig
 from tacsim.tasks.task import Axis
 
+LEAST_SHARE = 0.1  # of the sensors' way that a body is taken to give
 REACHED = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 
 
@@ -41,6 +42,15 @@ class Squeeze:
     def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
         felt = all(touch.contact.any() for touch in observation.tactile.values())
         return abs(estimated_height(observation) - self.config.goal) if felt else None
+
+    def expert(self, truth: Truth, start: Truth) -> FloatArray:
+        """Both sensors close by what is left of the height, over the share of their way that the body has taken since
+        `start` (the gels take the rest), as fast as they may. Where that share stays what it was, nobody is there
+        sooner."""
+        closed, taken = _gap(start) - _gap(truth), start.height - truth.height
+        share = min(max(taken / closed, LEAST_SHARE), 1.0) if closed > 0 else 1.0
+        half = np.clip((truth.height - self.config.goal) / share / 2 / self.config.max_step, -1.0, 1.0)
+        return np.array([half, -half])
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedSqueeze(self.config, through)
@@ -87,3 +97,8 @@ def indentation(touch: TactileObservation) -> float:
     if touch.height is None:
         raise ValueError("indentation: this sensor delivers no surface height")
     return max(0.0, float(touch.height.max(where=touch.valid, initial=0.0)))
+
+
+def _gap(truth: Truth) -> float:
+    """Between the sensors, along world z [m]."""
+    return float(truth.poses["upper"].position[2] - truth.poses["lower"].position[2])

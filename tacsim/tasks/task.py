@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from tacsim.interface import Needs, Observation, Policy, Truth
+from tacsim.interface import FloatArray, Needs, Observation, Policy, Truth
 from tacsim.models.rig import TaskConfig
 
 
@@ -47,6 +47,10 @@ class Task(Protocol):
     def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
         """The same distance by touch alone, as it can be known on hardware; `start` is the first observation of the
         episode, `pitch` that of the canonical grid [m]. None where nothing is felt that tells it."""
+        ...
+
+    def expert(self, truth: Truth, start: Truth) -> FloatArray | None:
+        """The best action vector, by the truth; None where no rule for it is known."""
         ...
 
     def scripted(self, *, through: bool = False) -> Policy:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tacsim.interface import Pose
+from tacsim.interface import Action, Pose
 from tacsim.limits import ActionError
-from tacsim.tasks.action import action_from
+from tacsim.tasks.action import action_from, vector_of
 from tacsim.tasks.task import Axis
 
 AXES = (Axis("lower", (0.0, 0.0, 1.0)), Axis("upper", (1.0, 0.0, 0.0)), Axis("upper", (0.0, 1.0, 0.0)))
@@ -42,3 +42,10 @@ def test_a_vector_moves_each_arm_along_its_axes() -> None:
 def test_a_vector_that_is_no_action_is_refused(vector: Any, message: str) -> None:
     with pytest.raises(ActionError, match=message):
         action_from(np.array(vector), AXES, 2e-4, POSES)
+
+
+def test_the_vector_of_an_action_asks_for_it_as_far_as_axes_and_lengths_allow() -> None:
+    vector = np.array([0.5, -1.0, 0.25], np.float32)
+    assert vector_of(action_from(vector, AXES, 2e-4, POSES), AXES, 2e-4, POSES) == pytest.approx(vector, abs=1e-6)
+    far = Pose(POSES["upper"].position + [1e-3, -1e-4, 5e-3], POSES["upper"].quaternion)
+    assert vector_of(Action({"upper": far, "lower": None}), AXES, 2e-4, POSES).tolist() == [0.0, 1.0, -0.5]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from robot.deploy.control_loop import run_episode
-from tacsim.interface import Action, Observation
+from tacsim.interface import Action, Observation, Truth
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.tasks import make_task
+from tacsim.tasks.action import action_from
 from tacsim.tasks.grip import Grip
 from tacsim.tasks.reposition import centre_of_pressure, estimated_position
 from tacsim.tasks.squeeze import estimated_height
@@ -152,3 +154,37 @@ def test_grip_addresses_a_sensor_without_arm_by_its_name(open_springs: Any) -> N
     assert target is not None
     assert target.position == pytest.approx([0, 0, 0.1e-3])
     assert np.array_equal(target.quaternion, [0, 0, 0, 1])
+
+
+def by_the_expert(rig: Any, task: Any, steps: int) -> list[float]:
+    """Distances of an episode that the expert plays."""
+    observation, start = rig.reset(0), rig.truth()
+    distances = [task.distance(start, start)]
+    for _ in range(steps):
+        poses = {name: arm.pose for name, arm in observation.arms.items()}
+        vector = task.expert(rig.truth(), start)
+        observation, _ = rig.step(action_from(vector, task.axes, task.config.max_step, poses))
+        distances.append(task.distance(rig.truth(), start))
+    return distances
+
+
+def test_the_expert_of_squeeze_is_there_in_the_fewest_steps(open_springs: Any) -> None:
+    """Gels and body are springs of one stiffness, so the body gives a third of what the sensors close; they close by no
+    more than 2 max_step in a step. That bounds every policy."""
+    task = make_task(SqueezeConfig(kind="squeeze", goal=9.7e-3, max_step=0.1e-3))
+    distances = by_the_expert(open_springs(), task, 10)
+    fewest = math.ceil(3 * distances[0] / (2 * 0.1e-3))
+    assert fewest == 5
+    assert distances[fewest] < 1e-6 < distances[fewest - 1]
+    assert max(distances[fewest:]) < 1e-6
+
+
+def test_the_expert_of_reposition_goes_straight(open_springs: Any) -> None:
+    task = make_task(REPOSITION)
+    distances = by_the_expert(open_springs("reposition"), task, 40)
+    assert distances[-1] < 0.02e-3
+    assert task.expert(*(truth_at(x) for x in (0.0, 0.0))) == pytest.approx([1.0, -0.5])
+
+
+def truth_at(x: float) -> Truth:
+    return Truth(10e-3, np.array([x, 0.0, 5e-3]), np.zeros((1, 3), np.float32), {})

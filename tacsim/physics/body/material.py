@@ -11,6 +11,7 @@ vec3 = ti.types.vector(3, ti.f32)
 vec6 = ti.types.vector(6, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
 
+LN_2 = 0.6931471805599453
 SQRT_2_3 = (2.0 / 3.0) ** 0.5  # equivalent plastic strain over the norm of the plastic strain increment
 ELASTIC = 1e9  # elastic limit of a body that never yields: it runs no return mapping
 # Largest arguments of the series below: errors under float32's rounding, 1.4e-5 relative, 3e-6 absolute
@@ -94,11 +95,19 @@ def log1p(x):
 
 
 @ti.func
-def lanes_log1p(x):
-    """The same for lanes, without a branch: far from 0 by the fourth root."""
-    t = ti.sqrt(ti.sqrt(1.0 + x)) - 1.0
-    large = ti.abs(x) > SERIES_LOG1P
-    return ti.select(large, 4.0, 1.0) * log1p_series(ti.select(large, t / (2.0 + t), x / (2.0 + x)))
+def lanes_log(x):
+    """ln x of lanes, without a branch, root or quotient; x > 0, error under float32's rounding, also near 1.
+
+    x = 2^n (1 + z) with 1 + z from sqrt(1/2) to sqrt(2); the polynomial is that of Cephes (Moshier 1992).
+    """
+    bits = ti.bit_cast(x, ti.i32)
+    n = (bits - 0x3F3504F3) >> 23  # less the bits of sqrt(1/2)
+    z = ti.bit_cast(bits - (n << 23), ti.f32) - 1.0
+    z2 = z * z
+    low = (3.3333331174e-1 - 2.4999993993e-1 * z) + z2 * (2.0000714765e-1 - 1.6668057665e-1 * z)
+    high = (1.4249322787e-1 - 1.2420140846e-1 * z) + z2 * (1.1676998740e-1 - 1.1514610310e-1 * z)
+    rest = z2 * z * (low + z2 * z2 * (high + z2 * z2 * 7.0376836292e-2)) - 0.5 * z2
+    return z + rest + ti.cast(n, ti.f32) * LN_2
 
 
 @ti.func

@@ -4,8 +4,8 @@ Work is laid out for a CPU's vector registers. What concerns one particle alone 
 done for LANES particles in an inner loop over arrays of its own, which LLVM turns into whole vectors: nothing else can
 lie where it writes. Particles are kept in rows of one number of all of them, so such a block is loaded and stored in
 whole vectors, too. What goes to nodes and comes from them is done particle by particle with NODES neighbours of a grid
-line in a register; a stencil of three nodes begins at any node, a strip at every second one, so two strips hold it, and
-the node too many has weight 0.
+line in a register, one or two; with two a strip begins at every second node, a stencil of three at any, so two strips
+hold it, and the node too many has weight 0.
 
 Stencils belong to where a particle was when the grid was laid, its reference, and stay; F = I + H is its deformation
 since then, and A = dv/dX its affine velocity over the reference (total-Lagrangian MPM: de Vaucorbeil et al. 2020).
@@ -63,8 +63,7 @@ LINE = 2 if NODES == 2 else 3  # strips that hold three neighbours
 # Rows of a block's own arrays, LANES numbers each.
 AT = 0  # offset of the particle from the stencil's first node; along z from its first strip
 W_X, W_Y, W_Z = 3, 6, 9  # weights by axis
-D_X, D_Y = W_Z + NODES * LINE, W_Z + NODES * LINE + 2  # j w_j of the second and third node
-STENCIL = D_Y + 2
+STENCIL = W_Z + NODES * LINE
 # Whole numbers: the first strip of each of the stencil's 9 lines along z, then
 OFF, LARGE = 9, 10  # off the grid; strain for `return_any_strain`
 INDICES = 11
@@ -151,8 +150,6 @@ def stencil(x, slab: ti.template(), rows: ti.template(), indices: ti.template(),
         rows[W_Y + i, lane] = w[i + 1][1]
     for n in ti.static(range(NODES * LINE)):
         rows[W_Z + n, lane] = ti.select(shift == 0, w[n + 1][2], w[n][2])
-    rows[D_X, lane], rows[D_X + 1, lane] = w[2][0], 2.0 * w[3][0]
-    rows[D_Y, lane], rows[D_Y + 1, lane] = w[2][1], 2.0 * w[3][1]
     row, at = nz // NODES, (first[0] * ny + first[1]) * (nz // NODES) + first[2] // NODES
     at = ti.select(off == 0, slab.base + at, slab.discard)
     for i, j in ti.static(ti.ndrange(3, 3)):
@@ -285,9 +282,11 @@ def mean(rows: ti.template(), row: ti.template(), lane, a, b, c):
 
 
 @ti.func
-def slope(rows: ti.template(), row: ti.template(), lane, b, c):
-    """The same with the node's number as a factor, by two rows: it is 0 for the first node."""
-    return rows[row, lane] * b + rows[row + 1, lane] * c
+def sums_of(rows: ti.template(), row: ti.template(), lane, a, b, c):
+    """The same sum, and that with the node's number as a factor, which is 0, 1 and 2."""
+    second, third = rows[row + 1, lane] * b, rows[row + 2, lane] * c
+    without_first = second + third
+    return rows[row, lane] * a + without_first, without_first + third
 
 
 @ti.func
@@ -341,12 +340,12 @@ def grid_to_particles(env: ti.template(), part, body: ti.template()):
                         v0, v1, v2 = [
                             body.velocities[bounded(indices[3 * i + j, lane], 4 * NODES) + s][c] for j in range(3)
                         ]
-                        plane[i] = mean(grid, W_Y, lane, v0, v1, v2)
-                        sloped[i] = slope(grid, D_Y, lane, v1, v2)
+                        plane[i], sloped[i] = sums_of(grid, W_Y, lane, v0, v1, v2)
                     w = ti.select(c < 4, grid[W_Z + NODES * s, lane], grid[W_Z + NODES * s + NODES - 1, lane])
-                    here = w * mean(grid, W_X, lane, plane[0], plane[1], plane[2])
+                    here, across = sums_of(grid, W_X, lane, plane[0], plane[1], plane[2])
+                    here *= w
                     total += here
-                    by_x += w * slope(grid, D_X, lane, plane[1], plane[2])
+                    by_x += w * across
                     by_y += w * mean(grid, W_X, lane, sloped[0], sloped[1], sloped[2])
                     by_z += ti.select(c < 4, float(NODES * s), float(NODES * s + 1)) * here
                 nodes[SUM, c], nodes[BY_X, c], nodes[BY_Y, c], nodes[BY_Z, c] = total, by_x, by_y, by_z

@@ -154,6 +154,15 @@ def contact_ceiling(env: ti.template(), gels: ti.template(), g):
 
 
 @ti.func
+def highest_near(gels: ti.template(), row, i, j):
+    """Height of the highest of the 3 x 3 nodes of a stencil from (i, j) on [mm]."""
+    highest = gels.surface[surface_at(gels, row + i + 1, j + 1) + 2]
+    for p, q in ti.static(ti.ndrange(3, 3)):
+        highest = ti.max(highest, gels.surface[surface_at(gels, row + i + p + 1, j + q + 1) + 2])
+    return highest
+
+
+@ti.func
 def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: ti.template(), row, forces):
     """Force on one particle from gel g (or its housing); all in the sensor frame. The opposite acts on the gel's nodes.
 
@@ -179,46 +188,50 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
         a = vec2(ti.max(0.0, ti.min(last[0], nx)), ti.max(0.0, ti.min(last[1], ny)))
         i, wx, dx = spline(a[0])
         j, wy, dy = spline(a[1])
-        us, t1, t2 = surface_sums(gels, row, i, j, wx, wy, dx / h, dy / h)
-        t1[0] += 1.0
-        t2[1] += 1.0
-        step = newton_step(t1, t2, start - a - vec2(us[0], us[1]) / h)
-        a += step
-        moved = h * (start - a)
-        inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
-        if inside:
-            depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
-            if k_n * depth + pressed > 0.0:
-                vs = surface_sum(gels, row + nx + 3, i, j, wx, wy)
-                n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
-                gap = depth * n[2]  # overlap; negative where they have parted
-                if gap > deepest:  # an overlap found late must not explode; counted
-                    gap = deepest
-                    record_more(env, slot_of(part), layout.CAPPED, 1.0)
-                vr = v - vec3(vs[0], vs[1], vs[2])
-                vn = vr.dot(n)
-                fn, pressed = normal_force(k_n * gap, pressed, c_n * vn)
-                ft, slip = friction(slip, n, vr - vn * n, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
-                force = fn * n + ft
-                in_contact = True
-                overlap = gap
-                back = vec4(force[0], force[1], force[2], 0.0)
-                for p, q in ti.static(ti.ndrange(3, 3)):
-                    node = surface_node(gels, i + p, j + q)
-                    add_four(gels.contact_force, forces + 4 * node, -(wx[p] * wy[q]) * back)
-        elif housing >= 0.0:
-            gap = radius - housing - x[2]
-            if k_n * gap + pressed > 0.0:
-                if gap > deepest:
-                    gap = deepest
-                    record_more(env, slot_of(part), layout.CAPPED, 1.0)
-                n = vec3(0.0, 0.0, 1.0)
-                fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
-                along = vec3(v[0], v[1], 0.0)
-                ft, slip = friction(slip, n, along, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
-                force = fn * n + ft
-                in_contact, housed = True, True
-                overlap = gap
+        moved = vec2(history[4], history[5])
+        # most particles near the gel lie behind others: its nodes are lower. Where it ends, the housing counts.
+        ends = i < 0 or j < 0 or i + 2 > nx or j + 2 > ny
+        if ends or x[2] < highest_near(gels, row, i, j) + radius + 0.25 * deepest:
+            us, t1, t2 = surface_sums(gels, row, i, j, wx, wy, dx / h, dy / h)
+            t1[0] += 1.0
+            t2[1] += 1.0
+            step = newton_step(t1, t2, start - a - vec2(us[0], us[1]) / h)
+            a += step
+            moved = h * (start - a)
+            inside = a[0] > 0.0 and a[1] > 0.0 and a[0] < nx and a[1] < ny
+            if inside:
+                depth = us[2] + h * (step[0] * t1[2] + step[1] * t2[2]) + radius - x[2]
+                if k_n * depth + pressed > 0.0:
+                    vs = surface_sum(gels, row + nx + 3, i, j, wx, wy)
+                    n = vec3(t1[0], t1[1], t1[2]).cross(vec3(t2[0], t2[1], t2[2])).normalized()
+                    gap = depth * n[2]  # overlap; negative where they have parted
+                    if gap > deepest:  # an overlap found late must not explode; counted
+                        gap = deepest
+                        record_more(env, slot_of(part), layout.CAPPED, 1.0)
+                    vr = v - vec3(vs[0], vs[1], vs[2])
+                    vn = vr.dot(n)
+                    fn, pressed = normal_force(k_n * gap, pressed, c_n * vn)
+                    ft, slip = friction(slip, n, vr - vn * n, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
+                    force = fn * n + ft
+                    in_contact = True
+                    overlap = gap
+                    back = vec4(force[0], force[1], force[2], 0.0)
+                    for p, q in ti.static(ti.ndrange(3, 3)):
+                        node = surface_node(gels, i + p, j + q)
+                        add_four(gels.contact_force, forces + 4 * node, -(wx[p] * wy[q]) * back)
+            elif housing >= 0.0:
+                gap = radius - housing - x[2]
+                if k_n * gap + pressed > 0.0:
+                    if gap > deepest:
+                        gap = deepest
+                        record_more(env, slot_of(part), layout.CAPPED, 1.0)
+                    n = vec3(0.0, 0.0, 1.0)
+                    fn, pressed = normal_force(k_n * gap, pressed, c_n * v[2])
+                    along = vec3(v[0], v[1], 0.0)
+                    ft, slip = friction(slip, n, along, mu * pressed, TANGENT_STIFFNESS * k_n, c_n, dt)
+                    force = fn * n + ft
+                    in_contact, housed = True, True
+                    overlap = gap
     remembered = ContactHistory([0.0, 0.0, 0.0, 0.0, moved[0], moved[1]])
     if in_contact:
         remembered = ContactHistory([slip[0], slip[1], slip[2], pressed / k_n, moved[0], moved[1]])

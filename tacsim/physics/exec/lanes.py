@@ -13,10 +13,27 @@ kernel is compiled.
 """
 
 import math
+import platform
+import re
+from pathlib import Path
 
 import numpy as np
 
 from tacsim.compute.runtime import DEVICE, ti
+
+
+def registers_of_four() -> bool:
+    """Whether kernels get vector registers of four floats, not of eight: on ARM, and on AMD's CPUs after Zen 4, which
+    LLVM 15, by which Taichi 1.7 compiles, does not know and takes for one with SSE2 (docs/decisions/0007)."""
+    if platform.machine().lower() in ("arm64", "aarch64"):
+        return True
+    try:
+        about = Path("/proc/cpuinfo").read_text()
+    except OSError:  # not Linux
+        return False
+    family = re.search(r"^vendor_id\s*: AuthenticAMD\ncpu family\s*: (\d+)$", about, re.MULTILINE)
+    return family is not None and int(family[1]) > 25
+
 
 ON_DEVICE = DEVICE != "cpu"
 LANES = 1 if ON_DEVICE else 8  # floats in a vector register of AVX2; a GPU's threads are its lanes
@@ -25,7 +42,8 @@ CACHE_LINE = 16  # floats
 MAX_NUMBERS = 2**30  # numbers in an array that kernels take
 COPIES = 1 if ON_DEVICE else PARTS  # of what is scattered into
 
-NODES = 1 if ON_DEVICE else 2  # neighbours along a line of the body's grid in one vector register: a strip
+# Neighbours along a line of the body's grid in one vector register: a strip
+NODES = 1 if ON_DEVICE or registers_of_four() else 2
 
 vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
@@ -209,8 +227,11 @@ def add_to(array: ti.template(), at: ti.template(), value: ti.template()):
 @ti.func
 def add_four(array: ti.template(), at, value):
     """Adds to four neighbours of what a part scatters into."""
-    for c in ti.static(range(4)):
-        if ti.static(ON_DEVICE):
+    if ti.static(ON_DEVICE):
+        for c in ti.static(range(4)):
             ti.atomic_add(array[at + c], value[c])
-        else:
-            array[at + c] = array[at + c] + value[c]
+    else:
+        start = bounded(at, 1)
+        sums = vec4([array[start + c] + value[c] for c in range(4)])
+        for c in ti.static(range(4)):
+            array[start + c] = sums[c]

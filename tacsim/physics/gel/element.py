@@ -2,7 +2,7 @@
 1981), neo-Hookean. LANES neighbours at once, laid out as the particles are in tacsim/physics/body/transfers.py."""
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.material import lanes_log1p
+from tacsim.physics.body.material import lanes_log
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import LANES, lanes, load_lanes, opaque, store_lanes, vec3
 
@@ -63,7 +63,7 @@ def element_block(
         jacobian = fx.dot(x)
         safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
         # neo-Hooke: P = mu F + (lambda ln J - mu) cof(F) / J
-        pressure = (lam * lanes_log1p(safe - 1.0) - mu) / safe
+        pressure = (lam * lanes_log(safe) - mu) / safe
         rows[SMALLEST, lane] = ti.min(rows[SMALLEST, lane], ti.select(whole > 0.0, jacobian, 1.0))
         for d in ti.static(range(3)):
             px = area * (mu * fx[d] + pressure * x[d])

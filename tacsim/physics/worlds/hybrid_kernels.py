@@ -13,7 +13,21 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial, record_sum
-from tacsim.physics.exec.lanes import LANES, NODES, ON_DEVICE, PARTS, copy_of, part_range, slot_of, strip, vec3
+from tacsim.physics.exec.lanes import (
+    LANES,
+    NODES,
+    ON_DEVICE,
+    PARTS,
+    copy_of,
+    filled,
+    load_rows,
+    part_range,
+    slot_of,
+    smallest_lane,
+    strip,
+    three,
+    vec3,
+)
 from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, piece_done
 from tacsim.physics.gel.kernels import (
     Lattice,
@@ -160,32 +174,39 @@ def gel_contact(
     stride, rows = env.count(layout.STRIDE), surface_row(env, gels, g)
     forces = contact_force_start(env, gels, copy_of(part), g)
     first, last = block_range(env, part)
-    for p in range(first * LANES, ti.min(last * LANES, env.count(layout.PARTICLES))):
-        at = env.index * layout.PARTICLE_ROWS * stride + p
-        arm = three_rows(body.particles, at + layout.POSITION * stride, stride) - origin
-        away = outward.dot(arm) - highest  # most of the body is far away: one dot product decides
-        radius = spacing  # at most
-        if away < 2.5 * spacing:
-            radius = support_radius(three_rows(body.particles, at + layout.PLANE * stride, stride), spacing)
-        # one radius to touch, half a spacing for what the contact's memory still bridges
-        if away < radius + 0.5 * spacing:
-            local = back @ arm
-            moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
-            relative = back @ (moving - velocity - spin.cross(arm))
-            in_contact, housed, force, history = particle_contact(
-                env, part, g, local, relative, histories[env.index, g, p], radius, gels, rows, forces
-            )
-            histories[env.index, g, p] = history
-            if in_contact:
-                moving += rate * (rotate @ force)
-                for d in ti.static(range(3)):
-                    body.particles[at + (layout.VELOCITY + d) * stride] = moving[d]
-                total -= force
-                moment -= local.cross(force)
-                if housed:
-                    on_housing -= force
-        elif away < 2.5 * spacing:  # nothing passes this margin in one substep, so what is beyond has forgotten
-            histories[env.index, g, p] = ContactHistory(0.0)
+    place = filled(0.0, 4, LANES)  # of a block's particles; how far they are away
+    for block in range(first, last):
+        start = env.index * layout.PARTICLE_ROWS * stride + block * LANES
+        load_rows(body.particles, start, stride, layout.POSITION, 3, place)
+        for lane in range(LANES):
+            place[3, lane] = outward.dot(three(place, 0, lane) - origin) - highest
+        # most of the body is far away: one dot product decides, for a whole block
+        near = ti.select(smallest_lane(place, 3) < 2.5 * spacing, LANES, 0)
+        for lane in range(ti.min(near, env.count(layout.PARTICLES) - block * LANES)):
+            at, p, away = start + lane, block * LANES + lane, place[3, lane]
+            arm = three(place, 0, lane) - origin
+            radius = spacing  # at most
+            if away < 2.5 * spacing:
+                radius = support_radius(three_rows(body.particles, at + layout.PLANE * stride, stride), spacing)
+            # one radius to touch, half a spacing for what the contact's memory still bridges
+            if away < radius + 0.5 * spacing:
+                local = back @ arm
+                moving = three_rows(body.particles, at + layout.VELOCITY * stride, stride)
+                relative = back @ (moving - velocity - spin.cross(arm))
+                in_contact, housed, force, history = particle_contact(
+                    env, part, g, local, relative, histories[env.index, g, p], radius, gels, rows, forces
+                )
+                histories[env.index, g, p] = history
+                if in_contact:
+                    moving += rate * (rotate @ force)
+                    for d in ti.static(range(3)):
+                        body.particles[at + (layout.VELOCITY + d) * stride] = moving[d]
+                    total -= force
+                    moment -= local.cross(force)
+                    if housed:
+                        on_housing -= force
+            elif away < 2.5 * spacing:  # nothing passes this margin in one substep, so what is beyond has forgotten
+                histories[env.index, g, p] = ContactHistory(0.0)
     slot = slot_of(part)
     for d in ti.static(range(3)):
         record_sum(env, slot, layout.FORCE + 6 * g + d, total[d])

@@ -18,7 +18,7 @@ from tacsim.physics.body.transfers import (
 )
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
-from tacsim.physics.exec.lanes import PARTS
+from tacsim.physics.exec.lanes import NODES, PARTS
 from tacsim.physics.oracle import mls_mpm
 from tacsim.physics.worlds.hybrid_kernels import Drive, grid_update
 
@@ -104,7 +104,7 @@ def stages() -> Stages:
     found: Stages = {}
     scatter(*arrays, *numbers)
     mls_mpm.particles_to_grid(x, v, c, f, momentum, mass, dx, dt, material)
-    used = np.prod(shape) // 2
+    used = np.prod(shape) // NODES
     sums = state.masses[0, :, :used].sum(axis=0, dtype=np.float64).reshape(*shape, 4)
     found["mass"], found["momentum"] = (sums[..., 3], mass.copy()), (sums[..., :3], momentum.copy())
     found["elastic strain"] = state.e().copy(), minus_identity(f)

@@ -37,6 +37,20 @@ def convect_all(e: Strains, d: Matrices):
         e[p] = material.convect(e[p], d[p])
 
 
+@ti.kernel
+def log_all(x: Scalars, y: Scalars):
+    for p in range(x.shape[0]):
+        y[p] = material.lanes_log(x[p])
+
+
+def test_lanes_have_a_logarithm_to_float32s_digits():
+    start()
+    x = np.float32(np.concatenate([np.geomspace(0.05, 30.0, 20_000), 1.0 + np.linspace(-1e-3, 1e-3, 2_001)]))
+    found, exact = np.zeros_like(x), np.log(x.astype(float))
+    log_all(x, found)
+    np.testing.assert_allclose(found, exact, rtol=2e-7)
+
+
 def six(m: np.ndarray) -> np.ndarray:
     return np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], m[..., 0, 1], m[..., 0, 2], m[..., 1, 2]], -1)
 

@@ -92,6 +92,8 @@ class Path:
 
     def _displacements(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 6) of a frame from its start: [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
+        if not self.substeps:
+            return np.zeros((len(knots), 6))
         t = np.clip(knots, 0.0, 1.0)[:, None]
         whole = displacement_between(self.start[index], self.end[index])
         if self.rates is None:

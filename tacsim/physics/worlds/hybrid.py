@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -164,6 +165,13 @@ class HybridState(FemState):
         )  # fmt: skip
 
 
+@lru_cache(maxsize=256)
+def _inverse_of(second: bytes) -> np.ndarray:
+    """Pseudo-inverse of second moments (3, 3) float64: those of a reference stay for many launches."""
+    inverse: np.ndarray = np.linalg.pinv(np.frombuffer(second).reshape(3, 3), rcond=1e-6, hermitian=True)
+    return inverse
+
+
 def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
     """A scene's body: parameters, particles at construction (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
     assert scene.body is not None
@@ -304,9 +312,7 @@ class HybridWorld(FemWorld):
         """Centre, inverse moment of inertia and mean motion of the particles since their reference, for the kernels."""
         params = self._state.params[self._index]
         params[REFERENCE_CENTRE : REFERENCE_CENTRE + 3] = moments.reference_centre
-        params[CARRIED : CARRIED + 9] = (
-            moments.moved @ np.linalg.pinv(moments.reference_second, rcond=1e-6, hermitian=True)
-        ).ravel()
+        params[CARRIED : CARRIED + 9] = (moments.moved @ _inverse_of(moments.reference_second.tobytes())).ravel()
         second = moments.second * float(params[BODY_MASS])
         inertia = np.trace(second) * np.eye(3) - second
         inverse = _pseudo_inverse(inertia)

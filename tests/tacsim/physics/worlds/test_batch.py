@@ -137,6 +137,9 @@ def test_one_that_is_replaced_is_a_new_world_to_the_bit() -> None:
         batch.replace(0, scene)
         new = HybridWorld(scene)
         assert_same(batch.worlds, [new, alone])
+        end = batch.move([None, closed(alone, 0.1e-3)])[1]  # the other alone, now that rows may be longer
+        assert end == alone.move(closed(alone, 0.1e-3))
+        assert_same(batch.worlds, [new, alone])
         ends = batch.move([closed(new, 0.7e-3), closed(alone, 0.1e-3)])
         assert ends == [new.move(closed(new, 0.7e-3)), alone.move(closed(alone, 0.1e-3))]
         assert_same(batch.worlds, [new, alone])

@@ -16,7 +16,7 @@ from tests.robot.rig.bare_rig import Opened, failing, opened, until
 pytestmark = pytest.mark.usefixtures("no_pause")
 SMALL = [f"canonical.{key}={value}" for key, value in (("rows", 32), ("columns", 32), ("pitch", "0.5 mm"))]
 for _name in ("lower", "upper"):
-    SMALL += [f"sensors.{_name}.{side}={pixels}" for side, pixels in (("width", 80), ("height", 60))]
+    SMALL += [f"sensors.{_name}.{key}={value}" for key, value in (("width", 80), ("height", 60), ("max_age", "20 s"))]
     SMALL += [
         f"sensors.{_name}.model.geometry.{key}={value}"
         for key, value in (("width", 80), ("height", 60), ("pixel_pitch", "0.1 mm"))

@@ -12,9 +12,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 
 from tacsim.geometry import shapes
 from tacsim.interface import FloatArray
@@ -78,6 +75,8 @@ def chamfer(body: FloatArray, solid: Solid, volume: float) -> float:
     Each particle covers the points that are no farther than half the diagonal of its cube, so that a body that fills
     the solid is at 0.
     """
+    from scipy.spatial import KDTree  # here: other tasks start without SciPy, 0.3 s sooner
+
     outside = np.maximum(solid.distance(body), 0.0).mean()
     reach = 0.5 * np.sqrt(3.0) * (volume / len(body)) ** (1 / 3)
     bare = np.maximum(KDTree(body).query(solid.points)[0] - reach, 0.0).mean()
@@ -86,6 +85,9 @@ def chamfer(body: FloatArray, solid: Solid, volume: float) -> float:
 
 def earth_movers(one: FloatArray, other: FloatArray) -> float:
     """Mean way that the points of one cloud have to go to become the other, of as many points, at best [m]."""
+    from scipy.optimize import linear_sum_assignment
+    from scipy.spatial.distance import cdist
+
     ways = cdist(one, other)
     return float(ways[linear_sum_assignment(ways)].mean())
 

@@ -155,7 +155,7 @@ def _gap(truth: Truth, sensor: Pose) -> float:
     """From the gel's rest surface to the nearest face of the body, along the sensor's z [m]."""
     points = truth.points.astype(np.float64)
     radius = 0.5 * (truth.height - float(np.ptp(points[:, 2])))
-    axis = se3.rotation(sensor).as_matrix()[:, 2]
+    axis = se3.matrix(sensor)[:, 2]
     return float(((points - sensor.position) @ axis).min()) - radius
 
 

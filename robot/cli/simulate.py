@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -13,7 +14,6 @@ from robot.cli.options import Out, Overrides, angle, length, quantities
 from robot.cli.output import busy, new_directory, notes, progress, results, say_files, writing
 
 if TYPE_CHECKING:
-    from tacsim.models.scene import Shape
     from tacsim.report.figure4 import Trial
 
 
@@ -29,6 +29,7 @@ def press(
     size: Annotated[
         Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
     ] = "5 mm, 5 mm, 5 mm",
+    edge_radius: Annotated[Any, length("Of a box's or cylinder's edges.")] = "0 mm",
     scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     set_: Overrides = None,
@@ -43,10 +44,8 @@ def press(
     from tacsim.config import load_scene, load_sensor
 
     folder = new_directory(out, "press")
-    scene = load_scene("press", [f"preset={preset}", *(set_ or [])])
-    if scene.indenter is not None:  # else the press refuses the scene
-        shape = _geometry(indenter, radius, height, size, scale)
-        scene = scene.model_copy(update={"indenter": scene.indenter.model_copy(update={"geometry": shape})})
+    shape = [_geometry(indenter, radius, height, size, scale), f"indenter.edge_radius={edge_radius!r}"]
+    scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
     sensor = load_sensor("ideal")
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
         from robot.studies import press as presses
@@ -61,32 +60,29 @@ def press(
     results.print(f"force            {config['force']:.4f} N")
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
+    if config["edge_radius"] is not None:
+        results.print(
+            f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{'' if config['edge_radius'] else ' (sharp)'}"
+        )
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         notes.print(f"warning: not settled, {held}; raise settling.max_substeps")
     say_files(*sorted(folder.iterdir()))
 
 
-def _geometry(indenter: str, radius: float, height: float, size: tuple[float, ...], scale: float) -> Shape:
-    from pydantic import TypeAdapter, ValidationError
-
-    from tacsim.models.scene import Shape
-
-    known: dict[str, dict[str, Any]] = {
+def _geometry(indenter: str, radius: float, height: float, size: tuple[float, ...], scale: float) -> str:
+    """The override that puts an indenter into a scene. Raises typer.BadParameter for a name that is none."""
+    described: dict[str, dict[str, Any]] = {
         "sphere": {"radius": radius},
         "cylinder": {"radius": radius, "height": height},
         "box": {"size": size},
     }
-    if indenter not in known and not indenter.lower().endswith(".stl"):
+    if indenter in described:
+        return f"indenter.geometry={json.dumps({'shape': indenter, **described[indenter]})}"
+    if not indenter.lower().endswith(".stl"):
         words = f"'{indenter}' is no indenter; allowed: sphere, cylinder, box, or the path of an .stl file"
         raise typer.BadParameter(words, param_hint="INDENTER")
-    described = {"shape": indenter, **known[indenter]} if indenter in known else {"path": indenter, "scale": scale}
-    try:
-        shape: Shape = TypeAdapter(Shape).validate_python({"shape": "stl", **described})
-    except ValidationError as error:
-        problems = "; ".join(f"{part['loc'][-1]}: {part['msg']}" for part in error.errors())
-        raise typer.BadParameter(problems, param_hint="INDENTER") from None
-    return shape
+    return f"indenter.geometry={json.dumps({'shape': 'stl', 'path': str(Path(indenter).absolute()), 'scale': scale})}"
 
 
 def reproduce(

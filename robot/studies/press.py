@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tacsim import pose as se3
 from tacsim.geometry.shapes import distance, extent
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.scene import Gel, Scene, Shape
+from tacsim.models.scene import Box, Cylinder, Gel, Scene, Shape
 from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
@@ -111,7 +111,7 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
     near = (np.abs(at) <= extent(geometry) / 2 + NEAR * scene.element).all(axis=1) & seen.valid.ravel()
     gaps = np.full(len(at), np.inf)
     if near.any():
-        gaps[near] = distance(geometry, at[near])
+        gaps[near] = distance(geometry, at[near], scene.indenter.edge_radius)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.seen(table.of_nodes(world.reach().astype(np.float32)), grid)
     pressed: NDArray[np.bool_] = gaps.reshape(seen.valid.shape) < reach.reshape(seen.valid.shape)
@@ -119,10 +119,12 @@ def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: Senso
 
 
 def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor: SensorModel) -> dict[str, Any]:
-    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured."""
+    """The result as JSON, SI units. residual: None where nothing was held, so that none was measured; edge_radius: None
+    of a ball, which has no edges, and of a mesh, whose edges are as drawn."""
     residual = max(move.residual for move in pressed.moves)
     return {
         "indenter": scene.indenter.model_dump(mode="json") if scene.indenter else None,
+        "edge_radius": _edge_radius(scene),
         "gel": scene.gel.model_dump(mode="json"),
         "preset": scene.preset,
         "element_size": scene.element,
@@ -138,6 +140,12 @@ def press_report(scene: Scene, motion: PressMotion, pressed: PressResult, sensor
         "residual": residual if math.isfinite(residual) else None,
         "substeps": sum(move.substeps for move in pressed.moves),
     }
+
+
+def _edge_radius(scene: Scene) -> float | None:
+    """Of the indenter's edges [m]; None where its geometry has none or says it."""
+    assert scene.indenter is not None
+    return scene.indenter.edge_radius if isinstance(scene.indenter.geometry, Box | Cylinder) else None
 
 
 def write(folder: Path, pressed: PressResult, config: dict[str, Any]) -> None:

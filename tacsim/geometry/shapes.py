@@ -49,21 +49,23 @@ def extent(geometry: Shape) -> FloatArray:
             return np.array(_mesh_extent(geometry, fingerprint(geometry.path)))
 
 
-def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike) -> FloatArray:
+def farthest(geometry: Box | Sphere | Cylinder, direction: ArrayLike, edge_radius: float = 0.0) -> FloatArray:
     """The point (3,) [m] of a shape that lies farthest along `direction` (3,); of several, the middle of those.
 
-    A face or edge within LEVEL of square to the direction is square to it, for rounding must not choose a corner.
+    edge_radius: of the edges of a box or cylinder, rounded within its size [m]. A face or edge within LEVEL of square
+    to the direction is square to it, for rounding must not choose a corner.
     """
     along = np.asarray(direction, dtype=np.float64)
     along = np.where(np.abs(along) > LEVEL * np.linalg.norm(along), along, 0.0)
+    rounding = edge_radius * along / np.linalg.norm(along)
     match geometry:
         case Box():
-            return np.asarray(np.sign(along) * np.array(geometry.size) / 2)
+            return np.asarray(np.sign(along) * (np.array(geometry.size) / 2 - edge_radius) + rounding)
         case Sphere():
             return np.asarray(geometry.radius * along / np.linalg.norm(along))
         case Cylinder():
-            rim = geometry.radius * along[:2] / max(float(np.linalg.norm(along[:2])), 1e-12)
-            return np.append(rim, np.sign(along[2]) * geometry.height / 2)
+            rim = (geometry.radius - edge_radius) * along[:2] / max(float(np.linalg.norm(along[:2])), 1e-12)
+            return np.append(rim, np.sign(along[2]) * (geometry.height / 2 - edge_radius)) + rounding
 
 
 def volume(geometry: Shape) -> float:
@@ -137,8 +139,10 @@ def _check_layers(geometry: Shape, size: FloatArray, spacing: float, layers: NDA
         )
 
 
-def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
+def distance(geometry: Shape, points: ArrayLike, edge_radius: float = 0.0) -> FloatArray:
     """Signed distance (n,) [m] of `points` (n, 3) [m] from the surface: exact, Euclidean, negative inside.
+
+    edge_radius: of the edges of a box or cylinder, rounded within its size [m].
 
     Raises what :func:`tacsim.geometry.mesh.load_mesh` raises.
     """
@@ -147,10 +151,11 @@ def distance(geometry: Shape, points: ArrayLike) -> FloatArray:
         case Sphere():
             return np.asarray(np.linalg.norm(at, axis=1) - geometry.radius, dtype=np.float64)
         case Box():
-            return _outside_and_inside(np.abs(at) - np.array(geometry.size) / 2)
+            return _outside_and_inside(np.abs(at) - np.array(geometry.size) / 2 + edge_radius) - edge_radius
         case Cylinder():
             radial = np.hypot(at[:, 0], at[:, 1]) - geometry.radius
-            return _outside_and_inside(np.stack([radial, np.abs(at[:, 2]) - geometry.height / 2], axis=1))
+            beyond = np.stack([radial, np.abs(at[:, 2]) - geometry.height / 2], axis=1)
+            return _outside_and_inside(beyond + edge_radius) - edge_radius
         case Mesh():
             return signed_distance(make_surface(centred(geometry)), at)
 

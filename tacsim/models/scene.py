@@ -146,8 +146,24 @@ class Indenter(Config):
     """A rigid body pressed on one gel; no particles are needed for it."""
 
     geometry: Shape = Sphere(radius=4e-3)
+    edge_radius: Annotated[Length, Field(ge=0)] = 0.0  # of a box's or cylinder's edges, rounded within its size [m]
     friction: Annotated[float, Field(ge=0, le=5)] = 0.6
     yaw: Angle = 0.0
+
+    @model_validator(mode="after")
+    def _edges_fit(self) -> Self:
+        geometry, radius = self.geometry, self.edge_radius
+        if radius > 0 and not isinstance(geometry, Box | Cylinder):
+            has = "a sphere has no edges" if isinstance(geometry, Sphere) else "the edges of an STL file are as drawn"
+            raise ValueError(f"edge_radius is {radius:g} m, but {has}; leave it out")
+        if isinstance(geometry, Box | Cylinder):
+            sides = geometry.size if isinstance(geometry, Box) else (2 * geometry.radius, geometry.height)
+            if radius > min(sides) / 2:
+                raise ValueError(
+                    f"edge_radius is {radius:g} m; at most half the shortest side of the {geometry.shape}, "
+                    f"{min(sides) / 2:g} m"
+                )
+        return self
 
 
 class Settling(Config):

@@ -265,5 +265,5 @@ def _folded(points: NDArray[np.float64]) -> SurfaceFolded:
     x, y = points[0] * 1e3
     return SurfaceFolded(
         f"the gel surface folds over at {len(points)} points, first at x = {x:.3f} mm, y = {y:.3f} mm: "
-        "it is no height field there. Press or slide less, or use a finer preset"
+        "it is no height field there. Press or slide less, or with rounder edges (edge_radius of an indenter)"
     )

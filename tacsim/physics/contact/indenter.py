@@ -106,15 +106,19 @@ def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
     its bounding box. The world lays as much of a mesh's grid as can touch (`PressState.cover`).
     """
     phi, n = UNKNOWN, vec3(0.0, 0.0, 1.0)
+    rounding = env.param(layout.EDGE_RADIUS)
     if kind == SPHERE:
         r = y.norm()
         phi = r - size[0]
         n = y / ti.max(r, 1e-12)
     elif kind == BOX:
-        phi, n = box_distance(size, y)
+        phi, n = box_distance(size - rounding, y)
+        phi -= rounding
     elif kind == CYLINDER:
         r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
-        phi, radial = corner_distance(vec3(r - size[0], -UNKNOWN, ti.abs(y[2]) - size[2]), vec3(1.0))
+        beyond = vec3(r - size[0] + rounding, -UNKNOWN, ti.abs(y[2]) - size[2] + rounding)
+        phi, radial = corner_distance(beyond, vec3(1.0))
+        phi -= rounding
         n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])
     else:
         at = (y - grid.origin) / grid.spacing

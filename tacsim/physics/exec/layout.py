@@ -29,7 +29,8 @@ CENTRE = 33  # of the particles at the launch's start x, y, z [mm]
 INVERSE_INERTIA = 36  # inverse moment of inertia of the particles then: xx, yy, zz, xy, xz, yz [1/(MPa mm^5)]
 REFERENCE_CENTRE = 42  # of the particles in the reference of the body's grid x, y, z [mm]
 CARRIED = 45  # mean displacement gradient of the particles since then, row by row
-PARAMS = 54
+EDGE_RADIUS = 54  # of an indenter [mm]
+PARAMS = 55
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite

@@ -22,7 +22,11 @@ FASTEST = 0.5  # speed of a particle or gel node / wave speed
 LARGEST_COURANT = 1.0  # time step / time of the pressure wave through the smallest cell or most squeezed element
 LARGEST_GRID = 20_000_000  # nodes of one environment; 80 bytes each on a CPU, in four copies
 
-ADVICE = "move less far or slower, or use a finer preset"
+ADVICE = "move less far or slower"
+TORN = (
+    "move less far, or press with rounder edges (edge_radius of an indenter); a finer mesh follows a sharp edge closer "
+    "and tears sooner"
+)
 NO_ROOM = "restore a snapshot in which its particles are together; worlds of a smaller batch have more room each"
 
 
@@ -107,7 +111,8 @@ def check_launch(arrays: Callable[[], State], good: State, health: Health, where
     fault = _fault(arrays, health)
     if fault is not None:
         words, quantity = fault
-        raise SimulationDiverged(words, where, quantity=quantity, good=good, failed=arrays(), health=health)
+        advice = TORN if quantity in ("node speed", "element length") else ADVICE
+        raise SimulationDiverged(words, where, advice, quantity=quantity, good=good, failed=arrays(), health=health)
     return health
 
 

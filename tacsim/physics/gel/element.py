@@ -5,6 +5,7 @@ from tacsim.compute.runtime import ti
 from tacsim.physics.body.material import lanes_log
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import LANES, lanes, load_lanes, opaque, store_lanes, vec3
+from tacsim.physics.gel.corner import SKEW, hold_corners
 
 HOURGLASS = 1.0 / 6.0  # the exact integral of a shear hourglass mode of a cube
 SMALLEST_STRETCH = 0.05  # J below this counts as inverted
@@ -12,7 +13,8 @@ SMALLEST_STRETCH = 0.05  # J below this counts as inverted
 # Rows of an element block's own array: displacements of eight corners, axis by axis, then the forces on them;
 WHOLE = 24  # 1 if the element is inside the gel, else 0
 SMALLEST = 25  # det F so far
-ROWS = 26
+SKEWED = 26  # squared force of the hourglass modes
+ROWS = 27
 
 
 @ti.func
@@ -59,6 +61,7 @@ def element_block(
             hyz[d] = stiffness * (left_yz + right_yz)
             hxz[d] = stiffness * (right_z - left_z)
             hxyz[d] = stiffness * (right_yz - left_yz)
+        rows[SKEWED, lane] = hxy.norm_sqr() + hyz.norm_sqr() + hxz.norm_sqr() + hxyz.norm_sqr()
         x, y, z = fy.cross(fz), fz.cross(fx), fx.cross(fy)  # columns of the cofactor matrix
         jacobian = fx.dot(x)
         safe = ti.max(jacobian, SMALLEST_STRETCH)  # keeps the logarithm finite; the partial sums report it
@@ -80,3 +83,8 @@ def element_block(
                 rows[12 + 3 * k + d, lane] = yz[k] - odd[k]
     for r in range(24):
         store_lanes(gels.corners, to + r * row, lanes([rows[r, lane] for lane in range(LANES)]), zero)
+    most = 0.0
+    for lane in range(LANES):
+        most = ti.max(most, rows[SKEWED, lane])
+    if most > (SKEW * HOURGLASS * mu * h * h) ** 2:
+        hold_corners(env, gels, block, u, axis, layer, to, row)

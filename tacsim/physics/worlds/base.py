@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tacsim.interface import Pose
 from tacsim.models.scene import Scene
 from tacsim.physics.failure import diagnosis, dump
-from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
+from tacsim.physics.failure.health import TORN, LaunchSpan, SimulationDiverged
 from tacsim.physics.motion.controller import ForceReading, Motion, run
 from tacsim.physics.motion.path import Path
 from tacsim.physics.move import MoveCommand, MoveStats
@@ -148,4 +148,4 @@ class BaseWorld(NotCopyable, ABC):
         if corners is not None and not corners.min() > SMALLEST_CORNER:
             words = f"a gel element is turned inside out (volume ratio {corners.min():.3g} at a corner)"
             end = LaunchSpan("at the end of the motion and its hold", {**self._poses, **command.targets})
-            raise SimulationDiverged(words, end, quantity="corner", failed=state)
+            raise SimulationDiverged(words, end, TORN, quantity="corner", failed=state)

@@ -32,6 +32,7 @@ from tacsim.physics.exec.lanes import MAX_NUMBERS, ON_DEVICE, PARTS, aligned_zer
 from tacsim.physics.exec.layout import (
     BACKING,
     COUNTS,
+    EDGE_RADIUS,
     ELEMENTS,
     FORCE,
     FRICTION,
@@ -187,6 +188,7 @@ class PressState(FemState):
         _require_resolved(scene.indenter.geometry, self.gel[index])
         kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
+        self.params[index, EDGE_RADIUS] = scene.indenter.edge_radius * MM
         self.params[index, SHAPE_SPACING] = GRID_SPACING * MM
         if mesh is not None:
             self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
@@ -332,15 +334,16 @@ class PressWorld(FemWorld):
         sums = partial.astype(np.float64).sum(axis=0)
         force, moment = sums[None, FORCE : FORCE + 3], sums[None, FORCE + 3 : FORCE + 6]
         backing = sums[None, BACKING : BACKING + 3]
-        if not force.any() and (prepared.launch.held or prepared.launch.last == prepared.launch.path.substeps):
-            self._require_touch(prepared)
+        if prepared.launch.held or (not force.any() and prepared.launch.last == prepared.launch.path.substeps):
+            self._require_seen(prepared, health.overlap)
         return ForceReading(
             force, backing, self._floor, health.overlap, health.capped, moment / max(self._gel.half),
             integration=Integration(prepared.launch.path.step, self._damping(), health.courant),
         )  # fmt: skip
 
-    def _require_touch(self, prepared: PreparedLaunch) -> None:
-        """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points."""
+    def _require_seen(self, prepared: PreparedLaunch, overlap: float) -> None:
+        """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points,
+        the deepest of which has an `overlap` with it [mm]."""
         assert self.scene.indenter is not None
         rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
         down = rows[:3].T @ [0.0, 0.0, -1.0]
@@ -349,19 +352,23 @@ class PressWorld(FemWorld):
             assert mesh is not None
             lowest = mesh.vertices[np.argmax(mesh.vertices @ down)]
         else:
-            lowest = farthest(geometry, down)
+            lowest = farthest(geometry, down, self.scene.indenter.edge_radius)
         tip = rows[:3] @ (lowest * MM) + rows[3]
         if (np.abs(tip[:2]) > np.array(self._gel.half) - spacing).any():
             return  # beside the gel, or at its rim
         nodes = self._surface_nodes()
         near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
         depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
-        if depth > UNSEEN * spacing / POINTS:
+        if depth - overlap > UNSEEN * spacing / POINTS:
             cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
+            if overlap > 0.0:
+                cause = (
+                    f"the indenter's lowest point is {depth:.3g} mm deep in the gel, which feels {overlap:.3g} mm of it"
+                )
             finer = self._gel.thickness / (2 * self._gel.elements[2])
             advice = (
                 f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
-                f"them: use a smaller element_size, such as {finer:.4g} mm, or a finer preset"
+                f"them: use a smaller element_size, such as {finer:.4g} mm"
             )
             before = prepared.before
             raise SimulationDiverged(cause, prepared.span, advice, retry=False, good=before, failed=self.arrays())

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
-from tacsim.geometry.sampling import body_points
+from tacsim.geometry.sampling import body_points, scattered
 from tacsim.geometry.shapes import distance, particles, volume
 from tacsim.models.scene import Body, Box, Cylinder, Mesh, Shape, Sphere
 
@@ -65,6 +65,18 @@ def test_what_cannot_be_sampled_is_refused_either_way() -> None:
 def test_a_body_that_no_random_particle_falls_into_is_refused() -> None:
     """One particle of a lattice fits; one at random in the same cell may lie outside."""
     ball = Sphere(radius=0.5 * MM)
-    assert len(body_points(Body(geometry=ball, sampling="random", seed=2), 1 * MM)) == 1
+    assert len(scattered(ball, 1 * MM, seed=2)) == 1
     with pytest.raises(ValueError, match="sphere holds no particle at a spacing of 1 mm"):
-        body_points(Body(geometry=ball, sampling="random", seed=0), 1 * MM)
+        scattered(ball, 1 * MM, seed=0)
+
+
+@pytest.mark.parametrize("sampling", ["lattice", "random"])
+@pytest.mark.parametrize(("thickness", "layers"), [(0.5 * MM, 1), (1 * MM, 2)])
+def test_a_sheet_of_one_or_two_layers_is_refused_with_what_to_choose(
+    thickness: float, layers: int, sampling: str
+) -> None:
+    sheet = Box(size=(4 * MM, 4 * MM, thickness))
+    said = rf"{layers} layers? of particles 0\.5 mm apart; .* at least 1\.5 mm thick, .* at most 0\.\d+ mm"
+    with pytest.raises(ValueError, match=said):
+        body_points(Body.model_validate({"geometry": sheet, "sampling": sampling}), 0.5 * MM)
+    assert len(np.unique(body_points(Body(geometry=sheet), thickness / 4)[:, 2])) == 4

@@ -310,3 +310,16 @@ def test_bad_grids_are_refused(tmp_path: Path) -> None:
         ValueError, match=r"part\.stl at 0\.005 mm would have 5\d\d,\d{3},\d{3} nodes, .* a larger spacing"
     ):
         distance_grid(geometry, 0.005 * MM)
+
+
+@pytest.mark.parametrize("shape", [Box(size=(4e-3, 6e-3, 5e-3)), Cylinder(radius=2e-3, height=5e-3)])
+def test_a_rounded_edge_lies_within_the_size_and_is_as_far_as_it_says(shape: Box | Cylinder) -> None:
+    """Farthest points lie on the surface; an edge falls short of the sharp one by (sqrt 2 - 1) of its radius."""
+    radius, rng = 0.5e-3, np.random.default_rng(0)
+    for direction in [*rng.normal(size=(50, 3)), *np.eye(3)]:
+        at = farthest(shape, direction, radius)
+        assert distance(shape, at[None], radius) == pytest.approx(0.0, abs=1e-12)
+        assert distance(shape, at[None]) <= 1e-12
+    edge = np.array([[2e-3, 0.0, 2.5e-3]])
+    assert distance(shape, edge, radius) == pytest.approx((np.sqrt(2) - 1) * radius)
+    assert distance(shape, np.zeros((1, 3)), radius) == pytest.approx(-2e-3)

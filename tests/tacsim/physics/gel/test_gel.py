@@ -11,6 +11,7 @@ from tacsim.models.scene import Gel, GelMaterial
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import PARTS
 from tacsim.physics.exec.layout import BACKING, COUNTS, ELEMENTS, GEL_DAMPING, NUMBERS, PARAMS, SMALLEST_VOLUME, STEP
+from tacsim.physics.gel.corner import CORNER_STIFFNESS, NARROW
 from tacsim.physics.gel.element import HOURGLASS
 from tacsim.physics.gel.gel import GelState, gel_params
 from tacsim.physics.gel.kernels import (
@@ -79,6 +80,39 @@ def test_random_displacement_matches_the_reference() -> None:
     f, _ = run(u)
     truth = laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS)
     assert np.abs(f - truth).max() < 3e-6 * np.abs(truth).max()
+
+
+def corner_energy(u: np.ndarray, h: float, modulus: float) -> float:
+    """Of the corners narrower than NARROW, each of an eighth of its element."""
+    x, energy = nodes() + u, 0.0
+    for i, j, k in np.ndindex(2, 2, 2):
+        here, edges = x[i : x.shape[0] - 1 + i, j : x.shape[1] - 1 + j, k : x.shape[2] - 1 + k], []
+        for axis, side in enumerate((i, j, k)):
+            at = [slice(c, n - 1 + c) for c, n in zip((i, j, k), x.shape[:3], strict=True)]
+            at[axis] = slice(1 - side, x.shape[axis] - side)
+            edges.append((x[tuple(at)] - here) * (1 - 2 * side) / h)
+        volume = np.linalg.det(np.stack(edges, axis=-1))
+        energy += float((np.maximum(NARROW - volume, 0.0) ** 2).sum()) * modulus / 2 * h**3 / 8
+    return energy
+
+
+def test_narrow_corners_press_back_by_a_potential() -> None:
+    """So their forces add up to none, and do not turn the gel; the other forces are as ever."""
+    params = gel_params(GEL, 1e-3)
+    rng = np.random.default_rng(5)
+    u = rng.normal(scale=0.22, size=nodes().shape)
+    f, _ = run(u)
+    found = f - laws.gel_forces(u, params.spacing, params.mu, params.lam, HOURGLASS)
+    modulus = CORNER_STIFFNESS * (params.lam + 2 * params.mu)
+    largest = np.abs(found).max()
+    assert largest > 0.01 * modulus
+    for index in [tuple(rng.integers(0, u.shape)) for _ in range(40)]:
+        step = np.zeros_like(u)
+        step[index] = 1e-5
+        slope = corner_energy(u + step, params.spacing, modulus) - corner_energy(u - step, params.spacing, modulus)
+        assert found[index] == pytest.approx(-slope / 2e-5, abs=2e-4 * largest)
+    assert np.abs(found.sum(axis=(0, 1, 2))).max() < 1e-4 * largest
+    assert np.abs(np.cross(nodes() + u, found).sum(axis=(0, 1, 2))).max() < 1e-3 * largest
 
 
 @pytest.mark.parametrize("element", [1e-3, 0.5e-3])

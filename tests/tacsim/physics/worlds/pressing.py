@@ -7,12 +7,14 @@ from tacsim.models.scene import Gel, GelMaterial, Indenter, Scene, Shape
 from tacsim.physics.worlds.press import PressWorld
 
 
-def world(geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, **scene: object) -> PressWorld:
+def world(
+    geometry: Shape, friction: float = 0.6, tolerance: float = 1e-3, edge_radius: float = 0.0, **scene: object
+) -> PressWorld:
     return PressWorld(
         Scene.model_validate(
             {
                 "body": None,
-                "indenter": Indenter(geometry=geometry, friction=friction),
+                "indenter": Indenter(geometry=geometry, friction=friction, edge_radius=edge_radius),
                 "gel": Gel(material=GelMaterial(poisson_ratio=0.45)),
                 "settling": {"tolerance": tolerance},
                 **scene,

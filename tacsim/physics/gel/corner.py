@@ -1,0 +1,48 @@
+"""What keeps an element of the gel from turning inside out at a corner, where its one point of stress does not see it.
+
+A corner and its three neighbours span a tetrahedron; where its volume falls below a share of that at rest, it presses
+back like a fluid of the stiffness of the gel's pressure wave. Forces of a potential: they add up to none, nor turn.
+"""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.lanes import LANES, vec3
+
+# The volume ratio of a corner at which it begins to press back, and its bulk modulus over lambda + 2 mu.
+NARROW, CORNER_STIFFNESS = 0.25, 4.0
+# Gradient of the hourglass modes in an element below which no corner is looked at: for an element that is not much
+# sheared besides, corners are above NARROW then.
+SKEW = 0.22
+
+
+@ti.func
+def displacement(gels: ti.template(), u, axis, layer, i, j, k):
+    at = u + k * layer + j + i * (gels.ny + 1)
+    return vec3([gels.nodes[at + d * axis] for d in range(3)])
+
+
+@ti.func
+def hold_corners(env: ti.template(), gels: ti.template(), block, u, axis, layer, to, row):
+    """Adds the forces of narrow corners to those of a block of elements; arguments as of `element_block`."""
+    h, stiffness = env.param(layout.GEL_SPACING), env.param(layout.GEL_LAMBDA) + 2.0 * env.param(layout.GEL_MU)
+    share = CORNER_STIFFNESS * stiffness * h * h / 8.0
+    for lane in range(LANES):
+        if gels.lattice[block][lane] > 0.0:
+            for corner in range(8):
+                i, j, k = corner // 4, corner // 2 % 2, corner % 2
+                sx, sy, sz = 1.0 - 2.0 * i, 1.0 - 2.0 * j, 1.0 - 2.0 * k
+                here = displacement(gels, u + lane, axis, layer, i, j, k)
+                # edges, over their length at rest
+                ex = sx / h * (displacement(gels, u + lane, axis, layer, 1 - i, j, k) - here) + vec3(1.0, 0.0, 0.0)
+                ey = sy / h * (displacement(gels, u + lane, axis, layer, i, 1 - j, k) - here) + vec3(0.0, 1.0, 0.0)
+                ez = sz / h * (displacement(gels, u + lane, axis, layer, i, j, 1 - k) - here) + vec3(0.0, 0.0, 1.0)
+                x, y, z = ey.cross(ez), ez.cross(ex), ex.cross(ey)
+                lacking = NARROW - ex.dot(x)
+                if lacking > 0.0:
+                    fx, fy, fz = share * lacking * sx * x, share * lacking * sy * y, share * lacking * sz * z
+                    for d in ti.static(range(3)):
+                        at = to + lane + d * row
+                        gels.corners[at + 3 * row * (4 * (1 - i) + 2 * j + k)] += fx[d]
+                        gels.corners[at + 3 * row * (4 * i + 2 * (1 - j) + k)] += fy[d]
+                        gels.corners[at + 3 * row * (4 * i + 2 * j + 1 - k)] += fz[d]
+                        gels.corners[at + 3 * row * corner] -= fx[d] + fy[d] + fz[d]

@@ -9,7 +9,7 @@ from tacsim.physics.exec import layout
 from tacsim.physics.exec.lanes import LANES, vec3
 
 # The volume ratio of a corner at which it begins to press back, and its bulk modulus over lambda + 2 mu.
-NARROW, CORNER_STIFFNESS = 0.25, 4.0
+NARROW, CORNER_STIFFNESS = 0.4, 8.0
 # Gradient of the hourglass modes in an element below which no corner is looked at: for an element that is not much
 # sheared besides, corners are above NARROW then.
 SKEW = 0.22

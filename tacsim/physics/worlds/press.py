@@ -359,15 +359,16 @@ class PressWorld(FemWorld):
         nodes = self._surface_nodes()
         near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
         depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
-        if depth - overlap > UNSEEN * spacing / POINTS:
+        # where points do touch, deeper by no more than half of its way into the untouched gel
+        if depth - overlap > max(UNSEEN * spacing / POINTS, 0.0 if overlap == 0.0 else -tip[2] / 2):
             cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
             if overlap > 0.0:
                 cause = (
-                    f"the indenter's lowest point is {depth:.3g} mm deep in the gel, which feels {overlap:.3g} mm of it"
+                    f"the indenter is {depth:.3g} mm deep in the gel, and no contact point more than {overlap:.3g} mm"
                 )
             finer = self._gel.thickness / (2 * self._gel.elements[2])
             advice = (
-                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip passes between "
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip or edge passes between "
                 f"them: use a smaller element_size, such as {finer:.4g} mm"
             )
             before = prepared.before

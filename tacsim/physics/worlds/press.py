@@ -368,8 +368,8 @@ class PressWorld(FemWorld):
                 )
             finer = self._gel.thickness / (2 * self._gel.elements[2])
             advice = (
-                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip or edge passes between "
-                f"them: use a smaller element_size, such as {finer:.4g} mm"
+                f"these lie {spacing / POINTS:.3g} mm apart (element_size / {POINTS}), and its tip or edge passes "
+                f"between them: use a smaller element_size, such as {finer:.4g} mm"
             )
             before = prepared.before
             raise SimulationDiverged(cause, prepared.span, advice, retry=False, good=before, failed=self.arrays())

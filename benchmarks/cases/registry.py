@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.cases import (
+    cycles,
     cylinder,
     environments,
     incline,
@@ -38,6 +39,7 @@ from benchmarks.harness.schema import Group
 CASES: tuple[Case, ...] = (
     *press.CASES,
     *squeeze.CASES,
+    *cycles.CASES,
     *random_steps.CASES,
     *large_strain.CASES,
     *incline.CASES,

@@ -224,6 +224,26 @@ class Scene(Config):
             )
         return self
 
+    @model_validator(mode="after")
+    def _followable(self) -> Self:
+        """What yields can be followed at the speed that its stress asks for, or a speed is given."""
+        allowed = self._mach_by_stress
+        if self.settling.mach is None and allowed < SLOWEST_MACH:
+            raise ValueError(
+                f"this body yields at so small a stress for its stiffness that it must be moved at Mach {allowed:.2g} "
+                f"(default speeds end at {SLOWEST_MACH:g}), or the speed itself makes it yield; give it a higher "
+                f"yield_stress, a lower youngs_modulus or poisson_ratio, or set settling.mach and see what it costs"
+            )
+        return self
+
+    @property
+    def _mach_by_stress(self) -> float:
+        """Peak speed at which a motion costs a body no more stress than MACH_BY_STRESS times what it yields at."""
+        if self.body is None:
+            return math.inf
+        mu, lam = lame(self.body.material)
+        return MACH_BY_STRESS * 2 * mu * self.body.material.elastic_limit / (lam + 2 * mu)
+
     @property
     def sensors(self) -> tuple[str, ...]:
         return ("lower", "upper") if self.indenter is None else ("lower",)
@@ -240,13 +260,11 @@ class Scene(Config):
         settling = self.settling
         if settling.mach is not None:
             return settling.mach
-        limit = math.inf if self.body is None else self.body.material.elastic_limit
-        if self.body is None or not math.isfinite(limit):
+        by_stress = self._mach_by_stress
+        if not math.isfinite(by_stress):
             mu, lam = lame(self.gel.material)
             return min(FASTEST_MACH, MACH_BY_SHEAR * math.sqrt(mu / (lam + 2 * mu)))
-        mu, lam = lame(self.body.material)
-        allowed = min(MACH_BY_TOLERANCE * settling.tolerance, MACH_BY_STRESS * 2 * mu * limit / (lam + 2 * mu))
-        return min(max(allowed, SLOWEST_MACH), FASTEST_MACH)
+        return min(max(MACH_BY_TOLERANCE * settling.tolerance, SLOWEST_MACH), by_stress, FASTEST_MACH)
 
     @property
     def spacing(self) -> float:

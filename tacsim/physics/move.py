@@ -17,13 +17,18 @@ class MoveStats:
     residual: float  # largest relative force imbalance or force change at the end [-]
     settled: bool  # residual <= the scene's tolerance
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
-    guard_hits: int  # times a guard changed the physics (particles set aside, gaps capped) or found gels in one another
+    # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or a body under
+    # more tension than it can bear (tacsim.physics.worlds.hybrid)
+    guard_hits: int
     retries: int = 0  # times the motion was started again with half the time step
     load_error: float = 0.0  # largest |force - load| of the sensors that hold a load [N]
     time_step: float = 0.0  # of the last substep, as the distance that the gel's pressure wave travels in it [m]
     damping: float = 0.0  # of the gel in the last substep: its rate times the wave's time through the gel [-]
     gel_overlap: float = 0.0  # deepest overlap of the two gels with one another at the end, which they do not feel [m]
     courant: float = 0.0  # largest time step / time of the wave through the most squeezed element or grid cell [-]
+    # least and largest elastic volume ratio of the body's particles at the end [-]; a body led to and fro keeps them
+    smallest_volume: float = 1.0
+    largest_volume: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

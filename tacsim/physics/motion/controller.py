@@ -58,6 +58,7 @@ class ForceReading:
     torque: NDArray[np.float64] | None = None  # (3,)
     integration: Integration = Integration()
     gel_overlap: float = 0.0  # of the gels with one another [mm]
+    volumes: tuple[float, float] = (1.0, 1.0)  # least and largest elastic volume ratio of the body's particles
 
 
 def residual(reading: ForceReading, before: ForceReading, balanced: bool) -> float:
@@ -180,9 +181,11 @@ def _stats(readings: Sequence[ForceReading], substeps: int, held: int, worst: fl
     overlap = readings[-1].overlap / MM if readings else 0.0
     hits = sum(reading.guard_hits for reading in readings)
     last = readings[-1].integration if readings else Integration()
+    smallest, largest = readings[-1].volumes if readings else (1.0, 1.0)
     return MoveStats(
         substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
         time_step=last.step / MM, damping=last.damping,
         courant=max((reading.integration.courant for reading in readings), default=0.0),
         gel_overlap=readings[-1].gel_overlap / MM if readings else 0.0,
+        smallest_volume=smallest, largest_volume=largest,
     )  # fmt: skip

@@ -53,6 +53,7 @@ from tacsim.physics.exec.layout import (
     WIDENING,
 )  # fmt: skip
 from tacsim.physics.exec.team import run_team
+from tacsim.physics.failure.diagnosis import volume_range
 from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
 from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
@@ -70,6 +71,9 @@ COURANT = 0.5
 # Damping of a driven motion falsifies its path, since gels yield and the body spreads; damping of the hold does not.
 ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
+# Yield stresses (Frobenius norm) of hydrostatic tension that nothing gives a squeezed body: beyond, particles have
+# strains that no node of the grid feels (docs/physics.md)
+TENSION = 3.0
 LARGEST_GREEN = 0.3  # norm of F^T F - I since the reference of the body's grid: beyond, the grid is laid anew
 CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
 
@@ -336,11 +340,20 @@ class HybridWorld(FemWorld):
         torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
         gel_overlap = self._gel_overlap(prepared)
+        volumes = volume_range(self.arrays()) if seen is None else seen.volumes
+        hits = health.capped + (gel_overlap > 0.0) + self._torn(volumes[1])
         return ForceReading(
-            contact, backing, self._floor, health.overlap, health.capped + (gel_overlap > 0.0),
+            contact, backing, self._floor, health.overlap, hits,
             moment / lever, self._weight, torque / lever,
-            Integration(prepared.launch.path.step, self._damping(), health.courant), gel_overlap,
+            Integration(prepared.launch.path.step, self._damping(), health.courant), gel_overlap, volumes,
         )  # fmt: skip
+
+    def _torn(self, largest: float) -> bool:
+        """Whether the largest elastic volume ratio needs a tension of more than TENSION yield stresses. What hardens may
+        bear any."""
+        body = self._body
+        bearable = TENSION * 2.0 * body.mu * body.limit / body.bulk
+        return self.yields and not body.hardening and math.log(largest) > bearable
 
     def _gel_overlap(self, prepared: PreparedLaunch) -> float:
         """How deep the two gels lie in one another, without feeling it [mm]. Raises SimulationDiverged if too deep."""

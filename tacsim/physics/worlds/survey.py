@@ -20,11 +20,11 @@ NODE_SPEED = 1  # largest component
 SHORTEST = 2  # by how much the shortest edge of an element is longer than at rest [mm]
 CORNER = 3  # smallest volume ratio at the elements' corners
 TOP = 4  # of the surface of gel 0, gel 1: largest |x|, largest |y|, lowest z, highest z of its displacements [mm]
-SQUARED_VOLUME = 12  # smallest det b_e of a particle
-LOW, HIGH = 13, 16  # of the particles' places on the grid: x, y, z [mm]
+SQUARED_VOLUME, LARGEST_SQUARED_VOLUME = 12, 13  # smallest and largest det b_e of a particle
+LOW, HIGH = 14, 17  # of the particles' places on the grid: x, y, z [mm]
 # Sums over the particles, of r their place on the grid less `base`, d = x - place, x their place in space less `base`:
 # d, r, x x^T and r r^T (xx, yy, zz, xy, xz, yz), d r^T (row by row)
-SUMS = 19
+SUMS = 20
 MOVED, REFERENCE, SECOND, REFERENCE_SECOND, MOVED_REFERENCE = 0, 3, 6, 12, 18
 MOMENTS = 27
 NUMBERS = SUMS + MOMENTS
@@ -41,6 +41,7 @@ class Survey:
     tops: NDArray[np.float32]  # (gels, 4) largest |x|, |y|, lowest and highest z of the surfaces' displacements [mm]
     extents: NDArray[np.float32]  # (1, 2, 3) lowest and highest places of the particles on their grid [mm]
     moments: Moments | None = None  # of a body
+    volumes: tuple[float, float] = (1.0, 1.0)  # least and largest elastic volume ratio of its particles
 
 
 def survey_of(numbers: NDArray[np.float32], spacing: float, particles: int = 0, base: Any = 0.0) -> Survey:
@@ -49,10 +50,15 @@ def survey_of(numbers: NDArray[np.float32], spacing: float, particles: int = 0, 
     sound = bool(
         finite and numbers[NODE_SPEED] <= FASTEST and numbers[SQUARED_VOLUME] > (2.0 * SMALLEST_VOLUME_RATIO) ** 2
     )
+    volumes = numbers[[SQUARED_VOLUME, LARGEST_SQUARED_VOLUME]]
+    if not (particles and volumes.min() > 0.0):
+        volumes = np.ones(2, np.float32)
+    least, largest = (float(volume) for volume in np.sqrt(volumes))
     return Survey(
         finite, sound, spacing + float(numbers[SHORTEST]), float(numbers[CORNER]), numbers[TOP : TOP + 8].reshape(2, 4),
         numbers[LOW : LOW + 6].reshape(1, 2, 3),
         _moments(numbers[SUMS:].astype(np.float64), particles, np.asarray(base, np.float64)) if particles else None,
+        (least, largest),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from tacsim.physics.worlds.survey import (
     BLOCKS,
     CORNER,
     HIGH,
+    LARGEST_SQUARED_VOLUME,
     LOW,
     MOMENTS,
     MOVED,
@@ -67,7 +68,7 @@ def begin_survey(found: Params):
         least = n >= LOW and n < HIGH
         for number in ti.static((SHORTEST, CORNER, SQUARED_VOLUME)):
             least = least or n == number
-        most = n >= HIGH and n < SUMS
+        most = (n >= HIGH and n < SUMS) or n == LARGEST_SQUARED_VOLUME
         for g in ti.static(range(2)):
             least = least or n == TOP + 4 * g + 2
             most = most or n == TOP + 4 * g + 3
@@ -130,7 +131,7 @@ def survey_particles(
         base = vec3([params[e, layout.REFERENCE_CENTRE + d] for d in range(3)])
         moved, reference, moved_reference = vec3(0.0), vec3(0.0), ti.Matrix.zero(ti.f32, 3, 3)
         square, cross, reference_square, reference_cross = vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0)
-        low, high, volume, bad = vec3(1e9), vec3(-1e9), 1e9, 0
+        low, high, volume, largest, bad = vec3(1e9), vec3(-1e9), 1e9, -1e9, 0
         for n in range((count - block + BLOCKS - 1) // BLOCKS):
             at = e * layout.PARTICLE_ROWS * stride + n * BLOCKS + block  # neighbouring threads read neighbours
             for r in range(layout.PARTICLE_ROWS):
@@ -151,9 +152,11 @@ def survey_particles(
             other = node_vector(particles, at + (layout.STRAIN + 3) * stride, stride)  # xy, xz, yz
             first = vec3(diagonal[0], other[0], other[1])
             middle = vec3(other[0], diagonal[1], other[2])
-            volume = ti.min(volume, first.dot(middle.cross(vec3(other[1], other[2], diagonal[2]))))
+            squared = first.dot(middle.cross(vec3(other[1], other[2], diagonal[2])))
+            volume, largest = ti.min(volume, squared), ti.max(largest, squared)
         note_bad(found, e, bad)
         note_least(found, e, SQUARED_VOLUME, volume)
+        note_most(found, e, LARGEST_SQUARED_VOLUME, largest)
         for c in ti.static(range(3)):
             note_least(found, e, LOW + c, low[c])
             note_most(found, e, HIGH + c, high[c])

@@ -148,7 +148,10 @@ def test_what_yields_at_a_small_strain_goes_slower() -> None:
     clays = [BodyMaterial(yield_stress=30e3, poisson_ratio=nu) for nu in (0.45, 0.49, 0.499)]
     compressed = [Scene(body=Body(material=material)) for material in clays]
     assert [scene.peak_mach for scene in compressed] == pytest.approx([0.03, 0.0114, 0.00117], rel=0.01)
-    assert Scene(body=clay(1e12)).peak_mach == 0.001
+    # beyond the slowest, no speed is chosen in silence
+    with pytest.raises(ValidationError, match=r"must be moved at Mach 0\.00059 .*set settling\.mach"):
+        Scene(body=Body(material=BodyMaterial(youngs_modulus=1e6, yield_stress=30e3, poisson_ratio=0.499)))
+    assert Scene(body=clay(1e12), settling=Settling(mach=0.002)).peak_mach == 0.002
 
 
 def test_where_nothing_yields_the_gels_shear_wave_sets_the_speed_unless_one_is_given() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Scene
+from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Scene, lame
 from tacsim.physics.failure.diagnosis import particle_volumes
 from tacsim.physics.worlds.hybrid import HybridWorld
 
@@ -40,8 +40,31 @@ def test_flowing_to_and_fro_writes_nothing_into_the_body(along: tuple[float, flo
     assert after.min() > 0.96 and after.max() < 1.02
 
 
+def test_a_body_under_more_tension_than_it_can_bear_is_told() -> None:
+    """Nothing pulls at a squeezed body: volume ratios far above 1 are strains that no node of the grid feels, as here,
+    where neighbours differ in turn."""
+    world = HybridWorld(Scene(body=CUBE))
+    lattice = np.round(world.snapshot()["position"] / (world.scene.spacing * 1e3) - 0.5).astype(int)
+    sign = 1 - 2 * (lattice.sum(axis=1) % 2)
+    closing = np.array([0.0, 0.0, 0.6e-3])
+    stats = world.move(shifted(world, {"lower": closing, "upper": -closing}))
+    state = world.snapshot()
+    volumes = particle_volumes(state)
+    assert volumes is not None
+    assert (stats.smallest_volume, stats.largest_volume) == pytest.approx((volumes.min(), volumes.max()), rel=1e-6)
+    assert 0.96 < stats.smallest_volume < stats.largest_volume < 1.02 and stats.guard_hits == 0
+    mu, lam = lame(CUBE.material)
+    for tension, told in ((1.0, False), (6.0, True)):  # yield stresses (Frobenius norm)
+        grown = tension * 2 * mu * CUBE.material.elastic_limit / (lam + 2 * mu / 3) * sign
+        strain = state["strain"].copy()
+        strain[:, :3] += (1 + strain[:, :3]) * (np.exp(2 / 3 * grown) - 1)[:, None]
+        strain[:, 3:] *= np.exp(2 / 3 * grown)[:, None]
+        world.restore({**state, "strain": strain})
+        assert (world.move({}).guard_hits > 0) == told
+
+
 @pytest.mark.deep
-@pytest.mark.xfail(strict=True, reason="inertia's overshoot at every reversal yields: 4.4 % are lost in 12 cycles")
+@pytest.mark.xfail(strict=True, reason="the gel lags on the way there and the body yields to it: 4.4 % are lost")
 def test_the_first_settled_cycles_take_nothing() -> None:
     """Axisymmetric finite elements (quadratic, multiplicative Hencky plasticity, implicit, h 0.5 mm) of this cylinder
     between discs of gel, 2.0 to 2.3 mm and back: 2.934, 2.933, 2.933 N."""

@@ -349,8 +349,8 @@ class HybridWorld(FemWorld):
         )  # fmt: skip
 
     def _torn(self, largest: float) -> bool:
-        """Whether the largest elastic volume ratio needs a tension of more than TENSION yield stresses. What hardens may
-        bear any."""
+        """Whether the largest elastic volume ratio needs a tension of more than TENSION yield stresses; of a body that
+        hardens nobody knows."""
         body = self._body
         bearable = TENSION * 2.0 * body.mu * body.limit / body.bulk
         return self.yields and not body.hardening and math.log(largest) > bearable

@@ -107,7 +107,7 @@ def cone() -> Mesh:
 
 
 def with_nan(times: int) -> dict[str, Any]:
-    return {"hybrid.copies": times, "press.copies": times, "seed.copies": times}
+    return {"fem.copies": times, "seed.copies": times}
 
 
 SHORT = {"hybrid.COURANT": 0.3, "press.COURANT": 0.3, "seed.COURANT": 0.3}

@@ -157,8 +157,8 @@ def _features(given: Features | Mapping[str, Any] | None) -> Features | None:
 
 def _env_of_hardware(config: RigConfig, render_mode: str | None, features: Features | None) -> TacsimEnv:
     """Of a rig that tells the truth of its body without being a simulation of ours, if there is one."""
-    from tacsim.features.encoder import FeatureEncoder
     from tacsim.gym.env import TacsimEnv
+    from tacsim.gym.features import FeatureEncoder
     from tacsim.tasks import make_task
 
     opened, task = open_rig(config), config.task

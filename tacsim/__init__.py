@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from tacsim.config import load_task as load_task
     from tacsim.control.approach import NoTouch as NoTouch
     from tacsim.control.contact_signal import contact_signal as contact_signal
-    from tacsim.features.encoder import FeatureEncoder as FeatureEncoder
     from tacsim.gym.env import TacsimEnv as TacsimEnv
+    from tacsim.gym.features import FeatureEncoder as FeatureEncoder
     from tacsim.gym.vector import TacsimVectorEnv as TacsimVectorEnv
     from tacsim.interface import Action as Action
     from tacsim.interface import Arm as Arm

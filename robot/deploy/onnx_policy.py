@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from robot.deploy.python_policy import PolicyNotFound
 from tacsim import pose as se3
-from tacsim.features.encoder import FeatureEncoder
+from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
 from tacsim.models.policy import METADATA_KEY, PolicySpec
 from tacsim.models.sensor import CanonicalGrid

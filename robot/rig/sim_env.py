@@ -10,9 +10,9 @@ from gymnasium.vector import AutoresetMode
 
 from robot.rig import CannotOpen
 from robot.rig.sim_rig import Simulation, simulate
-from tacsim.features.encoder import FeatureEncoder
 from tacsim.gym import encode
 from tacsim.gym.env import TacsimEnv, Variant, require_alike
+from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.features import Features
 from tacsim.models.hardware import Placement

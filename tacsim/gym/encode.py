@@ -28,7 +28,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.features.encoder import FeatureEncoder
+from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.tasks import make_task

@@ -15,8 +15,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
-from tacsim.features.encoder import FeatureEncoder
 from tacsim.gym import encode
+from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.plugin import register_envs
 from tacsim.interface import Needs, Pose, Truth
 from tacsim.limits import LimitExceeded

@@ -22,7 +22,7 @@ class MapGrid(Config):
 
 
 class Features(Config):
-    """Which of an observation's quantities, in which order. Units and scales: `tacsim.features.encoder`."""
+    """Which of an observation's quantities, in which order. Units and scales: `tacsim.gym.features`."""
 
     sensors: tuple[Name, ...] = Field(default=("lower", "upper"), max_length=16)
     arms: tuple[Name, ...] = Field(default=("lower", "upper"), max_length=16)

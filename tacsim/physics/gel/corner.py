@@ -12,7 +12,7 @@ from tacsim.physics.exec.lanes import LANES, vec3
 NARROW, CORNER_STIFFNESS = 0.4, 8.0
 # Gradient of the hourglass modes in an element below which no corner is looked at: for an element that is not much
 # sheared besides, corners are above NARROW then.
-SKEW = 0.22
+SKEW = 0.1
 
 
 @ti.func

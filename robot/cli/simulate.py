@@ -66,7 +66,10 @@ def press(
         )
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
-        notes.print(f"warning: not settled, {held}; raise settling.max_substeps")
+        do = "raise settling.max_substeps"
+        if config["residual"] is not None and config["residual"] <= scene.settling.tolerance:
+            held, do = f"contact slips by inertia at Mach {scene.peak_mach:g}", "leave out settling.mach, or lower it"
+        notes.print(f"warning: not settled, {held}; {do}")
     say_files(*sorted(folder.iterdir()))
 
 

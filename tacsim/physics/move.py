@@ -15,7 +15,8 @@ class MoveStats:
     substeps: int  # explicit substeps of motion and hold together
     hold: int  # of which hold
     residual: float  # largest relative force imbalance or force change at the end [-]
-    settled: bool  # residual <= the scene's tolerance
+    # residual <= the scene's tolerance, and no faster than friction may be followed (an indenter at a `settling.mach`)
+    settled: bool
     overlap: float  # deepest overlap of body (or indenter) and gel surface in the last substep [m]
     # times a guard changed the physics (particles set aside, gaps capped), found gels in one another, or a body under
     # more tension than it can bear (tacsim.physics.worlds.hybrid)

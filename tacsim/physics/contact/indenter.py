@@ -264,6 +264,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
     rows = [vec3([drive[e, it, 0, r, c] for c in range(3)]) for r in range(6)]
     rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
     area = h * h / (POINTS * POINTS)
+    follow = dt / (h * gels.layers)  # friction's limit follows the pressure within a wave's time through the gel
     c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
     back = rotate.transpose()
     total, moment = vec3(0.0), vec3(0.0)
@@ -334,7 +335,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                             sliding = moving - closing * n
                             rest = ti.max(pressure, 0.0)
                             memory = indenter.pressure[e, i, j]
-                            memory += MEMORY_RATE * (rest - memory)
+                            memory += follow * (rest - memory)
                             ft, slip = friction(
                                 indenter.slip[e, i, j], n, sliding, mu * memory, TANGENT_STIFFNESS * k_n, c_n, dt
                             )

@@ -22,6 +22,7 @@ from tacsim.physics.units import MM
 
 SUBSTEPS_PER_LAUNCH = 80  # while frames are driven: a control step is one launch or two
 EARLIER_READINGS = 2  # that one is compared with: a single one may have the same phase of an oscillation
+FORESIGHT = 20.0  # readings
 FORCE_FLOOR = 1e-3  # residuals are relative to the contact force, but to no less than this share of E thickness^2
 
 
@@ -76,6 +77,19 @@ def residual(reading: ForceReading, before: ForceReading, balanced: bool) -> flo
         if reading.torque is not None:
             parts.append(np.abs(reading.torque).max())
     return float(max(parts)) / scale
+
+
+def still_to_come(first: ForceReading, second: ForceReading, third: ForceReading) -> float:
+    """How far the contact forces will still creep, relative to the largest force [-]: what is left of a change that
+    shrinks by the same share from reading to reading, as contact that slips ever more slowly does.
+
+    A change that swings leaves nothing; of one that hardly shrinks only FORESIGHT readings are looked ahead.
+    """
+    before, now = second.contact - first.contact, third.contact - second.contact
+    creeping = before * now > 0.0
+    share = np.minimum(now[creeping] / before[creeping], 1.0)
+    to_come = np.abs(now[creeping]) * np.minimum(share / np.maximum(1.0 - share, 1e-9), FORESIGHT)
+    return float(to_come.max(initial=0.0)) / max(float(np.abs(third.contact).max()), third.floor)
 
 
 @dataclass(frozen=True)
@@ -142,9 +156,10 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
         held += count
         if len(readings) > EARLIER_READINGS:
             worst = max(residual(readings[-1], earlier, balanced) for earlier in readings[-1 - EARLIER_READINGS : -1])
+            worst = max(worst, still_to_come(*readings[-3:]))
             if worst <= settling.tolerance:
                 break
-    return _stats(readings, path.substeps, held, worst, settling)
+    return _stats(readings, path.substeps, held, worst, settling, hurried=path.hurried)
 
 
 def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
@@ -177,13 +192,16 @@ def _follow(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
     return readings
 
 
-def _stats(readings: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling) -> MoveStats:
+def _stats(
+    readings: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling, *,
+    hurried: bool = False,
+) -> MoveStats:  # fmt: skip
     overlap = readings[-1].overlap / MM if readings else 0.0
     hits = sum(reading.guard_hits for reading in readings)
     last = readings[-1].integration if readings else Integration()
     smallest, largest = readings[-1].volumes if readings else (1.0, 1.0)
     return MoveStats(
-        substeps + held, held, worst, worst <= settling.tolerance, overlap, hits,
+        substeps + held, held, worst, worst <= settling.tolerance and not hurried, overlap, hits,
         time_step=last.step / MM, damping=last.damping,
         courant=max((reading.integration.courant for reading in readings), default=0.0),
         gel_overlap=readings[-1].gel_overlap / MM if readings else 0.0,

@@ -25,7 +25,9 @@ PEAK_SLOPE = 1.875  # of the ramp, over its mean
 # Times of the gel's pressure wave through its thickness: the shortest ramp; the shortest step that flows, which takes
 # longer by as much as its speed changes; time of the hold between two readings of the forces
 SHORTEST_RAMP, SHORTEST_FLOW, READING_INTERVAL = 2.0, 1.25, 1.0
-SHORT_PATH = 0.5  # gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace
+# Gel thicknesses: shorter paths are followed slower than they may be, where the stop leaves a trace: in what yields, in
+# friction
+SHORT_PATH, SHORT_SLIDE = 0.5, 0.25
 ROUNDING = 1e-6  # of a number of substeps
 MOST_SUBSTEPS = 1_000_000  # of one motion: hours, and no motion that anybody means
 
@@ -51,6 +53,8 @@ class Path:
     Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. interval: substeps of the
     hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
 
+    hurried: faster than friction may be followed.
+
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm]: instead of a ramp
     from rest to rest the path is then the cubic that has them.
     """
@@ -62,12 +66,17 @@ class Path:
     refine: int = 1
     interval: int = 20
     rise: float = 0.5
+    hurried: bool = False
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property
     def step(self) -> float:
         """A real substep [mm, wave speed 1]."""
         return self.dt / self.refine
+
+    def peak_mach(self, lever: float) -> float:
+        """Of its fastest point, of a path from rest to rest; lever: see `of_fastest_point`."""
+        return PEAK_SLOPE * path_length(self.start, self.end, lever) / (max(self.substeps, 1) * self.dt)
 
     def drive(self, first: int, last: int) -> NDArray[np.float32]:
         """(n, frames, 6, 3) f32 for substeps first..last, n = (last - first) refine.
@@ -156,14 +165,14 @@ def path_along(start: Sequence[Pose], end: Sequence[Pose], lever: float) -> floa
 
 def plan(
     start: Sequence[Pose], end: Sequence[Pose], mach: float, dt: float, lever: float, thickness: float, *,
-    remembered: float = 0.0,
+    remembered: float = 0.0, short: float = SHORT_PATH,
 ) -> Path:  # fmt: skip
     """A path whose fastest point moves at peak Mach `mach`; it lasts no less than SHORTEST_RAMP gel thicknesses [mm],
     since a shorter jolt mostly makes the gel ring, and reaches its full speed within half of that.
 
     remembered: length of the path [mm] whose stop leaves a trace: all of it in a body that yields; in friction what
     of it goes along the surface, where the stop finds the gel. The trace grows with how hard the path brakes, so
-    short ones go slower: with the root of their length, which is the same braking for all.
+    those shorter than `short` gel thicknesses go slower: with the root of their length, the same braking for all.
 
     Raises ValueError for a path that takes more than MOST_SUBSTEPS.
     """
@@ -171,7 +180,7 @@ def plan(
     length = path_length(start, end, lever)
     if length == 0:
         return Path(start, end, 0, dt, interval=interval)
-    braked = math.sqrt(remembered * max(remembered, SHORT_PATH * thickness))
+    braked = math.sqrt(remembered * max(remembered, short * thickness))
     lasting = max(PEAK_SLOPE * max(length, braked) / mach, SHORTEST_RAMP * thickness)
     rise = SHORTEST_RAMP * thickness / 2 / lasting
     return Path(start, end, _substeps(lasting / dt, length, mach), dt, interval=interval, rise=rise)

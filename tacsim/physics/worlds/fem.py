@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +30,16 @@ from tacsim.physics.motion.controller import (
 )
 from tacsim.physics.motion.inertia import Inertia, plan_real_time
 from tacsim.physics.motion.load import keep_loads, require_loads
-from tacsim.physics.motion.path import Path, path_along, path_length, plan, plan_flow, resolve_targets
+from tacsim.physics.motion.path import (
+    SHORT_PATH,
+    SHORT_SLIDE,
+    Path,
+    path_along,
+    path_length,
+    plan,
+    plan_flow,
+    resolve_targets,
+)
 from tacsim.physics.move import MoveCommand
 from tacsim.physics.snapshot import Kept, State, copies, restore_arrays, snapshot_of
 from tacsim.physics.units import MM
@@ -92,6 +102,7 @@ class FemWorld(BaseWorld):
     _index: int
     _gel: GelParams
     _rates: NDArray[np.float64]  # (frames, 6) velocities at which a flowing motion has left them [-, rad/mm]
+    _fastest: float = math.inf  # Mach number beyond which what friction remembers is inertia's doing
     _scaled: Inertia  # of quasi-static motions
     _true: Inertia  # of motions in real time
     _inertia: Inertia  # of the last motion
@@ -242,7 +253,11 @@ class FemWorld(BaseWorld):
         """The path between two poses of all driven frames, at the scene's speed."""
         mach, gel, lever = self.scene.peak_mach, self._gel, max(self._gel.half)
         remembered = (path_length if self.yields else path_along)(start, end, lever)
-        return plan(start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered)
+        short = SHORT_PATH if self.yields else SHORT_SLIDE
+        path = plan(
+            start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered, short=short
+        )  # fmt: skip
+        return replace(path, hurried=path.peak_mach(lever) > self._fastest)
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.settling.flow_mach, self._gel

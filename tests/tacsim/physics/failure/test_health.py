@@ -304,7 +304,7 @@ def test_a_step_that_squeezed_elements_do_not_bear_is_halved(monkeypatch: pytest
 
     with monkeypatch.context() as patch:
         patch.setattr(health, "LARGEST_COURANT", np.inf)
-        assert all(stats.settled and stats.retries == 0 for stats in pressed())
+        assert all(stats.residual <= 1e-2 and stats.retries == 0 for stats in pressed())
     last = pressed()[-1]
     assert last.retries == 1 and last.time_step == pytest.approx(0.4e-3) and 0.4 < last.courant < LARGEST_COURANT
 

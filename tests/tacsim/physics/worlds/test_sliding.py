@@ -40,6 +40,13 @@ def test_a_slid_ball_is_dragged_by_all_its_friction_at_the_default_speed(
     assert slide(pressed_ball(friction, preset), 2e-3) == pytest.approx(ratio, rel=0.02)
 
 
+@pytest.mark.xfail(strict=True, reason="1.21 at draft: the corners of elements that plough press back and let it slip")
+def test_a_ball_slid_with_much_friction_is_dragged_by_all_of_it() -> None:
+    """Where it ploughs, at mu = 1.5: of the same mesh at Mach 0.001, 1.685 without what presses narrow corners back
+    and 1.546 with it."""
+    assert slide(pressed_ball(1.5, "draft"), 2e-3) == pytest.approx(1.685, rel=0.02)
+
+
 def test_a_short_slide_ends_as_a_slow_one() -> None:
     """0.3 and 0.6 mm at draft, where a part of the contact still sticks: the same mesh at Mach 0.001."""
     for friction, ratios in ((0.3, (0.321, 0.325)), (0.6, (0.421, 0.652)), (1.0, (0.450, 0.810))):
@@ -65,6 +72,26 @@ def test_what_has_edges_ends_a_slide_as_a_slow_one(shape: Shape, friction: float
         w.move({"indenter": Pose(w.pose("indenter").position - [0, 0, 0.4e-3])})
         ratios.append(slide(w, 0.5e-3, 3000))
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
+
+
+@pytest.mark.parametrize("friction", [0.3, 1.0])
+def test_small_slides_end_as_slow_ones_and_cost_little(friction: float) -> None:
+    """Four slides of 0.1 mm at draft, against the same mesh at Mach 0.001."""
+    slow = {0.3: (0.1464, 0.2602, 0.3189, 0.3216), 1.0: (0.1596, 0.3096, 0.4494, 0.5778)}[friction]
+    w = pressed_ball(friction, "draft")
+    ratios = [slide(w, 0.1e-3, 150) for _ in range(4)]
+    assert ratios == pytest.approx(slow, rel=0.015)
+
+
+def test_what_is_driven_faster_than_friction_may_be_followed_has_not_settled() -> None:
+    """At Mach 0.1 the gel slips by inertia on the way: the force of this press is 6 % low (Mach 0.001), whatever the
+    residual. Without friction the same state is found at any speed."""
+    for friction, mach, settled in ((0.6, None, True), (0.6, 0.1, False), (0.0, 0.1, True)):
+        w = world(Sphere(radius=4e-3), friction, 1e-2, preset="draft", gel=Gel(), settling={"mach": mach})
+        pose = w.pose("indenter")
+        stats = w.move({"indenter": Pose(pose.position - [0, 0, 1.1e-3], pose.quaternion)})
+        assert stats.settled == settled
+        assert stats.residual <= 1e-2
 
 
 def test_a_slid_ball_keeps_its_drag_while_it_is_held() -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Box, Cylinder, Gel, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Shape, Sphere
 from tacsim.physics.worlds.press import PressWorld
 from tests.tacsim.physics.worlds.pressing import move, world
 
@@ -72,6 +72,19 @@ def test_what_has_edges_ends_a_slide_as_a_slow_one(shape: Shape, friction: float
         w.move({"indenter": Pose(w.pose("indenter").position - [0, 0, 0.4e-3])})
         ratios.append(slide(w, 0.5e-3, 3000))
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("shape", [Box(size=(4e-3, 4e-3, 4e-3)), Cylinder(radius=2e-3, height=4e-3)])
+def test_an_edge_as_round_as_an_element_ends_a_long_slide_as_a_slow_one(shape: Shape, friction: float) -> None:
+    """2 mm at draft, where a sharp edge catches on the mesh, against a sixth of the speed."""
+    ratios = []
+    for settling in ({}, {"mach": 0.003, "tolerance": 1e-3, "max_substeps": 500}):
+        indenter = Indenter(geometry=shape, friction=friction, edge_radius=1e-3)
+        w = world(shape, friction, preset="draft", gel=Gel(), settling=settling, indenter=indenter)
+        w.move({"indenter": Pose(w.pose("indenter").position - [0, 0, 0.4e-3])})
+        ratios.append(slide(w, 2e-3, 4000))
+    assert ratios[0] == pytest.approx(ratios[1], rel=0.01)
 
 
 @pytest.mark.parametrize("friction", [0.3, 1.0])

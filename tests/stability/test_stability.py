@@ -26,8 +26,8 @@ USUAL = {
     ("elastic, nu 0.499, to half", "hybrid"),  # nearly incompressible, large strain
     ("plasticine, k 0.05, to a fifth", "hybrid"),  # large plastic strain
     ("hardly any yield stress", "hybrid"),  # a liquid
-    ("one layer of particles", "hybrid"),  # smallest resolution, and gels that meet
-    ("gel to a tenth, plate", "press"),  # elements turned inside out
+    ("one layer of particles", "hybrid"),  # refused
+    ("gel to a tenth, plate", "press"),  # elements crushed
     ("impact, press", "press"),  # fast, in real time
     ("flow, back and forth, fast", "hybrid"),  # accelerations between motions
     ("sensor through the body", "hybrid"),  # gels in one another
@@ -93,14 +93,10 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "hybrid": lambda f: balanced(f) and f["least element"] > 0.9999,
         "seed": balanced,
     },
-    # Elements of 1 mm with one point each fold at 1.7 mm of 4; a finer mesh goes deeper.
-    "gel to a tenth, plate": {"press": "turned inside out"},
-    "gel to a tenth, punch": {"press": "turned inside out"},
-    "one layer of particles": {
-        # the gels, 2.5 times as wide as it, meet round it
-        "hybrid": lambda f: balanced(f) and f["height"] < 0.6e-3 and f["guard_hits"] > 0,
-        "seed": lambda f: balanced(f) and f["height"] < 0.6e-3,
-    },
+    # Half of the gel is borne, nine tenths are not.
+    "gel to a tenth, plate": {"press": "inverted or crushed"},
+    "gel to a tenth, punch": {"press": "of the wave speed"},
+    "one layer of particles": {"hybrid": "it needs 3", "seed": "it needs 3"},
     "scene of 10 mm": {"hybrid": balanced, "seed": balanced},
     # Forces scale with length^2: against 0.521 N, that of the scene of 10 mm driven at Mach 0.003.
     "scene of 0.1 mm": {
@@ -112,8 +108,9 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "seed": lambda f: balanced(f) and f["retries"] == 0 and f["force"] == pytest.approx(0.528e4, rel=0.02),
     },
     # A tip and an edge go as deep into the surface as a half-space gives way between two nodes, 1 mm apart here.
-    "sharp cone": {"press": lambda f: f["settled"] == 1 and 0.05 < f["force"] < 0.3 and f["overlap"] < 150e-6},
-    "sharp cone, deep": {"press": "turned inside out"},
+    # Its tip lies between contact points 0.33 mm apart: seen from 1 mm deep on.
+    "sharp cone": {"press": "no contact point more than"},
+    "sharp cone, deep": {"press": lambda f: f["settled"] == 1 and f["least element"] > 0.5},
     "Mach 0.3": {"hybrid": balanced, "seed": balanced},
     "Mach 0.3, press": {"press": lambda f: f["settled"] == 1 and PRESSED[0] < f["force"] < PRESSED[1]},
     # The gels give half of the 3 mm; a body without yield springs back.
@@ -225,7 +222,7 @@ def test_hard_case(worker: Worker, name: str, physics: str) -> None:
         assert outcome.kind == "finite", outcome
         assert expected(outcome.figures), outcome.figures
     else:
-        assert outcome.kind == "diverged", outcome
+        assert outcome.kind in ("diverged", "refused"), outcome
         assert expected in outcome.words
         assert "wave speed" in outcome.words or "mm" in outcome.words  # says where
 

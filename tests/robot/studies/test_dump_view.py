@@ -98,7 +98,7 @@ def test_arrays_of_another_scene_are_refused(tmp_path: Path, monkeypatch: pytest
         (place / "dump.json").write_text(json.dumps({**info, "scene": {**info["scene"], **scene}}))
         return tacsim("debug", place)
 
-    for scene in ({"element_size": 2e-3}, {"particle_spacing": 1e-3}):
+    for scene in ({"element_size": 2e-3}, {"particle_spacing": 0.4e-3}):
         result = changed(**scene)
         assert result.exit_code == 2 and "is it of this scene?" in result.output
     (place / "dump.json").write_text(json.dumps(info))

@@ -119,7 +119,9 @@ def check_launch(arrays: Callable[[], State], good: State, health: Health, where
 def _fault(look: Callable[[], State], health: Health) -> tuple[str, diagnosis.Quantity] | None:
     """What is unphysical, and the quantity that shows where; None when all is well."""
     if not health.smallest_volume_ratio > SMALLEST_VOLUME_RATIO:
-        return f"a gel element is inverted or crushed (volume ratio {health.smallest_volume_ratio:.3g})", "node speed"
+        ratio = health.smallest_volume_ratio
+        told = f"volume ratio {ratio:.3g}" if ratio > -1e3 else "torn without bound"
+        return f"a gel element is inverted or crushed ({told})", "node speed"
     if not health.smallest_step_volume > SMALLEST_STEP_VOLUME:
         ratio = health.smallest_step_volume
         return f"a particle lost its volume in one substep (ratio {ratio:.3g})", "particle speed"

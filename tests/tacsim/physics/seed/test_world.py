@@ -128,8 +128,9 @@ def test_a_sideways_move_shears_both_gels(pressed):
     assert upper[0] == pytest.approx(-lower[0], abs=5e-3 * abs(lower[2]))
     sheared = [pressed.surface(name).displacement[8:12, 8:12, 0].mean() for name in pressed.sensors]
     assert sheared[0] > 5e-6
-    # equal forces, but shapes differ with the place of the gels relative to the nodes in x (about 25 %)
-    assert sheared[1] == pytest.approx(-sheared[0], rel=0.45)
+    # equal forces, but shapes differ with the place of the gels relative to the nodes in x, more the longer they creep:
+    # by 25 % at first, by 45 % when they have settled
+    assert sheared[1] == pytest.approx(-sheared[0], rel=0.55)
     assert pressed.truth().position[0] == pytest.approx(0.2e-3, abs=0.05e-3)
 
 

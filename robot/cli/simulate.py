@@ -69,6 +69,11 @@ def press(
         do = "raise settling.max_substeps"
         if config["residual"] is not None and config["residual"] <= scene.settling.tolerance:
             held, do = f"contact slips by inertia at Mach {scene.peak_mach:g}", "leave out settling.mach, or lower it"
+            from tacsim.models.scene import CATCHING
+
+            if scene.indenter is not None and scene.indenter.catches(scene.element):
+                held = f"an edge sharper than {CATCHING * scene.element * 1e3:g} mm catches on the mesh as it is slid"
+                do = "give so large an --edge-radius for a drag to rely on"
         notes.print(f"warning: not settled, {held}; {do}")
     say_files(*sorted(folder.iterdir()))
 

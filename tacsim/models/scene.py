@@ -29,6 +29,7 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 # (docs/decisions/0002).
 MACH_BY_TOLERANCE, MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH = 3.0, 4.0, 0.001, 0.03
 MACH_BY_SHEAR = 0.1
+CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
 
@@ -164,6 +165,11 @@ class Indenter(Config):
                     f"{min(sides) / 2:g} m"
                 )
         return self
+
+    def catches(self, element: float) -> bool:
+        """Its edges are sharper than a mesh of such elements [m] follows in a slide: they hang on to its points and
+        snap off (docs/decisions/0002)."""
+        return isinstance(self.geometry, Box | Cylinder) and self.edge_radius < CATCHING * element * (1 - 1e-9)
 
 
 class Settling(Config):

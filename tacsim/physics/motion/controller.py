@@ -159,7 +159,7 @@ def move_and_settle(path: Path, settling: Settling, *, balanced: bool) -> Motion
             worst = max(worst, still_to_come(*readings[-3:]))
             if worst <= settling.tolerance:
                 break
-    return _stats(readings, path.substeps, held, worst, settling, hurried=path.hurried)
+    return _stats(readings, path.substeps, held, worst, settling, unfollowed=path.unfollowed)
 
 
 def move_real_time(path: Path, settling: Settling, *, balanced: bool) -> Motion:
@@ -194,14 +194,14 @@ def _follow(path: Path) -> Generator[Launch, ForceReading, list[ForceReading]]:
 
 def _stats(
     readings: Sequence[ForceReading], substeps: int, held: int, worst: float, settling: Settling, *,
-    hurried: bool = False,
+    unfollowed: bool = False,
 ) -> MoveStats:  # fmt: skip
     overlap = readings[-1].overlap / MM if readings else 0.0
     hits = sum(reading.guard_hits for reading in readings)
     last = readings[-1].integration if readings else Integration()
     smallest, largest = readings[-1].volumes if readings else (1.0, 1.0)
     return MoveStats(
-        substeps + held, held, worst, worst <= settling.tolerance and not hurried, overlap, hits,
+        substeps + held, held, worst, worst <= settling.tolerance and not unfollowed, overlap, hits,
         time_step=last.step / MM, damping=last.damping,
         courant=max((reading.integration.courant for reading in readings), default=0.0),
         gel_overlap=readings[-1].gel_overlap / MM if readings else 0.0,

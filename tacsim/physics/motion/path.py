@@ -53,7 +53,7 @@ class Path:
     Each nominal substep is cut into `refine` real ones; all counts of substeps are nominal. interval: substeps of the
     hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
 
-    hurried: faster than friction may be followed.
+    unfollowed: friction does not follow it: too fast, or slid by an edge that catches on the mesh.
 
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm]: instead of a ramp
     from rest to rest the path is then the cubic that has them.
@@ -66,7 +66,7 @@ class Path:
     refine: int = 1
     interval: int = 20
     rise: float = 0.5
-    hurried: bool = False
+    unfollowed: bool = False
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property

@@ -55,6 +55,8 @@ ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0
 # Of the speed of the gel's shear wave, of an indenter with friction: up to it a slide ends within 2 % of a slow one; at
 # 0.25 it is up to 3 % off, at 0.5 up to 17 %
 HURRIED_BY_SHEAR = 0.155
+# Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 18 % off
+SLID_BY_EDGES = 0.5
 
 
 class FemState(ABC):
@@ -260,9 +262,12 @@ class FemWorld(BaseWorld):
             start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered, short=short
         )  # fmt: skip
         indenter = self.scene.indenter
-        rubs = indenter is not None and indenter.friction > 0.0
+        if indenter is None or indenter.friction == 0.0:
+            return path
+        slid = path_along(start, end, 0.0)  # without turns
+        catches = indenter.catches(self.scene.element) and slid > SLID_BY_EDGES * self.scene.element * MM * (1 + 1e-6)
         return replace(
-            path, hurried=rubs and path.peak_mach(lever) > HURRIED_BY_SHEAR * math.sqrt(gel.mu / gel.density)
+            path, unfollowed=catches or path.peak_mach(lever) > HURRIED_BY_SHEAR * math.sqrt(gel.mu / gel.density)
         )
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:

@@ -86,6 +86,23 @@ def test_an_edge_as_round_as_an_element_ends_a_long_slide_as_a_slow_one(shape: S
     assert ratios[0] == pytest.approx(ratios[1], rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("edge_radius", "friction", "by", "settled"),
+    [(0.0, 0.6, 0.5e-3, True), (0.0, 0.6, 0.6e-3, False), (0.5e-3, 0.6, 0.6e-3, True), (0.0, 0.0, 0.6e-3, True)],
+)
+def test_a_slide_by_an_edge_that_catches_has_not_settled(
+    edge_radius: float, friction: float, by: float, settled: bool
+) -> None:
+    """At draft, where half an element is 0.5 mm."""
+    shape = Cylinder(radius=2e-3, height=4e-3)
+    w = world(shape, friction, 1e-2, preset="draft", gel=Gel(), edge_radius=edge_radius)
+    move(w, (0, 0, -0.4e-3))
+    pose = w.pose("indenter")
+    stats = w.move({"indenter": Pose(pose.position + [by, 0, 0], pose.quaternion)})
+    assert stats.residual <= 1e-2 and stats.settled == settled
+    assert w.move({}).settled  # held on, what is there is at rest
+
+
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_small_slides_end_as_slow_ones_and_cost_little(friction: float) -> None:
     """Four slides of 0.1 mm at draft, against the same mesh at Mach 0.001."""

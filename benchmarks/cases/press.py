@@ -28,7 +28,19 @@ from benchmarks.truth.limit import (
 )
 from tacsim.geometry.shapes import extent
 from tacsim.interface import Pose
-from tacsim.models.scene import FASTEST_MACH, Box, Cylinder, Gel, GelMaterial, Indenter, Scene, Shape, Sphere
+from tacsim.models.scene import (
+    FASTEST_MACH,
+    PRESETS,
+    Box,
+    Cylinder,
+    Gel,
+    GelMaterial,
+    Indenter,
+    Preset,
+    Scene,
+    Shape,
+    Sphere,
+)
 from tacsim.physics.move import MoveStats
 from tacsim.physics.oracle.layer import LayerContact, layer_contact
 
@@ -181,24 +193,39 @@ def slid_ball(preset: str, repeat: int) -> list[Measurement]:
     settled = {"mach": SLIDE_SLOW[preset], "tolerance": 1e-3, "max_substeps": 500}
     rows = []
     for friction in (0.3, 0.6, 1.0, 1.5):
-        timing, (found, stats) = timed(partial(_drag, preset, friction, SLIDE), 1, warm=lambda: None)
-        truth, _ = _drag(preset, friction, SLIDE, **settled)
+        ball = Indenter(geometry=Sphere(radius=RADIUS), friction=friction)
+        timing, (found, stats) = timed(partial(_drag, preset, ball, 0.5e-3, SLIDE), 1, warm=lambda: None)
+        truth, _ = _drag(preset, ball, 0.5e-3, SLIDE, **settled)
         what = f"the same mesh at Mach {SLIDE_SLOW[preset]:g}"
         rows.append(_drag_row(timing, found, stats, truth, what, f"0.5 mm, friction {friction:g}"))
     return rows
 
 
-def _drag(preset: str, friction: float, length: float, **settling: float) -> tuple[float, MoveStats]:
-    """Drag over normal force after a slide of so much [m]."""
+def slid_edges(preset: Preset, repeat: int) -> list[Measurement]:
+    """A cylinder R 2 mm and a box of 4 mm, 0.3 mm deep, dragged by 2 mm: sharp, and as round as an element."""
+    element, settled = PRESETS[preset][1], {"mach": 0.003, "tolerance": 1e-3, "max_substeps": 500}
+    rows = []
+    for shape in (Cylinder(radius=2e-3, height=4e-3), Box(size=(4e-3, 4e-3, 4e-3))):
+        for radius, friction in ((r, mu) for r in (0.0, element) for mu in (0.3, 0.6, 1.0, 1.5)):
+            edged = Indenter(geometry=shape, friction=friction, edge_radius=radius)
+            timing, (found, stats) = timed(partial(_drag, preset, edged, 0.3e-3, 2e-3), 1, warm=lambda: None)
+            truth, _ = _drag(preset, edged, 0.3e-3, 2e-3, **settled)
+            variant = f"{'round' if radius else 'sharp'} {shape.shape}, friction {friction:g}"
+            rows.append(_drag_row(timing, found, stats, truth, "the same mesh at Mach 0.003", variant))
+    return rows
+
+
+def _drag(preset: str, indenter: Indenter, deep: float, length: float, **settling: float) -> tuple[float, MoveStats]:
+    """Drag over normal force after a slide of so much, so deep [m]."""
     scene = Scene.model_validate(
         {
             "body": None,
             "preset": preset,
-            "indenter": Indenter(geometry=Sphere(radius=RADIUS), friction=friction),
+            "indenter": indenter,
             "settling": settling,
         }
     )
-    world, _ = press(scene, 0.5e-3)
+    world, _ = press(scene, deep)
     pose = world.pose("indenter")
     stats = world.move({"indenter": Pose(pose.position + [length, 0, 0], pose.quaternion)})
     force = world.wrench("lower")
@@ -307,4 +334,6 @@ CASES = (
     Case("press", "flat_punch", "tacsim", "h 0.5 mm", partial(flat_punch, 0.5e-3)),
     Case("press", "sliding_force", "tacsim", "h 1 mm", partial(sliding_force, 1e-3)),
     *(Case("press", "slid_ball", "tacsim", preset, partial(slid_ball, preset)) for preset in ("draft", "standard")),
+    Case("press", "slid_edges", "tacsim", "draft", partial(slid_edges, "draft")),
+    Case("press", "slid_edges", "tacsim", "standard", partial(slid_edges, "standard"), long=True),
 )  # fmt: skip

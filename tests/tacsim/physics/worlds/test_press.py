@@ -144,11 +144,11 @@ def brick(folder: Path, size: tuple[float, float, float]) -> tuple[Box, Mesh]:
 def test_a_mesh_wider_than_the_gel_is_there_wherever_it_is_moved(tmp_path: Path) -> None:
     """Its far ends, brought over the gel after it was pressed, and by a turn, press as those of the closed form.
 
-    Little friction: what an edge that ploughs drags depends on which contact point it meets first (5 % at 0.2).
+    No friction: what an edge that ploughs drags depends on which contact point it meets first (5 % at 0.2).
     """
     forces = []
     for shape in brick(tmp_path, (18, 5, 2)):
-        w = world(shape, 0.1, preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
+        w = world(shape, 0.0, preset="draft", gel=Gel(size=(6e-3, 6e-3, 4e-3)))
         found = []
         for by, turn in (((0, 0, -0.4e-3), 0.0), ((7e-3, 0, 0), 0.0), ((0, 0, 0), 0.5)):
             move(w, by, turn)
@@ -284,7 +284,7 @@ def test_contact_forgets_what_it_no_longer_touches(kind: str, tmp_path: Path) ->
         box = Mesh(path=str(tmp_path / "box.stl"))
     w = world(box, tolerance=1e-2, preset="draft")
     move(w, (0, 0, -0.5e-3))
-    move(w, (2.3e-3, 0, 0))
+    w.move({"indenter": Pose(w.pose("indenter").position + [2.3e-3, 0, 0])})  # by sharp edges: not called settled
     touched = w.snapshot()
     assert touched["slip"].any() and touched["pressure"].any()
     move(w, (0, 0, 6e-3))

@@ -123,7 +123,7 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
                 "settled", "flowing at Mach 0.01, the default", "flowing, heights and forces: a step of 16",
                 "settled, heights and forces: a step of 16", "flowing, two pictures of 160 x 120: a step of 16",
                 "flowing, two pictures of 160 x 120: a reset", "a ball: force", "a ball: contact radius",
-                "0.5 mm, friction 0.6", "time 10: force", "700 cycles",
+                "0.5 mm, friction 0.6", "round box, friction 0.6", "time 10: force", "700 cycles",
                 "its centre", "its farthest particle", "stick limit", "lattice, 3 mm", "random, 3 mm",
                 "R 3 mm, 1 mm deep: image", "R 3 mm, 1 mm deep: pressure",
                 "THUsight: picture", "THUsight: normals", "Taxim: picture", "FOTS: picture", "R 3 mm: height",

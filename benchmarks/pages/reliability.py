@@ -74,7 +74,7 @@ READING = (
     "summed over all. The verdict is on the median; *met, worst beyond* says that a repetition was not within it.\n"
     "- **An idle machine** is meant. Others that work on it are told above by the load; with a load near the number of "
     "cores or beyond it the times here say more about them than about us. `make test` runs the same tests once, with "
-    "longer time-outs and bounds ten times wider.\n"
+    "longer time-outs, and judges by positions and the controller's clock, not by how long it took.\n"
     "- **Rerun:** `make reliability`, or `tacsim bench robot --long --json benchmarks/reliability.json --docs docs`: "
     "the tests below that record a figure, five times each. `tacsim bench all` leaves this group out. ur_rtde has no "
     "wheel for Python 3.13; there only the guard and the camera are measured."

@@ -71,7 +71,7 @@ def press(
             held, do = f"contact slips by inertia at Mach {scene.peak_mach:g}", "leave out settling.mach, or lower it"
             from tacsim.models.scene import CATCHING
 
-            if scene.indenter is not None and scene.indenter.catches(scene.element):
+            if scene.indenter is not None and scene.indenter.catches(scene.element) and any(motion.slide):
                 held = f"an edge sharper than {CATCHING * scene.element * 1e3:g} mm catches on the mesh as it is slid"
                 do = "give so large an --edge-radius for a drag to rely on"
         notes.print(f"warning: not settled, {held}; {do}")

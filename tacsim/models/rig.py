@@ -82,7 +82,9 @@ class SqueezeConfig(Config):
     placement: Annotated[Length, Field(ge=0)] = 0.0  # reset starts at most this far beside the body, by the seed [m]
     success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
     reward_scale: Annotated[Length, Field(gt=0)] = 1e-3  # reward = -distance / reward_scale
-    force_limit: Annotated[Force, Field(gt=0)] | None = None  # of a normal force: beyond it an episode has failed
+    force_limit: Annotated[Force, Field(gt=0)] | None = (
+        None  # of a normal force: an environment's episode fails beyond it (arms have limits of their own)
+    )
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
 
 

@@ -159,9 +159,9 @@ def _gap(truth: Truth, sensor: Pose) -> float:
     return float(((points - sensor.position) @ axis).min()) - radius
 
 
-def _advance(world: World, steps: Mapping[str, float], *, flow: bool = False) -> MoveStats:
+def _advance(world: World, steps: Mapping[str, float]) -> MoveStats:
     """Moves each named sensor along its own z by its step [m]."""
-    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()}, flow=flow)
+    return world.move({name: se3.along_z(world.pose(name), step) for name, step in steps.items()})
 
 
 def _least_force(world: World) -> float:

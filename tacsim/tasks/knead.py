@@ -77,9 +77,6 @@ class Knead:
             "iou": iou(body, self.solid),
         }
 
-    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
-        return None  # two contacts of one moment do not tell how round or how long a body is
-
     def expert(self, truth: Truth, start: Truth) -> None:
         return None
 

@@ -42,10 +42,6 @@ class Reposition:
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         return {}
 
-    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
-        now, then = estimated_position(observation), estimated_position(start)
-        return None if now is None or then is None else float(np.linalg.norm(now - then - np.array(self.config.goal)))
-
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """Straight for the goal, as fast as the longer axis may go."""
         left = np.array(self.config.goal) - (truth.position - start.position)[:2]

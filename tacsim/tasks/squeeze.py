@@ -39,10 +39,6 @@ class Squeeze:
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         return {}
 
-    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
-        felt = all(touch.contact.any() for touch in observation.tactile.values())
-        return abs(estimated_height(observation) - self.config.goal) if felt else None
-
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """Both sensors close by what is left of the height, over the share of their way that the body has taken since
         `start` (the gels take the rest), as fast as they may. Where that share stays what it was, nobody is there

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from tacsim.interface import FloatArray, Needs, Observation, Policy, Truth
+from tacsim.interface import FloatArray, Needs, Policy, Truth
 from tacsim.models.rig import TaskConfig
 
 
@@ -42,11 +42,6 @@ class Task(Protocol):
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         """What else is said of the body at the end of an episode."""
-        ...
-
-    def estimate(self, observation: Observation, start: Observation, pitch: float) -> float | None:
-        """The same distance by touch alone, as it can be known on hardware; `start` is the first observation of the
-        episode, `pitch` that of the canonical grid [m]. None where nothing is felt that tells it."""
         ...
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray | None:

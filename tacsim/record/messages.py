@@ -5,34 +5,44 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from tacsim.interface import Action, ArmState, Pose, SurfaceMap, TactileFrame
+from tacsim.record import format_1
 from tacsim.record.episode import ArmPackages, EpisodeError, Recorded, Step
 from tacsim.record.images import decode_image, encode_png
-from tacsim.record.schemas import (
-    ARM_SCHEMA,
-    PACKAGE_SCHEMA,
-    STEP_SCHEMA,
-    STEP_TOPIC,
-    ArmMessage,
-    FrameMessage,
-    PackageMessage,
-    PackagesMessage,
-    PoseMessage,
-    StepMessage,
+from tacsim.record.protobuf import (
+    PACKAGE_FIELDS,
+    TWIST,
+    WRENCH,
+    Arm,
+    ArmPackage,
+    Scalar,
+    arm_message,
+    joints_of,
+    package_message,
+    package_row,
+    parse,
+    put_pose,
+    six,
 )
+from tacsim.record.protobuf import Step as StepMessage
+from tacsim.record.schemas import STEP_TOPIC
 
 Messages = Mapping[str, Sequence[bytes]]  # of one step, by topic; only of packages there are several
 
+WORLD = "world"  # the frame of all poses
 _FLOAT = np.dtype("<f4")
 _SURFACE_FIELDS = ("height", "gradient_x", "gradient_y")
 _FLOW_FIELDS = ("flow_x", "flow_y")
@@ -43,7 +53,7 @@ class Encoded:
     """One message of a step."""
 
     topic: str
-    schema: str | type[Message]  # name of a JSON schema, or a protobuf message class
+    schema: type[Message]
     log_time: int  # where viewers put it: at its step, or a package at its own time; wall clock [ns]
     time: int  # when its content was true, wall clock [ns]
     data: bytes
@@ -86,25 +96,10 @@ def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]
         messages += _encode_arm(name, arm, clock)
     for name, packages in step.packages.items():
         messages += _encode_packages(name, packages, clock)
-    record = StepMessage(
-        index=int(step.index),
-        time=step.time,
-        seconds=step.seconds,
-        reward=step.reward,
-        distance=step.distance,
-        info={key: float(value) for key, value in step.info.items()},
-        action=None if step.action is None else _pose_messages(step.action.tool),
-        sent=_pose_messages(step.sent),
-        frames={name: _frame_message(frame) for name, frame in step.frames.items()},
-        arms=tuple(step.arms),
-        packages={
-            name: PackagesMessage(count=len(packages.stamp), lost=packages.lost)
-            for name, packages in step.packages.items()
-        },
-    )
-    left_out = set() if record.packages else {"packages"}  # readers of before know no packages
-    data = record.model_dump_json(exclude=left_out).encode()
-    messages.append(Encoded(STEP_TOPIC, STEP_SCHEMA, clock.now, clock.now, data))
+    for key, value in step.info.items():
+        data = Scalar(value=value).SerializeToString()
+        messages.append(Encoded(f"{STEP_TOPIC}/{key}", Scalar, clock.now, clock.now, data))
+    messages.append(Encoded(STEP_TOPIC, StepMessage, clock.now, clock.now, _step_message(step).SerializeToString()))
     return messages
 
 
@@ -119,33 +114,61 @@ def decode_step(
         sizes: rows and columns of the pictures by sensor, those of the first that is decoded: others are refused.
     """
     try:
-        record = StepMessage.model_validate_json(data)
-        for name, frame in record.frames.items():
-            for topic in _frame_topics(name, frame):
+        if format_1.is_json(data):
+            record, info = format_1.step(data)
+        else:
+            record = parse(StepMessage, data)
+            info = {key: parse(Scalar, _last(messages, f"{STEP_TOPIC}/{key}")).value for key in record.info}
+        frames = {frame.sensor: frame for frame in record.frames}
+        for frame in frames.values():
+            for topic in _frame_topics(frame):
                 _last(messages, topic)
+        packages = {each.arm: each for each in record.packages}
         return Step(
             index=record.index,
             time=record.time,
             frames=Recorded(
-                {name: frame.time for name, frame in record.frames.items()},
-                partial(_decode_frame, record.frames, messages, what, {} if sizes is None else sizes),
+                {name: frame.time for name, frame in frames.items()},
+                partial(_decode_frame, frames, messages, what, {} if sizes is None else sizes),
             ),
             arms={name: _decode_arm(name, messages) for name in record.arms},
-            action=None if record.action is None else Action(_poses(record.action)),
+            action=Action(_poses(record.asked)) if record.acted else None,
             sent=_poses(record.sent),
-            reward=record.reward,
-            distance=record.distance,
-            info=record.info,
+            reward=record.reward if record.HasField("reward") else None,
+            distance=record.distance if record.HasField("distance") else None,
+            info=info,
             seconds=record.seconds,
             packages=Recorded(
-                {name: each.lost for name, each in record.packages.items()},
-                partial(_decode_packages, record.packages, messages, what),
+                {name: each.lost for name, each in packages.items()},
+                partial(_decode_packages, packages, messages, what),
             ),
         )
     except EpisodeError:
         raise
     except (DecodeError, ValueError) as failure:
         raise EpisodeError(f"a step cannot be decoded: {failure}") from failure
+
+
+def _step_message(step: Step) -> Any:
+    made = StepMessage(index=int(step.index), time=step.time, seconds=step.seconds, acted=step.action is not None)
+    if step.reward is not None:
+        made.reward = step.reward
+    if step.distance is not None:
+        made.distance = step.distance
+    for targets, poses in ((made.asked, step.action.tool if step.action else {}), (made.sent, step.sent)):
+        for name, pose in poses.items():
+            target = targets.add(arm=name)
+            if pose is not None:
+                put_pose(target, pose.position.tolist(), pose.quaternion.tolist())
+    for name, frame in step.frames.items():
+        surface = frame.surface
+        flow = surface is not None and surface.flow is not None
+        made.frames.add(sensor=name, time=frame.time, index=int(frame.index), surface=surface is not None, flow=flow)
+    made.arms.extend(step.arms)
+    made.info.extend(step.info)
+    for name, packages in step.packages.items():
+        made.packages.add(arm=name, count=len(packages.stamp), lost=packages.lost)
+    return made
 
 
 def _last(messages: Messages, topic: str) -> bytes:
@@ -166,19 +189,23 @@ def _encode_frame(name: str, frame: TactileFrame, pitch: float, clock: _Clock) -
     width = pitch * surface.height.shape[-1]  # [m] of the whole map
     cells = _join(name, _SURFACE_FIELDS, surface.height[..., None], surface.gradient)
     yield Encoded(f"/{name}/surface", Grid, clock.now, time, _encode_grid(name, stamp, cells, _SURFACE_FIELDS, width))
+    rows, columns = surface.height.shape
+    height = RawImage(timestamp=stamp, frame_id=name, width=columns, height=rows, encoding="32FC1", step=4 * columns)
+    height.data = (1e3 * surface.height).astype(_FLOAT).tobytes()
+    yield Encoded(f"/{name}/height", RawImage, clock.now, time, height.SerializeToString())
     if surface.flow is not None:
         cells = _join(name, _FLOW_FIELDS, surface.flow)
         yield Encoded(f"/{name}/flow", Grid, clock.now, time, _encode_grid(name, stamp, cells, _FLOW_FIELDS, width))
 
 
-def _frame_topics(name: str, record: FrameMessage) -> list[str]:
+def _frame_topics(record: Any) -> list[str]:
     """The topics of the messages that a frame is made of."""
     there = {"image": True, "surface": record.surface, "flow": record.surface and record.flow}
-    return [f"/{name}/{part}" for part, is_there in there.items() if is_there]
+    return [f"/{record.sensor}/{part}" for part, is_there in there.items() if is_there]
 
 
 def _decode_frame(
-    records: Mapping[str, FrameMessage],
+    records: Mapping[str, Any],
     messages: Messages,
     what: str,
     sizes: dict[str, tuple[int, int]],
@@ -197,11 +224,6 @@ def _decode_frame(
         raise EpisodeError(f"{what}: {failure}") from failure
     sizes.setdefault(name, pixels.shape[:2])
     return TactileFrame(image=pixels, time=record.time, index=record.index, surface=surface)
-
-
-def _frame_message(frame: TactileFrame) -> FrameMessage:
-    flow = frame.surface is not None and frame.surface.flow is not None
-    return FrameMessage(time=frame.time, index=int(frame.index), surface=frame.surface is not None, flow=flow)
 
 
 def _join(name: str, fields: tuple[str, ...], *arrays: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -248,65 +270,59 @@ def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
 
 def _encode_arm(name: str, arm: ArmState, clock: _Clock) -> Iterator[Encoded]:
     time = clock(arm.time)
-    pose = PoseInFrame(timestamp=_timestamp(time), frame_id="world")
-    place, turn = pose.pose.position, pose.pose.orientation
-    place.x, place.y, place.z = arm.pose.position.tolist()
-    turn.x, turn.y, turn.z, turn.w = arm.pose.quaternion.tolist()
+    stamp = _timestamp(time)
+    pose = PoseInFrame(timestamp=stamp, frame_id=WORLD)
+    put_pose(pose, arm.pose.position.tolist(), arm.pose.quaternion.tolist())
     yield Encoded(f"/{name}/pose", PoseInFrame, clock.now, time, pose.SerializeToString())
-    joints = None if arm.joints is None else tuple(arm.joints.tolist())
-    record = ArmMessage(
-        twist=tuple(arm.twist.tolist()), wrench=tuple(arm.wrench.tolist()), joints=joints, time=arm.time
-    )
-    yield Encoded(f"/{name}/arm", ARM_SCHEMA, clock.now, time, record.model_dump_json().encode())
+    transform = FrameTransform(timestamp=stamp, parent_frame_id=WORLD, child_frame_id=name)
+    transform.translation.x, transform.translation.y, transform.translation.z = arm.pose.position.tolist()
+    transform.rotation.CopyFrom(pose.pose.orientation)
+    yield Encoded(f"/{name}/transform", FrameTransform, clock.now, time, transform.SerializeToString())
+    joints = None if arm.joints is None else arm.joints.tolist()
+    message = arm_message(arm.time, arm.twist.tolist(), arm.wrench.tolist(), joints)
+    yield Encoded(f"/{name}/arm", Arm, clock.now, time, message.SerializeToString())
 
 
 def _decode_arm(name: str, messages: Messages) -> ArmState:
     pose = PoseInFrame.FromString(_last(messages, f"/{name}/pose")).pose
-    record = ArmMessage.model_validate_json(_last(messages, f"/{name}/arm"))
-    place, turn = pose.position, pose.orientation
+    data = _last(messages, f"/{name}/arm")
+    arm = format_1.arm(data) if format_1.is_json(data) else parse(Arm, data)
     return ArmState(
-        pose=Pose(np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])),
-        twist=np.array(record.twist),
-        wrench=np.array(record.wrench),
-        joints=None if record.joints is None else np.array(record.joints, dtype=np.float64),
-        time=record.time,
+        pose=_pose(pose),
+        twist=np.array(six(arm, TWIST)),
+        wrench=np.array(six(arm, WRENCH)),
+        joints=np.array(joints_of(arm.joints)) if arm.HasField("joints") else None,
+        time=arm.time,
     )
 
 
 def _encode_packages(name: str, packages: ArmPackages, clock: _Clock) -> Iterator[Encoded]:
-    columns = [getattr(packages, field).tolist() for field in PackageMessage.model_fields]
-    for row in zip(*columns, strict=True):
-        record = PackageMessage(**dict(zip(PackageMessage.model_fields, row, strict=True)))
-        time = clock(record.time)
-        yield Encoded(f"/{name}/packages", PACKAGE_SCHEMA, time, time, record.model_dump_json().encode())
+    columns = {field: getattr(packages, field).tolist() for field in PACKAGE_FIELDS}
+    for values in zip(*columns.values(), strict=True):
+        message = package_message(dict(zip(columns, values, strict=True)))
+        time = clock(message.time)
+        yield Encoded(f"/{name}/packages", ArmPackage, time, time, message.SerializeToString())
 
 
-def _decode_packages(records: Mapping[str, PackagesMessage], messages: Messages, what: str, name: str) -> ArmPackages:
+def _decode_packages(records: Mapping[str, Any], messages: Messages, what: str, name: str) -> ArmPackages:
     there, told = messages.get(f"/{name}/packages", ()), records[name]
     if len(there) != told.count:
         raise EpisodeError(f"{what}: it names {told.count} packages of arm '{name}', but {len(there)} are there")
     try:
-        rows = [PackageMessage.model_validate_json(data) for data in there]
-    except ValueError as failure:
+        found = [format_1.package(data) if format_1.is_json(data) else parse(ArmPackage, data) for data in there]
+        rows = [package_row(package) for package in found]
+        return ArmPackages.of({field: [row[field] for row in rows] for field in PACKAGE_FIELDS}, told.lost)
+    except (DecodeError, ValueError) as failure:
         raise EpisodeError(f"{what}: a package of arm '{name}' cannot be decoded: {failure}") from failure
-    columns = {field: [getattr(row, field) for row in rows] for field in PackageMessage.model_fields}
-    return ArmPackages.of(columns, told.lost)
 
 
-def _pose_messages(poses: Mapping[str, Pose | None]) -> dict[str, PoseMessage | None]:
-    return {
-        name: None
-        if pose is None
-        else PoseMessage(position=tuple(pose.position.tolist()), quaternion=tuple(pose.quaternion.tolist()))
-        for name, pose in poses.items()
-    }
+def _poses(targets: Any) -> dict[str, Pose | None]:
+    return {target.arm: _pose(target.pose) if target.HasField("pose") else None for target in targets}
 
 
-def _poses(records: Mapping[str, PoseMessage | None]) -> dict[str, Pose | None]:
-    return {
-        name: None if record is None else Pose(np.array(record.position), np.array(record.quaternion))
-        for name, record in records.items()
-    }
+def _pose(pose: Any) -> Pose:
+    place, turn = pose.position, pose.orientation
+    return Pose(np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w]))
 
 
 def _timestamp(time: int) -> Timestamp:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import mimetypes
 import queue
 import threading
@@ -12,14 +11,14 @@ from pathlib import Path
 from typing import BinaryIO, Self
 
 from google.protobuf.message import Message
-from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.messages import encode_step
 from tacsim.record.reader import Place, RecordedSteps
-from tacsim.record.schemas import CLOSE, FORMAT, JSON_SCHEMAS, MAX_ATTACHMENT, META, encode_meta, sealed
+from tacsim.record.schemas import CLOSE, FORMAT, MAX_ATTACHMENT, META, encode_meta, sealed
 
 _ONE_CHUNK = 1 << 40  # [bytes] a chunk ends with its step, never by size
 
@@ -58,7 +57,7 @@ class Recorder:
         self._accepted = self._handled = self._dropped = self._written = 0
         self._error: Exception | None = None
         self._closed = False
-        self._schemas: dict[str | type[Message], int] = {}
+        self._schemas: dict[type[Message], int] = {}
         self._channels: dict[str, int] = {}
         self._offset = meta.wall_offset
         self._places: list[Place] = []
@@ -164,21 +163,14 @@ class Recorder:
         _flush(self._writer)
         self._places.append(place)
 
-    def _channel(self, topic: str, schema: str | type[Message]) -> int:
+    def _channel(self, topic: str, schema: type[Message]) -> int:
         if topic not in self._channels:
-            encoding = MessageEncoding.JSON if isinstance(schema, str) else MessageEncoding.Protobuf
-            self._channels[topic] = self._writer.register_channel(topic, encoding, self._schema(schema))
-            self._topics[self._channels[topic]] = topic
-        return self._channels[topic]
-
-    def _schema(self, schema: str | type[Message]) -> int:
-        if schema not in self._schemas:
-            if isinstance(schema, str):
-                text = json.dumps({"title": schema, **JSON_SCHEMAS[schema].model_json_schema()}).encode()
-                self._schemas[schema] = self._writer.register_schema(schema, SchemaEncoding.JSONSchema, text)
-            else:
+            if schema not in self._schemas:
                 self._schemas[schema] = register_schema(self._writer, schema)
-        return self._schemas[schema]
+            number = self._writer.register_channel(topic, MessageEncoding.Protobuf, self._schemas[schema])
+            self._channels[topic] = number
+            self._topics[number] = topic
+        return self._channels[topic]
 
     def _finish(self) -> None:
         account = {"steps": str(self._written), "dropped": str(self._dropped)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import sys
 import time
 import weakref
@@ -35,6 +34,7 @@ from tacsim.interface import (
 from tacsim.models.rig import SqueezeConfig
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_image
+from tacsim.record.protobuf import Step as StepMessage
 from tacsim.record.reader import read_episode
 from tacsim.record.writer import Recorder as FileRecorder
 from tacsim.rig import Rig
@@ -246,7 +246,7 @@ def test_a_recording_tells_the_date_and_keeps_exact_times(tmp_path: Path) -> Non
     assert before <= read.meta.wall_offset <= after  # the rig's clock stood at 0
     with (tmp_path / "e.mcap").open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages(topics=["/step", "/lower/image"]):
-            k = json.loads(message.data)["index"] if channel.topic == "/step" else None
+            k = StepMessage.FromString(message.data).index if channel.topic == "/step" else None
             if k is not None:
                 assert message.log_time == message.publish_time == read.meta.wall_offset + k * 10**8
             assert before <= message.log_time <= after + 3 * 10**8

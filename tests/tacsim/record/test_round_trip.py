@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -98,8 +97,8 @@ def test_stock_reader_finds_order_types_and_content(
         assert names["/upper/pose"] == "foxglove.PoseInFrame"
         assert names["/step"] == "tacsim.Step"
         topics = [channel.topic for _, channel, _ in reader.iter_messages()]
-        assert len(topics) == 3 * 11
-        assert topics[10::11] == ["/step"] * 3
+        assert len(topics) == 3 * 19
+        assert topics[18::19] == ["/step"] * 3
         decoded = list(reader.iter_decoded_messages(topics=["/lower/image", "/lower/surface", "/upper/pose"]))
         image, surface, pose = (entry.decoded_message for entry in decoded[-3:])
         assert image.format == "png"
@@ -114,15 +113,54 @@ def test_stock_reader_finds_order_types_and_content(
         assert [a.name for a in reader.iter_attachments()] == list(meta.attachments)
 
 
-def test_json_messages_carry_their_schema(tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]) -> None:
-    record(tmp_path / "e.mcap", meta, [make_step(1)])
+def test_viewers_find_every_number_in_a_field_of_its_own(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
+) -> None:
+    """As a viewer decodes them: by the schemas in the file, without tacsim."""
+    step = make_step(1, packages=True)
+    record(tmp_path / "e.mcap", meta, [step])
     with (tmp_path / "e.mcap").open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages(topics=["/step", "/lower/arm"]):
-            assert schema is not None
-            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
-            properties = json.loads(schema.data)["properties"]
-            content = json.loads(message.data, parse_constant=lambda text: pytest.fail(f"no JSON: {text}"))
-            assert set(properties) - set(content) <= {"packages"} and set(content) <= set(properties)
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = {entry.channel.topic: entry.decoded_message for entry in reader.iter_decoded_messages()}
+        assert {channel.message_encoding for _, channel, _ in reader.iter_messages()} == {"protobuf"}
+    arm = step.arms["upper"]
+    assert [getattr(found["/upper/arm"].force, axis) for axis in "xyz"] == arm.wrench[:3].tolist()
+    assert [getattr(found["/upper/arm"].torque, axis) for axis in "xyz"] == arm.wrench[3:].tolist()
+    assert [getattr(found["/upper/arm"].linear, axis) for axis in "xyz"] == arm.twist[:3].tolist()
+    assert [getattr(found["/upper/arm"].angular, axis) for axis in "xyz"] == arm.twist[3:].tolist()
+    assert arm.joints is not None
+    assert [getattr(found["/upper/arm"].joints, f"joint_{k}") for k in range(1, 7)] == arm.joints.tolist()
+    assert not found["/lower/arm"].HasField("joints")
+    step_message = found["/step"]
+    assert (step_message.index, step_message.reward, step_message.distance) == (1, step.reward, step.distance)
+    assert {name: found[f"/step/{name}"].value for name in ("residual", "most", "hits")} == {
+        name: step.info[name] for name in ("residual", "most", "hits")
+    }
+    package, sent = found["/upper/packages"], step.packages["upper"]
+    row = sent.time.tolist().index(package.time)
+    assert [getattr(package.tcp_rotation, axis) for axis in "xyz"] == sent.tcp_pose[row, 3:].tolist()
+    assert (package.joint_speeds.joint_6, package.status) == (sent.joint_speeds[row, 5], sent.status[row])
+    height, surface = found["/lower/height"], step.frames["lower"].surface
+    assert surface is not None and (height.encoding, height.frame_id) == ("32FC1", "lower")
+    pixels = np.frombuffer(height.data, "<f4").reshape(height.height, height.step // 4)
+    assert pixels.shape == surface.height.shape and height.width == surface.height.shape[1]
+    np.testing.assert_allclose(pixels, 1e3 * surface.height, rtol=1e-6)  # [mm]
+    frame = found["/upper/transform"]
+    assert (frame.parent_frame_id, frame.child_frame_id) == ("world", "upper")
+    assert [getattr(frame.translation, axis) for axis in "xyz"] == arm.pose.position.tolist()
+    assert [getattr(frame.rotation, axis) for axis in "xyzw"] == arm.pose.quaternion.tolist()
+
+
+def test_an_arm_with_too_many_joints_ends_the_recording(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
+) -> None:
+    step = make_step(1)
+    arms = {**step.arms, "upper": replace(step.arms["upper"], joints=np.zeros(8))}
+    with Recorder(tmp_path / "e.mcap", meta) as recorder:
+        recorder.write(replace(step, arms=arms))
+        recorder.flush()
+        assert "an arm of 8 joints; episodes have room for 7" in str(recorder.error)
+    assert len(read_episode(tmp_path / "e.mcap").steps) == 0
 
 
 def test_png_holds_rgb_not_bgr() -> None:

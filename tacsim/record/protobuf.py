@@ -1,0 +1,192 @@
+"""The protobuf messages of an episode that are tacsim's own.
+
+Each number that somebody may want to plot is a field of its own in nested messages: viewers (Foxglove, Rerun) plot
+those, but no maps, and lists only in part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+from google.protobuf.descriptor_pb2 import FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+
+MOST_JOINTS = 7  # that an arm's message has room for
+
+_NUMBERS = {
+    "double": Field.TYPE_DOUBLE,
+    "int64": Field.TYPE_INT64,
+    "bool": Field.TYPE_BOOL,
+    "string": Field.TYPE_STRING,
+}
+# Fields in their order, which gives them their numbers on the wire: new ones go to the end.
+_MESSAGES: dict[str, dict[str, str]] = {
+    "Joints": {f"joint_{number + 1}": "optional double" for number in range(MOST_JOINTS)},
+    "Arm": {
+        "time": "optional double",  # rig clock [s]; always there
+        "linear": "foxglove.Vector3",  # velocity of the sensor, world axes [m/s]
+        "angular": "foxglove.Vector3",  # [rad/s]
+        "force": "foxglove.Vector3",  # what the object does to the sensor, sensor axes [N]
+        "torque": "foxglove.Vector3",  # about the sensor's origin [N m]
+        "joints": "tacsim.Joints",  # [rad]; absent: not known
+    },
+    # One package of an arm's controller, as it came: base axes, not those of the sensor.
+    "ArmPackage": {
+        "time": "optional double",  # when it was read, rig clock [s]; always there
+        "stamp": "double",  # time on the controller's own clock [s]
+        "joints": "tacsim.Joints",  # [rad]
+        "joint_speeds": "tacsim.Joints",  # [rad/s]
+        "tcp_position": "foxglove.Vector3",  # [m]
+        "tcp_rotation": "foxglove.Vector3",  # rotation vector [rad]
+        "tcp_linear": "foxglove.Vector3",  # [m/s]
+        "tcp_angular": "foxglove.Vector3",  # [rad/s]
+        "tcp_force": "foxglove.Vector3",  # [N]
+        "tcp_torque": "foxglove.Vector3",  # [N m]
+        "runtime_state": "int64",  # of the controller's program: 1 stopped, 2 playing, 4 paused
+        "safety_bits": "int64",  # safety_status_bits of the controller
+        "status": "int64",  # what the driver made of it: robot.ArmStatus
+    },
+    "Scalar": {"value": "optional double"},  # always there
+    "Target": {"arm": "string", "pose": "foxglove.Pose"},  # world_from_sensor [m]; no pose: the arm holds
+    "Frame": {
+        "sensor": "string",
+        "time": "double",  # of exposure, rig clock [s]
+        "index": "int64",
+        "surface": "bool",  # this step has /{sensor}/surface
+        "flow": "bool",  # and /{sensor}/flow
+    },
+    "Packages": {
+        "arm": "string",
+        "count": "int64",  # messages /{arm}/packages that belong to this step
+        "lost": "int64",  # packages of the controller that are missing among and before them
+    },
+    "Step": {
+        "index": "optional int64",  # always there
+        "time": "double",  # rig clock [s]
+        "seconds": "double",  # wall time of the step [s]
+        "reward": "optional double",
+        "distance": "optional double",  # [m]
+        "acted": "bool",  # there was an action
+        "asked": "repeated tacsim.Target",  # the action
+        "sent": "repeated tacsim.Target",  # what was executed of it
+        "frames": "repeated tacsim.Frame",
+        "arms": "repeated string",
+        "info": "repeated string",  # each is a Scalar /step/{name}
+        "packages": "repeated tacsim.Packages",
+    },
+}
+
+
+def _classes() -> dict[str, Any]:
+    file = FileDescriptorProto(name="tacsim/episode.proto", package="tacsim", syntax="proto3")
+    pool = DescriptorPool()  # of our own: names cannot clash with those of another library
+    for known in (Vector3, Pose):
+        _add(pool, known.DESCRIPTOR.file)
+        file.dependency.append(known.DESCRIPTOR.file.name)
+    for name, fields in _MESSAGES.items():
+        message = file.message_type.add(name=name)
+        for number, (field, words) in enumerate(fields.items(), 1):
+            *label, kind = words.split()
+            made = message.field.add(name=field, number=number, label=Field.LABEL_OPTIONAL)
+            if kind in _NUMBERS:
+                made.type = _NUMBERS[kind]
+            else:
+                made.type, made.type_name = Field.TYPE_MESSAGE, f".{kind}"
+            if label == ["repeated"]:
+                made.label = Field.LABEL_REPEATED
+            elif label == ["optional"]:  # proto3 marks presence by a group of one
+                made.proto3_optional, made.oneof_index = True, len(message.oneof_decl)
+                message.oneof_decl.add(name=f"_{field}")
+    pool.AddSerializedFile(file.SerializeToString())
+    return {name: GetMessageClass(pool.FindMessageTypeByName(f"tacsim.{name}")) for name in _MESSAGES}
+
+
+def _add(pool: DescriptorPool, file: Any) -> None:
+    for needed in file.dependencies:
+        _add(pool, needed)
+    pool.AddSerializedFile(file.serialized_pb)
+
+
+_made = _classes()
+Arm, ArmPackage, Scalar, Step = (_made[name] for name in ("Arm", "ArmPackage", "Scalar", "Step"))
+
+# Two vectors of a message hold six numbers.
+TWIST, WRENCH = ("linear", "angular"), ("force", "torque")
+_PACKAGE_VECTORS = {
+    "tcp_pose": ("tcp_position", "tcp_rotation"),
+    "tcp_speed": ("tcp_linear", "tcp_angular"),
+    "tcp_force": ("tcp_force", "tcp_torque"),
+}
+_PACKAGE_JOINTS = ("joints", "joint_speeds")
+_PACKAGE_NUMBERS = ("time", "stamp", "runtime_state", "safety_bits", "status")
+PACKAGE_FIELDS = (*_PACKAGE_NUMBERS, *_PACKAGE_JOINTS, *_PACKAGE_VECTORS)
+
+
+def arm_message(time: float, twist: Sequence[float], wrench: Sequence[float], joints: Sequence[float] | None) -> Any:
+    """An Arm. Raises ValueError for more than MOST_JOINTS joints."""
+    made = Arm(time=time)
+    _put_six(made, TWIST, twist)
+    _put_six(made, WRENCH, wrench)
+    if joints is not None:
+        made.joints.SetInParent()
+        _put_joints(made.joints, joints)
+    return made
+
+
+def package_message(row: Mapping[str, Any]) -> Any:
+    """An ArmPackage of a package's fields. Raises ValueError for more than MOST_JOINTS joints."""
+    made = ArmPackage(**{name: row[name] for name in _PACKAGE_NUMBERS})
+    for name, pair in _PACKAGE_VECTORS.items():
+        _put_six(made, pair, row[name])
+    for name in _PACKAGE_JOINTS:
+        _put_joints(getattr(made, name), row[name])
+    return made
+
+
+def package_row(package: Any) -> dict[str, Any]:
+    """The fields of a package."""
+    row = {name: getattr(package, name) for name in _PACKAGE_NUMBERS}
+    row |= {name: six(package, pair) for name, pair in _PACKAGE_VECTORS.items()}
+    return row | {name: joints_of(getattr(package, name)) for name in _PACKAGE_JOINTS}
+
+
+def parse(kind: Any, data: bytes) -> Any:
+    """A message of class `kind`. Raises ValueError where its first field is not there: any few bytes would do else."""
+    made, first = kind.FromString(data), kind.DESCRIPTOR.fields[0].name
+    if not made.HasField(first):
+        raise ValueError(f"a message {kind.DESCRIPTOR.name} without its {first}")
+    return made
+
+
+def put_pose(message: Any, position: Sequence[float], quaternion: Sequence[float]) -> None:
+    """Position [m] and quaternion (x, y, z, w) into `message.pose`."""
+    pose = message.pose
+    pose.position.x, pose.position.y, pose.position.z = position
+    pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = quaternion
+
+
+def six(message: Any, pair: tuple[str, str]) -> list[float]:
+    """Six numbers of two vectors of a message."""
+    return [getattr(getattr(message, name), axis) for name in pair for axis in "xyz"]
+
+
+def joints_of(joints: Any) -> list[float]:
+    """The joints that are there, in order."""
+    return [value for _, value in joints.ListFields()]
+
+
+def _put_six(message: Any, pair: tuple[str, str], values: Sequence[float]) -> None:
+    for number, value in enumerate(values):
+        setattr(getattr(message, pair[number // 3]), "xyz"[number % 3], value)
+
+
+def _put_joints(joints: Any, values: Sequence[float]) -> None:
+    if len(values) > MOST_JOINTS:
+        raise ValueError(f"an arm of {len(values)} joints; episodes have room for {MOST_JOINTS}")
+    for number, value in enumerate(values):
+        setattr(joints, f"joint_{number + 1}", value)

@@ -26,7 +26,7 @@ from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
 from tacsim.tasks import make_task
-from tacsim.tasks.action import action_from
+from tacsim.tasks.action import action_from, vector_of
 from tacsim.tasks.effort import Effort
 from tacsim.tasks.task import Task, judge
 
@@ -158,6 +158,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._truth_at_start = self._truth()
         self._effort = Effort(observation.arms)
         self._count, self.phase = 0, "running"
+        self._observation, self._teacher = observation, self.task.scripted(through=True)
         self._flat: encode.Flat = self._view.begin(observation, self.task.goal)
 
     def _truth(self) -> Truth:
@@ -220,6 +221,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             self._done = flat, self._for_all_left(reward) if exceeded else reward, exceeded, not exceeded, info
             return
         self._targets |= {name: pose for name, pose in self._sent.items() if pose is not None}
+        self._observation = observation
         self._effort.add(observation.arms)
         self._flat = self._view(observation)
         most, peak = self.task.config.force_limit, self._effort.peak
@@ -252,6 +254,17 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         if self.phase == "over":
             info |= self.task.measures(truth, self._truth_at_start)
         return outcome.reward, info | dict(self.rig.diagnostics())
+
+    def expert(self) -> NDArray[np.float32]:
+        """The action here of a teacher for those that learn: by the truth, or where the task knows none by that, of its
+        scripted policy."""
+        if self.phase != "running":
+            return np.zeros(len(self.task.axes), np.float32)
+        vector = self.task.expert(self._truth(), self._truth_at_start)
+        if vector is None:
+            action = self._teacher(self._observation)
+            vector = vector_of(action, self.task.axes, self.task.config.max_step, self._targets)
+        return np.asarray(vector, np.float32)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones

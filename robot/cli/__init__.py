@@ -16,6 +16,9 @@ from robot.cli.compare import compare
 from robot.cli.debug import debug
 from robot.cli.doctor import doctor, schema
 from robot.cli.errors import Guarded
+from robot.cli.learn.evaluate import evaluate
+from robot.cli.learn.export import export, policy
+from robot.cli.learn.train import train
 from robot.cli.mock import mock
 from robot.cli.recover import recover
 from robot.cli.run import replay, run
@@ -33,9 +36,11 @@ app = typer.Typer(
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
 )
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(export, name="export")
 COMMANDS = {
-    app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor, start),
+    app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor, start, train, evaluate),
     calibrate: (latency, lens, touch, hand_eye),
+    export: (policy,),
 }
 for group, commands in COMMANDS.items():
     for command in commands:

@@ -44,11 +44,13 @@ def explain(error: Exception) -> tuple[str, int]:
     from calibration.errors import CalibrationError
     from robot.deploy.policy import PolicyNotFound
     from robot.open import CannotOpen
+    from robot.train.run_folder import RunError
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
     from tacsim.physics.failure.dump import DumpError
 
-    if isinstance(error, (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, CalibrationError, DumpError)):
+    unusable = (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, CalibrationError, DumpError, RunError)
+    if isinstance(error, unusable):
         return str(error), UNUSABLE
     if _refused(error):
         return str(error), UNUSABLE

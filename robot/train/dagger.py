@@ -1,152 +1,134 @@
 """Teacher to student: a policy that acts by the truth shows one that only feels what to do (DAgger, Ross et al. 2011).
 
-In each round the student acts, the first time the teacher; what the teacher would have done is learned in all states that were
-met. A round is a function of the seed, its number and the network, so a run that was killed goes on to the same end.
+In each round the student acts, the first time the teacher; what the teacher would have done is learned in all states
+that were met so far.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from robot.train.network import PolicyNetwork
+from robot.train.run_folder import RunError, Tell, save
+from tacsim.gym.vector import TacsimVectorEnv
+from tacsim.models.text import printable
+from tacsim.models.training import Training
 
 Arrays = dict[str, NDArray[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class DaggerSettings:
-    """How long, and how."""
+class Dagger:
+    """A student in `envs`. What was met is kept in `folder`, a file a round."""
 
-    rounds: int = 8
-    steps: int = 200  # of each environment in a round
-    epochs: int = 20  # of learning after each round
-    batch: int = 256
-    rate: float = 1e-3  # of Adam
-    seed: int = 0
+    def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
+        self._envs, self._settings, self._folder = envs, training.dagger, folder
+        self._seed, self.actor = training.seed, actor
+        self.rounds = training.dagger.rounds
+
+    def round(self, number: int, tell: Tell) -> dict[str, float]:
+        """Acts, keeps what was met, and learns."""
+        seen, wanted, figures = self._collect(number, tell)
+        save(
+            self._folder / f"round-{number:03d}.npz",
+            lambda file: np.savez(file, allow_pickle=False, action=wanted, **seen),
+        )
+        loss = self._learn(*_all_met(self._folder, number), number, tell)
+        return {"steps": float(len(wanted)), **figures, "loss": loss}
+
+    def state(self) -> dict[str, Any]:
+        return {"actor": self.actor.state_dict()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.actor.load_state_dict(state["actor"])
+
+    def _collect(self, number: int, tell: Tell) -> tuple[Arrays, NDArray[np.float32], dict[str, float]]:
+        """What was seen (n, ...), what the teacher would have done (n, k), and how the episodes went. In the first
+        round the teacher acts, with noise that leads it off its way."""
+        envs = self._envs
+        random = np.random.default_rng([self._seed, number])
+        seen, _ = envs.reset(seed=int(random.integers(2**31)))
+        steps = envs.members[0].task.config.steps
+        states: list[Arrays] = []
+        labels: list[NDArray[np.float32]] = []
+        ends: list[NDArray[np.float64]] = []
+        for step in range(steps):
+            tell(f"round {number + 1} of {self.rounds}: acting", step, steps)
+            teacher = self._settings.pace * np.stack([member.expert() for member in envs.members])
+            states.append({key: value.copy() for key, value in seen.items()})
+            labels.append(teacher)
+            if number == 0:
+                action = teacher + random.normal(0.0, self._settings.noise, teacher.shape).astype(np.float32)
+            else:
+                action = act(self.actor, seen)
+            seen, _, _, _, info = envs.step(action.clip(-1.0, 1.0))
+            ends.append(ended(info))
+        data = {key: np.concatenate([state[key] for state in states]) for key in states[0]}
+        return data, np.concatenate(labels), means(ends)
+
+    def _learn(self, data: Arrays, actions: NDArray[np.float32], number: int, tell: Tell) -> float:
+        """The mean loss of the last epoch."""
+        settings = self._settings
+        tensors = {key: torch.from_numpy(value) for key, value in data.items()}
+        wanted = torch.from_numpy(actions)
+        if number == 0:
+            self.actor.layers.normalise_by(tensors)
+        random = torch.Generator().manual_seed(self._seed * 1000 + number)
+        optimiser = torch.optim.Adam(self.actor.parameters(), lr=settings.rate)
+        decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
+        total = 0.0
+        for epoch in range(settings.epochs):
+            tell(f"round {number + 1} of {self.rounds}: learning", epoch, settings.epochs)
+            total = 0.0
+            for part in torch.randperm(len(wanted), generator=random).split(settings.batch):
+                answer = self.actor(*(tensors[key][part] for key in self.actor.keys))
+                loss = torch.nn.functional.mse_loss(answer, wanted[part])
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+                total += loss.item() * len(part)
+            decay.step()
+        return total / len(wanted)
 
 
-def train(
-    envs: VectorEnv[Any, Any, Any],
-    settings: DaggerSettings,
-    folder: Path,
-    tell: Callable[[str, int, int], None] = lambda words, done, of: None,
-) -> PolicyNetwork:
-    """Trains a student in `envs` (of TacsimEnv, SAME_STEP), and keeps it in `folder` after each round; goes on where a run
-    in that folder ended.
-
-    tell: is told what is done, and how much of how much.
-    Raises ValueError for a folder of other settings.
-    """
-    space = envs.single_observation_space
-    shapes = {key: space[key].shape for key in space}  # type: ignore[index, attr-defined]
-    torch.manual_seed(settings.seed)
-    network = PolicyNetwork(shapes, int(envs.single_action_space.shape[0]))  # type: ignore[index]
-    first = _resume(network, settings, folder)
-    for number in range(first, settings.rounds):
-        seen, wanted = _collect(envs, None if number == 0 else network, settings, number, tell)
-        _save(folder / f"round-{number:03d}.npz", lambda file: np.savez(file, action=wanted, **seen))
-        data, actions = _rounds(folder, number)
-        _learn(network, data, actions, settings, number, tell)
-        checkpoint = {"round": number + 1, "network": network.state_dict()}
-        _save(folder / "checkpoint.pt", lambda file: torch.save(checkpoint, file))
-    return network
-
-
-def act(network: PolicyNetwork, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+def act(actor: torch.nn.Module, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
     """Actions (n, k) for a batch of features."""
     with torch.no_grad():
-        found: NDArray[np.float32] = network(*(torch.from_numpy(np.asarray(seen[key])) for key in network.keys)).numpy()
+        found: NDArray[np.float32] = actor(*(torch.from_numpy(np.asarray(seen[key])) for key in actor.keys)).numpy()
     return found
 
 
-def _collect(
-    envs: VectorEnv[Any, Any, Any],
-    student: PolicyNetwork | None,
-    settings: DaggerSettings,
-    number: int,
-    tell: Callable[[str, int, int], None],
-) -> tuple[Arrays, NDArray[np.float32]]:
-    """What was seen (n, ...), and what the teacher would have done (n, k). Without a student the teacher acts, with noise
-    that leads it off its way."""
-    random = np.random.default_rng([settings.seed, number])
-    seen, _ = envs.reset(seed=int(random.integers(2**31)))
-    states: list[Arrays] = []
-    labels: list[NDArray[np.float32]] = []
-    for step in range(settings.steps):
-        tell(f"round {number + 1} of {settings.rounds}: acting", step, settings.steps)
-        teacher = np.stack(envs.call("expert")).astype(np.float32)  # type: ignore[attr-defined]
-        states.append({key: value.copy() for key, value in seen.items()})
-        labels.append(teacher)
-        if student is None:
-            action = teacher + random.normal(0.0, 0.3, teacher.shape).astype(np.float32)
-        else:
-            action = act(student, seen)
-        seen, *_ = envs.step(action.clip(-1.0, 1.0))
-    return {key: np.concatenate([state[key] for state in states]) for key in states[0]}, np.concatenate(labels)
+def ended(info: Mapping[str, Any]) -> NDArray[np.float64]:
+    """(n, 3) of the episodes that ended in a step of a vector environment in SAME_STEP: distance [m], success, peak
+    force [N]."""
+    if "final_info" not in info:
+        return np.empty((0, 3))
+    last = info["final_info"]
+    figures = [last[key][info["_final_info"]] for key in ("distance", "is_success", "peak_force")]
+    return np.stack(figures, axis=1).astype(np.float64)
 
 
-def _learn(
-    network: PolicyNetwork,
-    data: Arrays,
-    actions: NDArray[np.float32],
-    settings: DaggerSettings,
-    number: int,
-    tell: Callable[[str, int, int], None],
-) -> None:
-    tensors = {key: torch.from_numpy(value) for key, value in data.items()}
-    wanted = torch.from_numpy(actions)
-    if number == 0:
-        network.normalise_by(tensors)
-    random = torch.Generator().manual_seed(settings.seed * 1000 + number)
-    optimiser = torch.optim.Adam(network.parameters(), lr=settings.rate)
-    for epoch in range(settings.epochs):
-        tell(f"round {number + 1} of {settings.rounds}: learning", epoch, settings.epochs)
-        for part in torch.randperm(len(wanted), generator=random).split(settings.batch):
-            loss = torch.mean((network(*(tensors[key][part] for key in network.keys)) - wanted[part]) ** 2)
-            optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimiser.step()
+def means(ends: Sequence[NDArray[np.float64]]) -> dict[str, float]:
+    """Of all episodes that `ended`."""
+    distance, success, force = np.concatenate(ends).mean(axis=0)
+    return {"distance": float(distance), "success": float(success), "peak_force": float(force)}
 
 
-def _rounds(folder: Path, last: int) -> tuple[Arrays, NDArray[np.float32]]:
-    """All that was met until round `last`."""
+def _all_met(folder: Path, last: int) -> tuple[Arrays, NDArray[np.float32]]:
+    """What was met until round `last`."""
     parts = []
     for number in range(last + 1):
-        with np.load(folder / f"round-{number:03d}.npz", allow_pickle=False) as file:
-            parts.append({key: file[key] for key in file.files})
+        path = folder / f"round-{number:03d}.npz"
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                parts.append({key: file[key] for key in file.files})
+        except (ValueError, EOFError, BadZipFile) as failure:
+            raise RunError(f"{path} cannot be read: {printable(str(failure))}; train anew") from None
     whole = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return whole, whole.pop("action")
-
-
-def _resume(network: PolicyNetwork, settings: DaggerSettings, folder: Path) -> int:
-    """The number of the next round."""
-    told = folder / "dagger.json"
-    mine = json.dumps(asdict(settings), indent=2)
-    if not told.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        _save(told, lambda file: file.write(mine.encode()))
-    elif {**json.loads(told.read_text()), "rounds": 0} != {**json.loads(mine), "rounds": 0}:
-        raise ValueError(f"{folder} holds a run with other settings ({told.name}): name another folder")
-    checkpoint = folder / "checkpoint.pt"
-    if not checkpoint.exists():
-        return 0
-    found = torch.load(checkpoint, weights_only=True)  # tensors and numbers, no code
-    network.load_state_dict(found["network"])
-    return int(found["round"])
-
-
-def _save(path: Path, write: Callable[[Any], Any]) -> None:
-    """There is a whole file or none, whenever the process ends."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        write(file)
-    part.replace(path)

@@ -3,38 +3,48 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
 import torch
-from numpy.typing import NDArray
 
-from robot.train.network import PolicyNetwork
+from robot.train.network import PolicyNetwork, Shapes
+from robot.train.run_folder import save
 from tacsim.models.policy import METADATA_KEY, PolicySpec
 
 OPSET = 17
 MOST_BYTES = 2 * 2**20
 PARITY = 1e-5  # between torch and ONNX
+EXAMPLES = 64
 
 
 class ExportError(RuntimeError):
     """The file would not do what the network does."""
 
 
-def export(network: PolicyNetwork, spec: PolicySpec, examples: Mapping[str, NDArray[Any]], path: Path) -> float:
-    """Writes the file, and returns the greatest difference of its actions from the network's, over the examples (batch,
-    ...). Raises ExportError when that is more than PARITY, or the file has more than MOST_BYTES."""
+def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path) -> float:
+    """Writes the file, and returns the greatest difference of its actions from the network's, for random features.
+    Raises ExportError when that is more than PARITY, or the file has more than MOST_BYTES."""
     network.eval()
-    inputs = tuple(torch.from_numpy(np.asarray(examples[key][:1], np.float32)) for key in network.keys)
+    random = torch.Generator().manual_seed(0)
+    examples = [torch.randn((EXAMPLES, *shapes[key]), generator=random) for key in network.keys]
     buffer = io.BytesIO()
-    torch.onnx.export(
-        network, inputs, buffer, input_names=list(network.keys), output_names=["action"], opset_version=OPSET,
-        dynamo=False,
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # of torch's older exporter, whose graphs need no extra package
+        torch.onnx.export(
+            network,
+            tuple(example[:1] for example in examples),
+            buffer,
+            input_names=list(network.keys),
+            output_names=["action"],
+            opset_version=OPSET,
+            dynamo=False,
+        )
     model = onnx.load_model_from_string(buffer.getvalue())
     onnx.helper.set_model_props(model, {METADATA_KEY: spec.model_dump_json()})
     data = model.SerializeToString()
@@ -43,18 +53,17 @@ def export(network: PolicyNetwork, spec: PolicySpec, examples: Mapping[str, NDAr
     worst = _difference(network, data, examples)
     if not worst <= PARITY:
         raise ExportError(f"the file's actions differ by {worst:.2g} from the network's, allowed: {PARITY:g}")
-    part = path.with_suffix(".part")
-    part.write_bytes(data)
-    part.replace(path)  # there is a whole file or none
+    save(path, lambda file: file.write(data))
     return worst
 
 
-def _difference(network: PolicyNetwork, data: bytes, examples: Mapping[str, NDArray[Any]]) -> float:
+def _difference(network: PolicyNetwork, data: bytes, examples: list[torch.Tensor]) -> float:
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     worst = 0.0
-    for index in range(len(examples[network.keys[0]])):
-        one = {key: np.asarray(examples[key][index : index + 1], np.float32) for key in network.keys}
+    for index in range(EXAMPLES):
+        one = [example[index : index + 1] for example in examples]
         with torch.no_grad():
-            wanted = network(*(torch.from_numpy(one[key]) for key in network.keys)).numpy()
-        worst = max(worst, float(np.abs(session.run(["action"], one)[0] - wanted).max()))
+            wanted = network(*one).numpy()
+        (found,) = session.run(["action"], {key: value.numpy() for key, value in zip(network.keys, one, strict=True)})
+        worst = max(worst, float(np.abs(found - wanted).max()))
     return worst

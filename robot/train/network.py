@@ -9,10 +9,13 @@ from torch import Tensor, nn
 
 CLIP = 5.0  # deviations from the mean
 PICTURES = ("maps", "flow")  # channels first; the other features are plain numbers
+OF_PICTURES = 64  # numbers that a picture is brought to
+
+Shapes = Mapping[str, tuple[int, ...]]
 
 
-class PolicyNetwork(nn.Module):
-    """Features (each with a leading batch axis) -> actions (batch, n) within [-1, 1].
+class FeatureLayers(nn.Module):
+    """Features (each with a leading batch axis, in the order of `keys`) -> (batch, `size`).
 
     Normalisation is inside: each channel of maps and each number less its mean, over its deviation, cut at CLIP.
 
@@ -20,26 +23,18 @@ class PolicyNetwork(nn.Module):
         shapes: of the features without the batch axis, by name.
     """
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]], actions: int, width: int = 128) -> None:
+    def __init__(self, shapes: Shapes) -> None:
         super().__init__()
         self.keys = tuple(sorted(shapes))
-        self.pictures = nn.ModuleDict()
-        features = 0
+        self.pictures = nn.ModuleDict({key: _picture_layers(shapes[key]) for key in self.keys if key in PICTURES})
+        self.size = 0
         for key in self.keys:
             channels = shapes[key][0]
             self.register_buffer(f"mean_{key}", torch.zeros(channels))
             self.register_buffer(f"deviation_{key}", torch.ones(channels))
-            if key in PICTURES:
-                self.pictures[key] = _picture_layers(shapes[key])
-                features += 64
-            else:
-                features += channels
-        self.head = nn.Sequential(
-            nn.Linear(features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, actions)
-        )
+            self.size += OF_PICTURES if key in PICTURES else channels
 
     def forward(self, *features: Tensor) -> Tensor:
-        """`features` in the order of `keys`."""
         parts = []
         for key, value in zip(self.keys, features, strict=True):
             mean, deviation = getattr(self, f"mean_{key}"), getattr(self, f"deviation_{key}")
@@ -47,8 +42,7 @@ class PolicyNetwork(nn.Module):
                 mean, deviation = mean[:, None, None], deviation[:, None, None]
             normal = torch.clamp((value - mean) / deviation, -CLIP, CLIP)
             parts.append(self.pictures[key](normal) if key in PICTURES else normal)
-        action: Tensor = torch.tanh(self.head(torch.cat(parts, dim=1)))
-        return action
+        return torch.cat(parts, dim=1)
 
     def normalise_by(self, seen: Mapping[str, Tensor]) -> None:
         """Takes mean and deviation from examples (batch, ...); what hardly varies is left at its own size."""
@@ -61,8 +55,29 @@ class PolicyNetwork(nn.Module):
             )
 
 
+class PolicyNetwork(nn.Module):
+    """Features, in the order of `keys` -> actions (batch, n) within [-1, 1].
+
+    Args:
+        cut: what is beyond is cut, as PPO does; otherwise a hyperbolic tangent brings everything within.
+    """
+
+    def __init__(self, shapes: Shapes, actions: int, width: int, *, cut: bool = False) -> None:
+        super().__init__()
+        self._cut = cut
+        self.layers = FeatureLayers(shapes)
+        self.keys = self.layers.keys
+        self.head = nn.Sequential(
+            nn.Linear(self.layers.size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, actions)
+        )
+
+    def forward(self, *features: Tensor) -> Tensor:
+        raw: Tensor = self.head(self.layers(*features))
+        return torch.clamp(raw, -1.0, 1.0) if self._cut else torch.tanh(raw)
+
+
 def _picture_layers(shape: tuple[int, ...]) -> nn.Sequential:
-    """(batch, *shape) -> (batch, 64)."""
+    """(batch, *shape) -> (batch, OF_PICTURES)."""
     channels, rows, columns = shape
     layers = nn.Sequential(
         nn.Conv2d(channels, 16, 3, stride=2, padding=1), nn.ReLU(),
@@ -71,4 +86,4 @@ def _picture_layers(shape: tuple[int, ...]) -> nn.Sequential:
     )  # fmt: skip
     with torch.no_grad():
         size = layers(torch.zeros(1, channels, rows, columns)).shape[1]
-    return nn.Sequential(layers, nn.Linear(size, 64), nn.ReLU())
+    return nn.Sequential(layers, nn.Linear(size, OF_PICTURES), nn.ReLU())

@@ -18,6 +18,7 @@ from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import KneadConfig, RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
 from tacsim.models.scene import BodyMaterial, GelMaterial, Scene
 from tacsim.models.sensor import SensorModel
+from tacsim.models.training import Training
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}")
 
@@ -40,6 +41,7 @@ KINDS = {
         Kind("scene", "scenes", (Scene,), Scene),
         Kind("sensor", "sensors", (SensorModel,), SensorModel),
         Kind("randomisation", "randomisations", (Randomisation,), Randomisation),
+        Kind("training", "trainings", (Training,), Training),
         Kind("material", "materials", (GelMaterial, BodyMaterial), GelMaterial | BodyMaterial),
     )
 }

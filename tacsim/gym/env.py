@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.plugin import register_envs
-from tacsim.interface import Needs, Pose, Truth
+from tacsim.interface import Needs, Policy, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
@@ -257,14 +257,17 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
 
     def expert(self) -> NDArray[np.float32]:
         """The action here of a teacher for those that learn: by the truth, or where the task knows none by that, of its
-        scripted policy."""
+        scripted policy. Zeros where no episode is running."""
         if self.phase != "running":
             return np.zeros(len(self.task.axes), np.float32)
-        vector = self.task.expert(self._truth(), self._truth_at_start)
-        if vector is None:
-            action = self._teacher(self._observation)
-            vector = vector_of(action, self.task.axes, self.task.config.max_step, self._targets)
-        return np.asarray(vector, np.float32)
+        best = self.task.expert(self._truth(), self._truth_at_start)
+        return self.ask(self._teacher) if best is None else np.asarray(best, np.float32)
+
+    def ask(self, policy: Policy) -> NDArray[np.float32]:
+        """What `policy` does here, as an action of this environment. A policy with a memory must be asked in every step
+        of the episode, and reset before."""
+        action = policy(self._observation)
+        return vector_of(action, self.task.axes, self.task.config.max_step, self._targets)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The native pictures of all sensors side by side, (H, W, 3) uint8 RGB, in the order of the rig; smaller ones

@@ -79,6 +79,11 @@ class TacsimVectorEnv(SyncVectorEnv):
         super().__init__([partial(getattr, member, "env") for member in members], autoreset_mode=autoreset_mode)
         self.metadata["reset_mask"] = True  # reset(options={"reset_mask": ...}) is understood
 
+    @property
+    def members(self) -> tuple[TacsimEnv, ...]:
+        """The environments, as what they are."""
+        return tuple(member.env for member in self._members)
+
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:

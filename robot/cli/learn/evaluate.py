@@ -1,0 +1,86 @@
+"""`tacsim evaluate`: how good policies are, in the same unseen episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from robot.cli.options import Overrides
+from robot.cli.output import notes, one_bar, show_table, writing
+
+if TYPE_CHECKING:
+    from robot.train.evaluate import Interval, Judged
+
+
+def evaluate(
+    task: Annotated[str, typer.Argument(help="squeeze, reposition, knead, or the path of a training file.")],
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="teacher (by the truth), random, scripted, learned (the shipped one), FILE.onnx; may be repeated.",
+            show_default="teacher, scripted, random",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same episodes.")] = 0,
+    json_: Annotated[
+        Path | None, typer.Option("--json", help="Write how each episode ended.", show_default=False)
+    ] = None,
+    set_: Overrides = None,
+) -> None:
+    """Compare policies in the same episodes, whose bodies and goals no training has met.
+
+    Success with Wilson's interval, distance and improvement (share of the distance at the start) with a bootstrap's,
+    all of 95 %; the peak of the normal force as mean and as what one episode in twenty exceeds.
+
+    Example: tacsim evaluate squeeze --policy learned --policy scripted --episodes 50
+    """
+    if json_ is not None and json_.exists():
+        raise typer.BadParameter(f"{json_} exists already; name a new file", param_hint="--json")
+    from robot.train.evaluate import evaluate as judge_all
+    from tacsim.config import load
+    from tacsim.models.training import Training
+
+    training = load(Training, task, set_ or [])
+    if not notes.is_terminal:
+        notes.print(f"{episodes} episodes of each policy")
+    with one_bar("starting") as bar:
+
+        def tell(words: str, done: int, of: int) -> None:
+            bar.say(words)
+            bar.count(done, of)
+
+        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, tell)
+    _show(judged)
+    if json_ is not None:
+        import json
+
+        with writing(json_.parent):
+            json_.write_text(
+                json.dumps({each.policy: [end._asdict() for end in each.episodes] for each in judged}, indent=1) + "\n",
+                encoding="utf-8",
+            )
+
+
+def _show(judged: list[Judged]) -> None:
+    rows = []
+    for each in judged:
+        mean, most = each.peak_force
+        rows.append(
+            (
+                each.policy,
+                _text(each.success, 100, 0),
+                _text(each.distance, 1e3, 3),
+                _text(each.improvement, 100, 0),
+                f"{mean:.1f}, {most:.1f}",
+            )
+        )
+    columns = ("policy", "success [%]", "distance [mm]", "improvement [%]", "peak force [N]")
+    show_table(f"{len(judged[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
+
+
+def _text(interval: Interval, scale: float, digits: int) -> str:
+    value, low, high = (f"{scale * number:.{digits}f}" for number in (interval.value, interval.low, interval.high))
+    return f"{value} ({low} to {high})"

@@ -1,0 +1,164 @@
+"""How good policies are: the same unseen episodes for each, and intervals for what that tells of all others.
+
+Needs no torch. A policy file is judged as it would run on a rig: by its own encoder, from observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.deploy.policy import load_policy, require_fit
+from robot.open import make_vector_env
+from tacsim.config import load_rig
+from tacsim.gym.env import TacsimEnv
+from tacsim.gym.vector import TacsimVectorEnv
+from tacsim.interface import Policy
+from tacsim.models.features import Features
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.models.training import Training
+
+TEACHER, RANDOM = "teacher", "random"  # beside what load_policy knows
+UNSEEN = 1_000_000  # added to the seeds of training: other bodies, other episodes
+RESAMPLED = 10_000
+Tell = Callable[[str, int, int], None]
+Act = Callable[[TacsimEnv], NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """An estimate, and where the truth lies in 95 of 100 cases."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Ended(NamedTuple):
+    """One episode."""
+
+    distance: float  # of the body from the goal [m]
+    success: bool
+    peak_force: float  # the greatest normal force [N]
+    improvement: float  # share of the distance at the start
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """How the episodes of one policy ended."""
+
+    policy: str
+    episodes: tuple[Ended, ...]
+
+    @property
+    def success(self) -> Interval:
+        """Share, by Wilson's interval."""
+        from scipy import stats
+
+        count, total = sum(each.success for each in self.episodes), len(self.episodes)
+        low, high = stats.binomtest(count, total).proportion_ci(method="wilson")
+        return Interval(count / total, float(low), float(high))
+
+    @property
+    def distance(self) -> Interval:
+        """Mean [m], by bootstrap."""
+        return _bootstrap(np.array([each.distance for each in self.episodes]))
+
+    @property
+    def improvement(self) -> Interval:
+        """Mean, by bootstrap."""
+        return _bootstrap(np.array([each.improvement for each in self.episodes]))
+
+    @property
+    def peak_force(self) -> tuple[float, float]:
+        """Mean, and what one episode in twenty exceeds [N]."""
+        forces = [each.peak_force for each in self.episodes]
+        return float(np.mean(forces)), float(np.quantile(forces, 0.95))
+
+
+def evaluate(
+    training: Training,
+    policies: Sequence[str],
+    episodes: int = 200,
+    seed: int = 0,
+    tell: Tell = lambda words, done, of: None,
+) -> list[Judged]:
+    """Each policy in the same episodes, of bodies and goals drawn as in training but with other seeds.
+
+    policies: "teacher" (acts by the truth), "random", and what `load_policy` knows: "scripted", "FILE.onnx" ...
+    Raises PolicyNotFound, IncompatibleRig, and as `make_vector_env`.
+    """
+    config = load_rig(training.rig, task=training.task, overrides=training.overrides).config
+    drawn = training.randomise
+    if drawn is not None:
+        drawn = drawn.model_copy(update={"draws": episodes, "seed": UNSEEN + seed})
+    number = min(training.environments, episodes)
+    sight = Features(maps=(), touch=("moved",), arms=tuple(config.arms)[:1], goal=False)  # nobody looks at it
+    envs = make_vector_env(number, training.task, training.rig, training.overrides, randomise=drawn, features=sight)
+    try:
+        for name in policies:
+            _fitting(name, envs.members[0], config.canonical)
+        return [_judge(envs, name, episodes, seed, config.canonical, tell) for name in policies]
+    finally:
+        envs.close()
+
+
+def _judge(envs: TacsimVectorEnv, name: str, episodes: int, seed: int, canonical: CanonicalGrid, tell: Tell) -> Judged:
+    rows: list[Ended] = []
+    members = envs.members
+    count = len(members)
+    for first in range(0, episodes, count):
+        seeds = [UNSEEN + seed + first + i for i in range(count)]
+        _, info = envs.reset(seed=list(seeds))
+        start = info["distance"]
+        actors = [_actor(name, env, canonical, each) for env, each in zip(members, seeds, strict=True)]
+        ends: dict[int, Ended] = {}
+        while len(ends) < count:
+            tell(name, len(rows) + len(ends), episodes)
+            idle = np.zeros(len(members[0].task.axes), np.float32)
+            actions = [
+                idle if i in ends else act(env) for i, (act, env) in enumerate(zip(actors, members, strict=True))
+            ]
+            _, _, terminated, truncated, info = envs.step(np.stack(actions))
+            for i in np.flatnonzero(terminated | truncated).tolist():
+                if i not in ends:
+                    ends[i] = Ended(
+                        float(info["distance"][i]),
+                        bool(info["is_success"][i]),
+                        float(info["peak_force"][i]),
+                        max(0.0, 1.0 - float(info["distance"][i]) / float(start[i])),
+                    )
+        rows += [ends[i] for i in range(count)]
+    return Judged(name, tuple(rows[:episodes]))
+
+
+def _actor(name: str, env: TacsimEnv, canonical: CanonicalGrid, seed: int) -> Act:
+    """The policy at the start of an episode."""
+    if name == TEACHER:
+        return lambda env: env.expert()
+    if name == RANDOM:
+        random = np.random.default_rng([UNSEEN, seed])
+        return lambda env: random.uniform(-1.0, 1.0, len(env.task.axes)).astype(np.float32)
+    policy = _fitting(name, env, canonical)
+    assert policy is not None
+    policy.reset()
+    return lambda env: env.ask(policy)
+
+
+def _fitting(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | None:
+    if name in (TEACHER, RANDOM):
+        return None
+    policy = load_policy(name, env.task, env.rig.spec, canonical)
+    require_fit(env.rig.name, env.rig.spec, policy, name, env.task)
+    return policy
+
+
+def _bootstrap(values: NDArray[np.float64]) -> Interval:
+    """The mean of (n,) values."""
+    chosen = np.random.default_rng(0).integers(len(values), size=(RESAMPLED, len(values)))
+    low, high = np.quantile(values[chosen].mean(axis=1), [0.025, 0.975])
+    return Interval(float(values.mean()), float(low), float(high))

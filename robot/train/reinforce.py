@@ -1,0 +1,142 @@
+"""PPO and SAC of stable-baselines3, in rounds that each begin with new episodes; so a run that was killed can go on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+
+from robot.train.network import PolicyNetwork
+from robot.train.run_folder import Tell, save
+from robot.train.sb3 import FeaturesExtractor, SharedVecEnv
+from tacsim.gym.vector import TacsimVectorEnv
+from tacsim.models.training import Training
+
+WARM_UP = 1000  # control steps of random actions before SAC learns
+KEPT = 50_000  # control steps that SAC remembers
+
+
+class Reinforce:
+    """PPO or SAC in `envs`; `actor` is what of it becomes a policy file. What SAC remembers is kept in `folder`."""
+
+    def __init__(self, envs: TacsimVectorEnv, training: Training, actor: PolicyNetwork, folder: Path) -> None:
+        settings = training.reinforce
+        self.rounds, self.actor = settings.rounds, actor
+        self._seed, self._folder = training.seed, folder
+        self._envs = SharedVecEnv(envs)
+        self._steps = settings.episodes * envs.members[0].task.config.steps  # of each environment in a round
+        shape: dict[str, Any] = {
+            "net_arch": [training.width, training.width],
+            "activation_fn": torch.nn.ReLU,
+            "features_extractor_class": FeaturesExtractor,
+        }
+        common: dict[str, Any] = {
+            "learning_rate": settings.rate,
+            "batch_size": _batch(self._steps * envs.num_envs, settings.batch),
+            "policy_kwargs": shape,
+            "device": "cpu",
+            "seed": training.seed,
+        }
+        if training.algorithm == "ppo":
+            self._model: Any = PPO("MultiInputPolicy", self._envs, n_steps=self._steps, **common)
+        else:
+            self._model = SAC(
+                "MultiInputPolicy", self._envs, learning_starts=WARM_UP, buffer_size=KEPT, train_freq=1,
+                gradient_steps=envs.num_envs // 2 or 1, **common,
+            )  # fmt: skip
+
+    def round(self, number: int, tell: Tell) -> dict[str, float]:
+        """Episodes from their start, and what is learned of them."""
+        random = np.random.default_rng([self._seed, number])
+        model, total = self._model, self._steps * self._envs.num_envs
+        model.set_random_seed(int(random.integers(2**31)))  # NumPy, torch, and the environments' next reset
+        model._last_obs = None  # episodes begin anew
+        watch = _Watch(lambda done: tell(f"round {number + 1} of {self.rounds}", done, total))
+        model.learn(total, callback=watch, reset_num_timesteps=False)
+        self._take_actor()
+        if isinstance(model, SAC):
+            save(self._folder / f"memory-{number % 2}.npz", self._write_memory)
+        rewards, distances, successes, forces = np.array(watch.ends).T
+        return {
+            "steps": float(total), "distance": float(distances.mean()), "success": float(successes.mean()),
+            "peak_force": float(forces.mean()), "return": float(rewards.mean()),
+        }  # fmt: skip
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "actor": self.actor.state_dict(),
+            "model": self._model.get_parameters(),
+            "timesteps": self._model.num_timesteps,
+            "updates": self._model._n_updates,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """After round n - 1, whose memory lies in the file of that round."""
+        model, total = self._model, self._steps * self._envs.num_envs
+        model.set_parameters(state["model"], device="cpu")
+        model.num_timesteps, model._n_updates = int(state["timesteps"]), int(state["updates"])
+        self.actor.load_state_dict(state["actor"])
+        if isinstance(model, SAC):
+            self._read_memory(self._folder / f"memory-{(model.num_timesteps // total - 1) % 2}.npz")
+
+    def _take_actor(self) -> None:
+        policy = self._model.policy
+        extractor: Any = policy.features_extractor if isinstance(self._model, PPO) else policy.actor.features_extractor
+        self.actor.layers.load_state_dict(extractor.layers.state_dict())
+        hidden, last = (
+            (policy.mlp_extractor.policy_net, policy.action_net)
+            if isinstance(self._model, PPO)
+            else (policy.actor.latent_pi, policy.actor.mu)
+        )
+        self.actor.head.load_state_dict(torch.nn.Sequential(*hidden, last).state_dict())
+
+    def _write_memory(self, file: Any) -> None:
+        memory = self._model.replay_buffer
+        count = len(memory.actions) if memory.full else memory.pos
+        arrays: dict[str, NDArray[Any]] = {key: getattr(memory, key)[:count] for key in _OF_MEMORY}
+        for what in ("observations", "next_observations"):
+            arrays |= {f"{what}/{key}": value[:count] for key, value in getattr(memory, what).items()}
+        np.savez(file, allow_pickle=False, at=np.array([memory.pos, memory.full]), **arrays)
+
+    def _read_memory(self, path: Path) -> None:
+        memory = self._model.replay_buffer
+        with np.load(path, allow_pickle=False) as file:
+            memory.pos, memory.full = int(file["at"][0]), bool(file["at"][1])
+            for key in file.files:
+                what, _, name = key.partition("/")
+                if key != "at":
+                    (getattr(memory, what)[name] if name else getattr(memory, what))[: len(file[key])] = file[key]
+
+
+def _batch(total: int, most: int) -> int:
+    """The greatest size of equal batches, at least 2: PPO divides by the deviation within each."""
+    return next((size for size in range(min(total, most), 1, -1) if total % size == 0), total)
+
+
+_OF_MEMORY = ("actions", "rewards", "dones", "timeouts")
+
+
+class _Watch(BaseCallback):
+    """Notes how episodes end: sum of rewards, distance [m], success, peak force [N]."""
+
+    def __init__(self, tell: Any) -> None:
+        super().__init__()
+        self.ends: list[tuple[float, float, float, float]] = []
+        self._tell, self._done = tell, 0
+
+    def _on_step(self) -> bool:
+        rewards = self.locals["rewards"]
+        self._sums = getattr(self, "_sums", 0.0) + np.asarray(rewards, float)
+        self._done += len(rewards)
+        for index in np.flatnonzero(self.locals["dones"]).tolist():
+            info = self.locals["infos"][index]
+            self.ends.append((self._sums[index], info["distance"], float(info["is_success"]), info["peak_force"]))
+            self._sums[index] = 0.0
+        self._tell(self._done)
+        return True

@@ -1,0 +1,157 @@
+"""A training run: rounds of acting and learning, a checkpoint after each, a policy file at the end.
+
+A round is a function of the settings, its number and the state after the round before; so a run that was killed
+anywhere goes on from its last checkpoint to the same end, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from gymnasium.vector import AutoresetMode
+
+from robot.open import make_vector_env
+from robot.train.dagger import Dagger
+from robot.train.export import export
+from robot.train.network import PolicyNetwork
+from robot.train.run_folder import RunError, RunFolder, Tell, save, version
+from tacsim.config import load_rig
+from tacsim.gym.encode import space_of_features
+from tacsim.gym.features import FeatureEncoder
+from tacsim.gym.vector import TacsimVectorEnv
+from tacsim.models.policy import ActionAxis, PolicySpec
+from tacsim.models.text import printable
+from tacsim.models.training import Training
+from tacsim.tasks import make_task
+
+POLICY, CURVE = "policy.onnx", "curve.json"  # in the folder of a run
+Figures = Mapping[str, float]
+
+
+class Learner(Protocol):
+    """Learns in rounds."""
+
+    rounds: int
+    actor: PolicyNetwork
+
+    def round(self, number: int, tell: Tell) -> dict[str, float]:
+        """One round; what is to be told of it, `steps` (control steps of all environments) among it."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """All that the next round depends on, as tensors, numbers and texts; `actor` is the state of the actor."""
+        ...
+
+    def restore(self, state: Mapping[str, Any]) -> None: ...
+
+
+def environments(training: Training) -> TacsimVectorEnv:
+    """Those that a policy is trained in. Raises ConfigError, CannotOpen, IncompatibleRig, ValueError."""
+    return make_vector_env(
+        training.environments,
+        training.task,
+        training.rig,
+        training.overrides,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        randomise=training.randomise,
+        features=training.features,
+    )
+
+
+def begin(training: Training, folder: Path) -> RunFolder:
+    """Makes the folder of a new run. Raises as `environments`, and FileExistsError."""
+    environments(training).close()  # what cannot be made is told before there is a folder
+    config = load_rig(training.rig, task=training.task, overrides=training.overrides).config
+    assert config.task is not None
+    task, encoder = make_task(config.task), FeatureEncoder(training.features, config.canonical)
+    spec = PolicySpec(
+        task=config.task.kind,
+        period=config.period,
+        features=training.features,
+        inputs=encoder.inputs,
+        axes=tuple(ActionAxis(arm=axis.arm, direction=axis.direction) for axis in task.axes),
+        max_step=config.task.max_step,
+        trained={"by": f"tacsim {version()}".strip(), "training": training.model_dump(mode="json")},
+    )
+    space: Any = space_of_features(encoder, config)
+    return RunFolder.make(folder, training, spec, {key: box.shape for key, box in space.items()})
+
+
+def train(
+    run: RunFolder,
+    tell: Tell = lambda words, done, of: None,
+    say: Callable[[Figures], None] = lambda figures: None,
+) -> Path:
+    """Goes on with a run to its end, and writes its policy there; returns the file.
+
+    say: is told the figures of each round: its number `round`, those of the learner, and `seconds`.
+    Raises RunError, and OSError for a disk that is full: the last checkpoint is still whole.
+    """
+    torch.set_num_threads(1)  # small networks; and sums have one order on any machine
+    done, state, curve = run.last()
+    envs = environments(run.settings.training)
+    try:
+        learner = _learner(envs, run)
+        if done:
+            with _fitting(run):
+                learner.restore(state)
+        for number in range(done, learner.rounds):
+            began = time.perf_counter()
+            figures = learner.round(number, tell)
+            curve.append({"round": number + 1, **figures, "seconds": time.perf_counter() - began})
+            run.keep(number, learner.state(), curve)
+            save(run.folder / CURVE, lambda file: file.write(json.dumps(curve, indent=1).encode()))
+            say(curve[-1])
+    finally:
+        envs.close()
+    path = run.folder / POLICY
+    export_policy(run, path)
+    return path
+
+
+def export_policy(run: RunFolder, path: Path) -> float:
+    """Writes the policy of a run, as far as it has come; returns how far the file's actions are from the network's.
+
+    Raises RunError without a checkpoint, ExportError, OSError.
+    """
+    done, state, curve = run.last()
+    if not done:
+        raise RunError(f"{run.folder} has no checkpoint: not one round of its training is done")
+    actor = new_actor(run)
+    with _fitting(run):
+        actor.load_state_dict(state["actor"])
+    steps = int(sum(row["steps"] for row in curve))
+    trained = {**run.settings.spec.trained, "rounds": done, "steps": steps}
+    return export(actor, run.settings.spec.model_copy(update={"trained": trained}), run.settings.shapes, path)
+
+
+def new_actor(run: RunFolder) -> PolicyNetwork:
+    """The network of a run, before anything is learned."""
+    settings = run.settings
+    torch.manual_seed(settings.training.seed)
+    cut = settings.training.algorithm == "ppo"
+    return PolicyNetwork(settings.shapes, len(settings.spec.axes), settings.training.width, cut=cut)
+
+
+@contextmanager
+def _fitting(run: RunFolder) -> Iterator[None]:
+    """Raises RunError where what is restored in the block is not of this run's network."""
+    try:
+        yield
+    except (KeyError, RuntimeError, ValueError) as failure:
+        words = printable(str(failure).splitlines()[0])
+        raise RunError(f"{run.folder}: its checkpoint does not fit its settings: {words}") from None
+
+
+def _learner(envs: TacsimVectorEnv, run: RunFolder) -> Learner:
+    if run.settings.training.algorithm == "dagger":
+        return Dagger(envs, run.settings.training, new_actor(run), run.folder)
+    from robot.train.reinforce import Reinforce
+
+    return Reinforce(envs, run.settings.training, new_actor(run), run.folder)

@@ -1,0 +1,91 @@
+"""The same unseen episodes for every policy, and intervals that are those of the literature. Needs no torch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.deploy.policy import PolicyNotFound
+from robot.train.evaluate import Ended, Interval, Judged, evaluate
+from tests.robot.cli.invoked import tacsim
+from tests.robot.train.short import training
+
+
+def judged(successes: int, of: int, distances: list[float] | None = None) -> Judged:
+    given = distances or [1e-3] * of
+    return Judged("x", tuple(Ended(given[i], i < successes, float(i), 0.5) for i in range(of)))
+
+
+def close(found: Interval, *wanted: float) -> None:
+    assert (found.value, found.low, found.high) == pytest.approx(wanted, abs=5e-4)
+
+
+def test_the_interval_of_a_share_is_wilsons() -> None:
+    """z = 1.96, by hand: centre (p + z^2/2n) / (1 + z^2/n), half z/(1 + z^2/n) sqrt(p(1-p)/n + z^2/4n^2)."""
+    close(judged(8, 10).success, 0.8, 0.4902, 0.9433)
+    close(judged(0, 20).success, 0.0, 0.0, 0.1611)
+    close(judged(200, 200).success, 1.0, 0.9812, 1.0)
+
+
+def test_the_interval_of_a_mean_is_that_of_a_bell_for_many() -> None:
+    """Of 400 draws: mean ± 1.96 deviations / 20, to a few percent of its width."""
+    values = np.random.default_rng(1).normal(5.0, 2.0, 400)
+    found = judged(0, 400, values.tolist()).distance
+    half = 1.96 * values.std(ddof=1) / 20
+    assert found.value == pytest.approx(values.mean())
+    assert found.low == pytest.approx(values.mean() - half, abs=0.1 * half)
+    assert found.high == pytest.approx(values.mean() + half, abs=0.1 * half)
+
+
+def test_peaks_are_told_as_mean_and_as_what_one_in_twenty_exceeds() -> None:
+    assert judged(0, 21).peak_force == (10.0, 19.0)  # 0, 1, ... 20 N
+
+
+def test_the_teacher_is_nearer_than_chance_and_every_policy_meets_the_same_episodes() -> None:
+    settings = training(randomise=None)
+    teacher, random, again = evaluate(settings, ["teacher", "random", "teacher"], 5)
+    assert len(teacher.episodes) == 5
+    assert teacher.episodes == again.episodes
+    assert teacher.distance.value < random.distance.value
+    starts = [each.distance / (1 - each.improvement) for each in teacher.episodes]
+    assert np.ptp(starts) < 1e-9  # one scene, one goal
+    other = evaluate(settings, ["random"], 5, seed=1)[0]
+    assert other.episodes != random.episodes
+
+
+def test_drawn_episodes_are_not_those_of_training() -> None:
+    drawn = training()
+    ends = {seed: [each.distance for each in evaluate(drawn, ["teacher"], 4, seed)[0].episodes] for seed in (0, 1)}
+    assert len(set(ends[0])) > 1
+    assert ends[0] != ends[1]
+
+
+def test_a_policy_that_is_not_there_is_named_before_anything_runs() -> None:
+    with pytest.raises(PolicyNotFound, match=r"nothing\.onnx"):
+        evaluate(training(), ["teacher", "nothing.onnx"], 2)
+
+
+def test_the_command_writes_a_table_and_a_file(tmp_path: Path) -> None:
+    file, found = tmp_path / "short.yaml", tmp_path / "found.json"
+    file.write_text(json.dumps(training().model_dump(mode="json", exclude_none=True)), encoding="utf-8")
+    words = (
+        "evaluate",
+        str(file),
+        "--policy",
+        "teacher",
+        "--policy",
+        "scripted",
+        "--episodes",
+        "3",
+        "--json",
+        str(found),
+    )
+    result = tacsim(*words)
+    assert result.exit_code == 0, result.output
+    assert "3 unseen episodes, 95 % intervals" in result.stdout
+    assert "teacher" in result.stdout and "scripted" in result.stdout
+    assert len(json.loads(found.read_text())["scripted"]) == 3
+    assert "exists already" in tacsim(*words).stderr

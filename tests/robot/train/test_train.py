@@ -1,0 +1,304 @@
+"""Training runs: what is learned, what a kill leaves, and the file at the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+
+import onnx  # noqa: E402
+import onnxruntime  # noqa: E402
+
+from robot.deploy.onnx_policy import OnnxPolicy  # noqa: E402
+from robot.train.export import MOST_BYTES, ExportError, export  # noqa: E402
+from robot.train.network import CLIP, FeatureLayers, PolicyNetwork  # noqa: E402
+from robot.train.run_folder import RunError, RunFolder  # noqa: E402
+from robot.train.train import begin, environments, export_policy, new_actor, train  # noqa: E402
+from tacsim.models.training import Training  # noqa: E402
+from tests.robot.cli.invoked import START, environment, tacsim  # noqa: E402
+from tests.robot.train.short import training  # noqa: E402
+
+ALGORITHMS = ("dagger", "ppo", "sac")
+
+
+def weights(run: RunFolder) -> dict[str, Any]:
+    """All numbers of the last checkpoint."""
+    found: dict[str, Any] = {}
+
+    def walk(value: Any, at: str) -> None:
+        if isinstance(value, dict):
+            for key, each in value.items():
+                walk(each, f"{at}.{key}")
+        elif isinstance(value, torch.Tensor):
+            found[at] = value.numpy().tobytes()
+        elif isinstance(value, int | float):
+            found[at] = value
+
+    walk(run.last()[1], "")
+    return found
+
+
+class Killed(Exception):
+    """Stands for a kill: nothing after it runs."""
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_that_was_killed_goes_on_to_the_same_end_bit_for_bit(algorithm: str, tmp_path: Path) -> None:
+    settings = training(algorithm=algorithm)
+    whole = begin(settings, tmp_path / "whole")
+    train(whole)
+
+    def kill_in_round_2(words: str, done: int, of: int) -> None:
+        if "round 3" in words and done >= of // 2:
+            raise Killed
+
+    cut = begin(settings, tmp_path / "cut")
+    with pytest.raises(Killed):
+        train(cut, kill_in_round_2)
+    assert cut.last()[0] == 2
+    train(RunFolder(tmp_path / "cut"))
+    assert weights(cut) == weights(whole) != {}
+    assert (tmp_path / "cut/policy.onnx").read_bytes() == (tmp_path / "whole/policy.onnx").read_bytes()
+    assert len(json.loads((tmp_path / "cut/curve.json").read_text())) == 3
+
+
+def test_other_seeds_learn_something_else(tmp_path: Path) -> None:
+    ends = []
+    for seed in (0, 1):
+        run = begin(training(seed=seed, dagger={"rounds": 1, "epochs": 1}), tmp_path / str(seed))
+        train(run)
+        ends.append(weights(run))
+    assert ends[0] != ends[1]
+
+
+def test_a_process_that_is_killed_leaves_a_run_that_goes_on(tmp_path: Path) -> None:
+    """kill -9 at a time that nobody chose."""
+    file = tmp_path / "short.yaml"
+    file.write_text(json.dumps(training().model_dump(mode="json", exclude_none=True)), encoding="utf-8")
+    command = [*START, "train", str(file), "--out", str(tmp_path / "run")]
+    with subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        while process.poll() is None and not (tmp_path / "run/checkpoint.pt").exists():
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() in (-signal.SIGKILL, 0), process.stderr and process.stderr.read()
+    result = tacsim("train", "--resume", str(tmp_path / "run"))
+    assert result.exit_code == 0, result.output
+    whole = begin(training(), tmp_path / "whole")
+    train(whole)
+    assert weights(RunFolder(tmp_path / "run")) == weights(whole)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_says_so_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
+    run = begin(training(), tmp_path / "run")
+
+    def fill_in_round_2(words: str, done: int, of: int) -> None:
+        if "round 2" in words and not (run.folder / "checkpoint.pt.part").exists():
+            (run.folder / "checkpoint.pt.part").symlink_to("/dev/full")
+
+    with pytest.raises(OSError, match=r"cannot be written") as failed:
+        train(run, fill_in_round_2)
+    assert failed.value.filename == str(run.folder / "checkpoint.pt")
+    assert not (run.folder / "checkpoint.pt.part").is_symlink()
+    assert run.last()[0] == 1
+    train(run)
+    assert run.last()[0] == 3
+
+
+@pytest.mark.parametrize("maps", [(), ("height", "slope")])
+def test_the_file_does_what_the_network_does(maps: tuple[str, ...], tmp_path: Path) -> None:
+    """Normalisation and clipping inside, no other file, metadata: to 1e-5, far outside of what was met too."""
+    features = {
+        "maps": maps,
+        "grid": {"rows": 4, "columns": 4, "pitch": 2e-3},
+        "touch": ["depth", "wrench"],
+        "frames": 2,
+    }
+    run = begin(training(features=features, dagger={"rounds": 1, "epochs": 1}), tmp_path / "run")
+    train(run)
+    path = tmp_path / "run/policy.onnx"
+    model = onnx.load(path, load_external_data=False)
+    assert path.stat().st_size <= MOST_BYTES
+    assert not any(tensor.external_data for tensor in model.graph.initializer)
+    policy = OnnxPolicy(path, environments_grid(), 2e-3)
+    assert policy.spec.trained["training"]["features"]["frames"] == 2
+    assert policy.spec.trained["steps"] == 9
+    actor, session = new_actor(run), onnxruntime.InferenceSession(path)
+    actor.load_state_dict(run.last()[1]["actor"])
+    random = np.random.default_rng(3)
+    for scale in (0.1, 1.0, 30.0):
+        seen = {
+            key: random.normal(0, scale, (1, *shape)).astype(np.float32) for key, shape in run.settings.shapes.items()
+        }
+        with torch.no_grad():
+            wanted = actor(*(torch.from_numpy(seen[key]) for key in actor.keys)).numpy()
+        (found,) = session.run(["action"], seen)
+        assert np.abs(found - wanted).max() <= 1e-5
+        assert np.abs(found).max() <= 1.0
+
+
+def environments_grid() -> Any:
+    from tacsim.models.sensor import CanonicalGrid
+
+    return CanonicalGrid(rows=8, columns=8, pitch=1e-3, image_scale=1)
+
+
+def test_normalisation_is_by_what_was_met_and_cuts_what_is_far() -> None:
+    layers = FeatureLayers({"touch": (2,), "goal": (1,)})
+    assert layers.keys == ("goal", "touch")
+    layers.normalise_by({"touch": torch.tensor([[1.0, 5.0], [3.0, 5.0]]), "goal": torch.tensor([[0.7], [0.7]])})
+    found = layers(torch.tensor([[0.9]]), torch.tensor([[4.0, 1e9]]))
+    # goal and the second number never varied: their own size; the first has mean 2 and deviation 1
+    assert found[0].tolist() == pytest.approx([0.2, 2.0, CLIP])
+
+
+def test_a_network_that_is_too_large_for_a_file_is_refused(tmp_path: Path) -> None:
+    run = begin(training(), tmp_path / "run")
+    with pytest.raises(ExportError, match="MiB, at most 2 are written"):
+        export(PolicyNetwork(run.settings.shapes, 2, 1000), run.settings.spec, run.settings.shapes, tmp_path / "x.onnx")
+    assert not (tmp_path / "x.onnx").exists()
+
+
+def test_export_of_a_run_that_has_only_begun(tmp_path: Path) -> None:
+    run = begin(training(), tmp_path / "run")
+    with pytest.raises(RunError, match="not one round of its training is done"):
+        export_policy(run, tmp_path / "x.onnx")
+
+
+def test_the_command_trains_exports_and_goes_on(tmp_path: Path) -> None:
+    file = tmp_path / "short.yaml"
+    file.write_text(json.dumps(training().model_dump(mode="json", exclude_none=True)), encoding="utf-8")
+    run = tmp_path / "run"
+    result = tacsim("train", str(file), "--set", "dagger.rounds=1", "--seed", "5", "--out", str(run))
+    assert result.exit_code == 0, result.output
+    assert "round 1: " in result.stdout
+    assert RunFolder(run).settings.training.seed == 5
+    result = tacsim("export", "policy", str(run), "--out", str(tmp_path / "x.onnx"))
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "x.onnx").read_bytes() == (run / "policy.onnx").read_bytes()
+    result = tacsim("export", "policy", str(run), "--out", str(tmp_path / "x.onnx"))
+    assert result.exit_code == 2
+    assert "exists already" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "name a task"),
+        (("juggle",), "no training 'juggle'; allowed: "),
+        (("squeeze", "--algorithm", "magic"), "algorithm"),
+        (("squeeze", "--set", "dagger.round=3"), "did you mean"),
+        (("squeeze", "--set", "overrides=[scene.presett=learn]"), "did you mean"),
+        (("squeeze", "--set", "rig=mock", "--set", "overrides=[]", "--set", "randomise=null"), "not simulated"),
+        (("squeeze", "--set", "features.flow=true"), "markers"),
+        (("--resume", "nowhere"), "nowhere holds no training run"),
+        (("--resume", "nowhere", "--seed", "1"), "leave out all else"),
+        (("squeeze", "--resume", "nowhere"), "leave out all else"),
+    ],
+)
+def test_what_cannot_be_is_said(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = tacsim("train", *words)
+    assert result.exit_code == 2, result.output
+    assert said in " ".join(result.output.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def other_format(folder: Path) -> None:
+    text = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**text, "format": 2}))
+
+
+def cut_off(folder: Path) -> None:
+    (folder / "checkpoint.pt").write_bytes((folder / "checkpoint.pt").read_bytes()[:500])
+
+
+def other_checkpoint(folder: Path) -> None:
+    torch.save({"format": 7}, folder / "checkpoint.pt")
+
+
+def code(folder: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> Any:
+            return os.system, (f"touch {folder}/ran",)
+
+    torch.save({"format": 1, "rounds": 1, "state": Evil(), "curve": []}, folder / "checkpoint.pt")
+
+
+def misfit(folder: Path) -> None:
+    text = json.loads((folder / "run.json").read_text())
+    text["training"]["width"] = 9
+    (folder / "run.json").write_text(json.dumps(text))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (other_format, "has format 2, this version of tacsim goes on with 1"),
+        (lambda folder: (folder / "run.json").write_text("{"), "run.json cannot be read"),
+        (cut_off, "is no checkpoint of this version"),
+        (other_checkpoint, "has format 7"),
+        (code, "is no checkpoint of this version"),
+        (misfit, "does not fit its settings"),
+        (lambda folder: (folder / "round-000.npz").unlink(), "round-000.npz"),
+        (lambda folder: (folder / "round-000.npz").write_bytes(b"PK"), "round-000.npz"),
+    ],
+)
+def test_a_run_that_cannot_go_on_says_why(spoil: Any, said: str, done: Path, tmp_path: Path) -> None:
+    import shutil
+
+    folder = tmp_path / "run"
+    shutil.copytree(done, folder)
+    text = json.loads((folder / "run.json").read_text())
+    text["training"]["dagger"]["rounds"] = 2
+    (folder / "run.json").write_text(json.dumps(text))
+    spoil(folder)
+    result = tacsim("train", "--resume", str(folder))
+    assert result.exit_code in (1, 2), result.output
+    assert said in " ".join(result.output.split())
+    assert "unexpected" not in result.output
+    assert not (folder / "ran").exists()
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one round."""
+    folder: Path = tmp_path_factory.mktemp("done") / "run"
+    train(begin(training(dagger={"rounds": 1, "epochs": 1}), folder))
+    return folder
+
+
+def test_nothing_else_loads_torch() -> None:
+    program = """
+import sys
+import robot.cli, robot.open, robot.deploy.policy, robot.train.evaluate, robot.train.run_folder
+from robot.cli.learn import evaluate, export, train
+assert not {"torch", "stable_baselines3", "onnx", "onnxruntime"} & set(sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment(), capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_environments_of_a_training_share_launches() -> None:
+    envs = environments(training())
+    assert envs.num_envs == 3
+    assert [member.expert().tolist() for member in envs.members] == [[0.0, 0.0]] * 3  # nothing is running
+    envs.reset(seed=1)
+    assert all(np.abs(member.expert()).max() > 0.1 for member in envs.members)
+    envs.close()
+    assert isinstance(training(), Training)

@@ -99,7 +99,7 @@ def _run(
     if not notes.is_terminal:
         notes.print(begun)
     task = None if loaded.config.task is None else make_task(loaded.config.task)
-    setup = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()})
+    setup = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()}, loaded.config.canonical)
     recorder: Recorder | None = None
     fitting: list[Policy] = []
 

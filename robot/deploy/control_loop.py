@@ -14,10 +14,12 @@ from typing import Protocol
 from robot.deploy.policy import require_fit
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.report.series import LOST
+from tacsim.report.series import FELT, LOST
 from tacsim.rig import Rig
 from tacsim.tasks import Task, judge
+from tacsim.tasks.task import Estimator
 
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
 
@@ -58,6 +60,7 @@ class EpisodeSetup:
     policy: str = "policy"
     seed: int = 0
     attachments: Mapping[str, bytes] = field(default_factory=dict)
+    canonical: CanonicalGrid = field(default_factory=CanonicalGrid)  # of the rig
 
 
 def run_episode(
@@ -72,7 +75,8 @@ def run_episode(
     stop: Callable[[], bool] = lambda: False,
 ) -> Episode:
     """Resets rig and policy, then runs exactly `steps` control steps; fewer only when a recording is over, `stop` says
-    so, or on Ctrl-C. The episode's step 0 is the state after reset. Where the rig knows no truth, nothing is judged.
+    so, or on Ctrl-C. The episode's step 0 is the state after reset. Where the rig knows the truth of the body, its task
+    judges by that; where all that it takes is felt, `Step.info` has the distance by touch alone (`felt_distance`), too.
 
     With a recorder the steps of the episode are those in its file, read when they are asked for: however long it is,
     it takes no memory. Without one they are kept in memory, with their pictures.
@@ -95,13 +99,16 @@ def run_episode(
     rig.packages()  # those of before are not of this episode
     meta = _meta(rig, task, setup)
     sink = None if recorder is None else recorder(meta)
+    can_feel = task is not None and not task.needs_to_feel.missing(rig.spec)
+    feel = task.estimator(setup.canonical) if task is not None and can_feel else None
     kept: list[Step] = []
     episode = Episode(meta, kept if sink is None else sink.steps)
     count = 0
 
     def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
         nonlocal count
-        step = _step(count, rig, task, start, observation, action, sent, time.perf_counter() - started)
+        seconds = time.perf_counter() - started
+        step = _step(count, rig, task, start, feel, observation, action, sent, seconds)
         count += 1
         if sink is None:
             kept.append(step)
@@ -164,6 +171,7 @@ def _step(
     rig: Rig,
     task: Task | None,
     start: Truth | None,
+    feel: Estimator | None,
     observation: Observation,
     action: Action | None,
     sent: Mapping[str, Pose | None],
@@ -174,6 +182,9 @@ def _step(
     info |= rig.diagnostics()
     packages = rig.packages()
     info |= {f"{LOST}{name}": float(each.lost) for name, each in packages.items()}
+    distance = None if feel is None else feel(observation)
+    if distance is not None:
+        info[FELT] = distance
     truth, outcome = rig.truth(), None
     if truth is not None and start is not None:
         moved = truth.position - start.position

@@ -45,8 +45,11 @@ def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task |
     """Raises IncompatibleRig, which says what to choose instead, where a rig that delivers `spec` lacks what the task
     or the policy called `name` needs."""
     if task is not None:
+        who = f"task '{task.config.kind}'"
         advice = "Leave the task out (task: null in the rig file, or --set task=null): then nothing is judged"
-        require(rig, spec, task.needs, f"task '{task.config.kind}'", advice)
+        require(rig, spec, task.needs, who, advice)
+        if not spec.truth:
+            require(rig, spec, task.needs_to_feel, f"{who} (judged by touch, as nobody knows the truth)", advice)
     advice = "" if name == "grip" else "Take --policy grip, which needs pictures alone, or one of your own"
     require(rig, spec, policy.needs, f"policy '{name}'", advice)
     if isinstance(policy, OnnxPolicy) and (found := misfits(policy, spec, task)):

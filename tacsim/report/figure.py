@@ -158,11 +158,14 @@ def _draw_reward(axes: Axes, series: Series) -> None:
 def _draw_distance(axes: Axes, series: Series) -> None:
     known = {"squeeze": "|height − goal|", "reposition": "|position − goal|"}
     plain(axes, f"distance: {known.get(series.meta.task or '', 'from the goal')}", "step", "mm")
-    _line(axes, series, series.distance * 1e3, INK)
-    best = int(np.nanargmin(series.distance))
-    at, least = series.index[best], series.distance[best] * 1e3
     axes.axhline(0.0, color=GOAL, linestyle="--", linewidth=1)
-    axes.plot([at], [least], "o", color=GOAL, markersize=6, label=f"best {least:.3f} mm at step {at}")
+    if np.isfinite(series.felt).any():
+        _line(axes, series, series.felt * 1e3, QUIET, "by touch alone")
+    if np.isfinite(series.distance).any():
+        _line(axes, series, series.distance * 1e3, INK)
+        best = int(np.nanargmin(series.distance))
+        at, least = series.index[best], series.distance[best] * 1e3
+        axes.plot([at], [least], "o", color=GOAL, markersize=6, label=f"best {least:.3f} mm at step {at}")
     _legend(axes)
 
 
@@ -211,7 +214,7 @@ def _panels(series: Series) -> list[Callable[[Axes, Series], None]]:
         (bool(np.isfinite(series.reward).any()), _draw_reward),
         (bool(series.force), _draw_force),
         (bool(series.signals), _draw_signal),
-        (bool(np.isfinite(series.distance).any()), _draw_distance),
+        (bool(np.isfinite([series.distance, series.felt]).any()), _draw_distance),
         (bool(np.isfinite(series.after_reset().seconds).any()), _draw_timing),
         (bool(signal_against_force(series)), _draw_signal_against_force),
     ]

@@ -27,9 +27,10 @@ FILMSTRIP = 12  # frames a sensor in report.html
 def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[str, Any]:
     """An episode in numbers, as JSON; lists have one entry for each control step (none for the state after reset).
 
-    `reward` [-], `distance` [m], `force` (arm -> |Fz| [N]), `seconds` [s], `contact_signal` (sensor -> list),
-    `correlation` (sensor -> r between contact signal and force), `timing` (tacsim.report.diagnostics; null unless the
-    rig is live), `trust` (the same; null if sensors know their surface), `started` (ISO date and time with its zone).
+    `reward` [-], `distance` [m], `felt_distance` (the same by touch alone [m]), `force` (arm -> |Fz| [N]), `seconds`
+    [s], `contact_signal` (sensor -> list), `correlation` (sensor -> r between contact signal and force), `timing`
+    (tacsim.report.diagnostics; null unless the rig is live), `trust` (the same; null if sensors know their surface),
+    `started` (ISO date and time with its zone).
     Unknown and infinite values are null.
     """
     from tacsim.report.figure import signal_against_force
@@ -49,6 +50,7 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
         "step": done.index.tolist(),
         "reward": _numbers(done.reward),
         "distance": _numbers(done.distance),
+        "felt_distance": _numbers(done.felt),
         "force": [{name: force[name][at] for name in force if present[name][at]} for at in range(len(done))],
         "contact_signal": {name: _numbers(values) for name, values in done.signals.items()},
         "correlation": {name: pair[2] for name, pair in signal_against_force(series).items()},
@@ -103,15 +105,15 @@ def end_table(stats: Mapping[str, Any], paths: Iterable[Path]) -> Table:
 
 
 def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
-    known = [(value, k) for k, value in zip(stats["step"], stats["distance"], strict=True) if value is not None]
-    best = min(known, default=None)
+    best, felt = (_least(stats, key) for key in ("distance", "felt_distance"))
     rewards = [value for value in stats["reward"] if value is not None]
     rows_of_force = zip(stats["step"], stats["force"], strict=True)
     forces = [(value, arm, k) for k, row in rows_of_force for arm, value in row.items() if value is not None]
     peak = max(forces, key=lambda row: row[0], default=None)  # of equal ones the first
     rows = [
         ("steps", f"{stats['steps']}" + ("" if stats["complete"] else " (recording incomplete)")),
-        ("best distance", f"{best[0] * 1e3:.3f} mm at step {best[1]}" if best else "–"),
+        ("best distance", best),
+        ("best distance, felt", felt),
         ("final reward", f"{rewards[-1]:.3f}" if rewards else "–"),
         ("peak force |Fz|", f"{peak[0]:.2f} N ({peak[1]}, step {peak[2]})" if peak else "–"),
         ("contact signal", _signal_text(stats)),
@@ -126,6 +128,11 @@ def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     if stats["dropped"]:
         rows.append(("dropped", f"{stats['dropped']} steps were not recorded"))
     return rows
+
+
+def _least(stats: Mapping[str, Any], key: str) -> str:
+    known = [(value, k) for k, value in zip(stats["step"], stats[key], strict=True) if value is not None]
+    return f"{1e3 * min(known)[0]:.3f} mm at step {min(known)[1]}" if known else "–"
 
 
 def _signal_text(stats: Mapping[str, Any]) -> str:

@@ -27,6 +27,7 @@ BACKGROUND = "background_"  # mean slope that a drift of the light would look li
 BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrated slopes
 KEPT = "kept_"  # share of the markers that were seen
 SETTLED = "settled"
+FELT = "felt_distance"  # from the goal, by touch alone [m]
 _OF_ARMS = (ALIGNMENT, LIMITS, LOST)
 _OF_SENSORS = (SIGNAL, STALE, DRIFT, BACKGROUND, BEYOND, KEPT, PICTURES_LOST, PICTURES_DAMAGED, PICTURES_REPEATED)
 LARGEST = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
@@ -51,7 +52,7 @@ class Series:
     def of(cls, episode: Episode) -> Self:
         """The numbers that a report shows, of the arms and sensors that the episode's metadata name."""
         count, spec = len(episode.steps), episode.meta.spec
-        shown = {SETTLED, *(key + name for key in _OF_ARMS for name in spec.arms)}
+        shown = {SETTLED, FELT, *(key + name for key in _OF_ARMS for name in spec.arms)}
         shown |= {key + name for key in _OF_SENSORS for name in spec.sensors}
         index = np.zeros(count, np.int64)
         own = {name: np.full(count, np.nan) for name in _OWN}
@@ -93,6 +94,11 @@ class Series:
     def sensors(self) -> list[str]:
         """Sensors with pictures, top to bottom as they stand on the bench: `upper` first, then by name."""
         return upper_first(self.exposed)
+
+    @property
+    def felt(self) -> FloatArray:
+        """The distance from the goal by touch alone [m]."""
+        return self.info.get(FELT, np.full(len(self), np.nan))
 
     @property
     def signals(self) -> dict[str, FloatArray]:

@@ -11,9 +11,11 @@ import numpy as np
 from tacsim.geometry import shapes
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, Truth
 from tacsim.models.rig import KneadConfig
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.tasks.felt_shape import FeltShape
 from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spread
-from tacsim.tasks.squeeze import estimated_height
-from tacsim.tasks.task import Axis
+from tacsim.tasks.squeeze import BOTH, estimated_height
+from tacsim.tasks.task import Axis, Estimator
 
 GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
 
@@ -26,7 +28,11 @@ class Knead:
 
     @property
     def needs(self) -> Needs:
-        return Needs(arms=frozenset({"lower", "upper"}), truth=True)
+        return Needs(arms=BOTH)
+
+    @property
+    def needs_to_feel(self) -> Needs:
+        return Needs(BOTH, BOTH, height=True)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -77,6 +83,16 @@ class Knead:
             "iou": iou(body, self.solid),
         }
 
+    def estimator(self, canonical: CanonicalGrid) -> Estimator:
+        shape = FeltShape(self.volume, canonical)
+
+        def felt(observation: Observation) -> float | None:
+            shape.feel(observation)
+            points = shape.points()
+            return None if points is None else chamfer(points, self.solid, self.volume)
+
+        return felt
+
     def expert(self, truth: Truth, start: Truth) -> None:
         return None
 
@@ -105,7 +121,7 @@ class ScriptedKnead:
 
     @property
     def needs(self) -> Needs:
-        return Needs(sensors=frozenset({"lower", "upper"}), arms=frozenset({"lower", "upper"}), height=True)
+        return Needs(BOTH, BOTH, height=True)
 
     def reset(self) -> None:
         self._start, self._way = None, 0.0

@@ -11,7 +11,8 @@ import numpy as np
 from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
 from tacsim.models.rig import RepositionConfig
-from tacsim.tasks.task import Axis
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.tasks.task import Axis, Estimator
 
 REACHED = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 LEAST_FORCE = 0.01  # a smaller normal force counts as no contact [N]
@@ -25,7 +26,11 @@ class Reposition:
 
     @property
     def needs(self) -> Needs:
-        return Needs(arms=frozenset({"upper"}), truth=True)
+        return Needs(arms=frozenset({"upper"}))
+
+    @property
+    def needs_to_feel(self) -> Needs:
+        return Needs(arms=frozenset({"lower", "upper"}))
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -41,6 +46,19 @@ class Reposition:
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         return {}
+
+    def estimator(self, canonical: CanonicalGrid) -> Estimator:
+        start: FloatArray | None = None
+
+        def felt(observation: Observation) -> float | None:
+            nonlocal start
+            position = estimated_position(observation)
+            if position is None:
+                return None
+            start = position if start is None else start
+            return math.hypot(*(position - start - np.array(self.config.goal)))
+
+        return felt
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """Straight for the goal, as fast as the longer axis may go."""

@@ -9,8 +9,10 @@ import numpy as np
 
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
 from tacsim.models.rig import SqueezeConfig
-from tacsim.tasks.task import Axis
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.tasks.task import Axis, Estimator
 
+BOTH = frozenset({"lower", "upper"})
 LEAST_SHARE = 0.1  # of the sensors' way that a body is taken to give
 REACHED = 0.01e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 
@@ -23,7 +25,11 @@ class Squeeze:
 
     @property
     def needs(self) -> Needs:
-        return Needs(arms=frozenset({"lower", "upper"}), truth=True)
+        return Needs(arms=BOTH)
+
+    @property
+    def needs_to_feel(self) -> Needs:
+        return Needs(BOTH, BOTH, height=True)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -38,6 +44,13 @@ class Squeeze:
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         return {}
+
+    def estimator(self, canonical: CanonicalGrid) -> Estimator:
+        def felt(observation: Observation) -> float | None:
+            touched = all(observation.tactile[name].contact.any() for name in BOTH)
+            return abs(estimated_height(observation) - self.config.goal) if touched else None
+
+        return felt
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray:
         """Both sensors close by what is left of the height, over the share of their way that the body has taken since
@@ -64,7 +77,7 @@ class ScriptedSqueeze:
 
     @property
     def needs(self) -> Needs:
-        return Needs(sensors=frozenset({"lower", "upper"}), arms=frozenset({"lower", "upper"}), height=True)
+        return Needs(BOTH, BOTH, height=True)
 
     def reset(self) -> None:
         self._reached = False

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from tacsim.interface import FloatArray, Needs, Policy, Truth
+from tacsim.interface import FloatArray, Needs, Observation, Policy, Truth
 from tacsim.models.rig import TaskConfig
+from tacsim.models.sensor import CanonicalGrid
+
+# Observations of one episode, in order from the reset on -> the distance of each, felt [m]; None: nothing tells it.
+Estimator = Callable[[Observation], float | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +30,12 @@ class Task(Protocol):
     def config(self) -> TaskConfig: ...
     @property
     def needs(self) -> Needs:
-        """What judging needs of a rig; the policy has needs of its own."""
+        """What it needs of a rig; the policy has needs of its own."""
+        ...
+
+    @property
+    def needs_to_feel(self) -> Needs:
+        """What `estimator` needs besides; a rig that does not know the truth must have it."""
         ...
 
     @property
@@ -42,6 +51,10 @@ class Task(Protocol):
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         """What else is said of the body at the end of an episode."""
+        ...
+
+    def estimator(self, canonical: CanonicalGrid) -> Estimator:
+        """The distance by touch alone, as it exists on hardware: a new one for each episode."""
         ...
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray | None:

@@ -45,7 +45,7 @@ def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--task", "squeeze"], r"task 'squeeze'.*lacks .*ground truth.*--set task=null"),
+        (["--task", "squeeze"], r"task 'squeeze'.*lacks arm 'lower'; arm 'upper'.*--set task=null"),
         (["--policy", "mine:NeedsHeight"], r"lacks surface height.*Take --policy grip, which needs pictures alone"),
         (["--policy", "nothing"], "no policy 'nothing'"),
         (["--set", "arms.arm.limits.depth=1 mm"], r"limits\.depth: sensor 'finger' does not measure it"),

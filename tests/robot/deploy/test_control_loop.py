@@ -261,7 +261,7 @@ def test_a_rig_without_truth_is_not_judged() -> None:
 
 def test_needs_are_checked_before_anything_moves() -> None:
     hand = Hand()
-    with pytest.raises(IncompatibleRig, match="task 'squeeze' cannot run on rig 'hand': it lacks ground truth"):
+    with pytest.raises(IncompatibleRig, match=r"task 'squeeze' .judged by touch.*lacks sensor 'upper'; surface h"):
         run_episode(make_rig(hand, truth=False), FunctionPolicy(lift), TASK, 2)
     with pytest.raises(IncompatibleRig, match="policy 'scripted'"):
         run_episode(make_rig(hand), TASK.scripted(), TASK, 2, setup=EpisodeSetup("scripted"))

@@ -7,10 +7,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
 from robot.open import open_rig
 from tacsim.config import load_rig
-from tacsim.interface import Truth
+from tacsim.interface import FloatArray, Truth
 from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Body, Box, Indenter, Scene
 from tacsim.tasks import judge, make_task
@@ -68,22 +69,27 @@ def test_without_a_body_there_is_nothing_to_knead() -> None:
         _ = make_task(KneadConfig(kind="knead", scene=scene)).goal
 
 
-def kneaded(steps: int, policy: str, *overrides: str) -> dict[str, float]:
-    """What an episode of so many steps ends with."""
+def kneaded(steps: int, policy: str, *overrides: str) -> tuple[dict[str, float], FloatArray]:
+    """What an episode of so many steps ends with; and (n, 2) true and felt distance at each tenth step [m]."""
     loaded = load_rig("sim", task="knead", overrides=[*QUICK, *overrides])
     assert loaded.config.task is not None
     task, random = make_task(loaded.config.task), np.random.default_rng(1)
     with open_rig(loaded) as rig:
         observation = rig.reset(0)
-        start, acts = rig.truth(), task.scripted(through=True)
-        for _ in range(steps):
+        start, acts, feel = rig.truth(), task.scripted(through=True), task.estimator(loaded.config.canonical)
+        assert start is not None
+        both = []
+        for step in range(steps):
+            felt, now = feel(observation), rig.truth()
+            if step % 10 == 0 and felt is not None and now is not None:
+                both.append((task.distance(now, start), felt))
             poses = {name: arm.pose for name, arm in observation.arms.items()}
             vector = random.uniform(-1, 1, 4) * [0.2, 0.2, 1, 1]
             action = acts(observation) if policy == "scripted" else action_from(vector, task.axes, 0.5e-3, poses)
             observation, _ = rig.step(action)
         truth = rig.truth()
-    assert truth is not None and start is not None
-    return dict(task.measures(truth, start))
+    assert truth is not None
+    return dict(task.measures(truth, start)), np.array(both)
 
 
 @pytest.mark.deep
@@ -93,9 +99,13 @@ def kneaded(steps: int, policy: str, *overrides: str) -> dict[str, float]:
     ids=["rod", "ball"],
 )
 def test_the_scripted_policy_kneads_where_a_random_one_does_not(overrides: tuple[str, ...], least: float) -> None:
-    scripted, random = (kneaded(100, policy, *overrides)["chamfer_improvement"] for policy in ("scripted", "random"))
-    assert scripted > least
-    assert scripted > 2 * random
+    (scripted, one), (random, other) = (kneaded(100, policy, *overrides) for policy in ("scripted", "random"))
+    assert scripted["chamfer_improvement"] > least
+    assert scripted["chamfer_improvement"] > 2 * random["chamfer_improvement"]
+    true, felt = np.concatenate([one, other]).T
+    assert len(true) > 15
+    assert np.sqrt(np.mean((true - felt) ** 2)) < 0.1e-3
+    assert spearmanr(true, felt)[0] > 0.6
 
 
 def test_its_environment_measures_at_the_end() -> None:

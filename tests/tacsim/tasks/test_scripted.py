@@ -12,6 +12,7 @@ import pytest
 from robot.deploy.control_loop import run_episode
 from tacsim.interface import Action, Observation, Truth
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
+from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks import make_task
 from tacsim.tasks.action import action_from
 from tacsim.tasks.grip import Grip
@@ -111,6 +112,32 @@ def test_reposition_feels_the_body_and_nothing_without_contact(open_springs: Any
     task = make_task(REPOSITION)
     blind = Observation(observation.tactile, {**observation.arms, "upper": free}, 0.0)
     assert task.scripted()(blind).tool == {"upper": None}
+
+
+def test_distances_are_felt_too_where_nobody_knows_the_truth(open_springs: Any) -> None:
+    """Squeeze: to 2 um of the true distance; reposition: body and pressure are in one place here."""
+    for name, config, way in (("squeeze", SQUEEZE, 2e-6), ("reposition", REPOSITION, 1e-9)):
+        rig, task = open_springs(name), make_task(config)
+        episode = run_episode(rig, task.scripted(), task, 10)
+        for step in episode.steps[1:]:
+            assert step.info["felt_distance"] == pytest.approx(step.distance, abs=way)
+        rig._truth, rig.spec = None, replace(rig.spec, truth=False)
+        blind = run_episode(rig, task.scripted(), task, 10)
+        assert [step.distance for step in blind.steps] == [None] * 11
+        felt, same = ([step.info["felt_distance"] for step in each.steps[1:]] for each in (blind, episode))
+        assert felt == same
+
+
+@pytest.mark.parametrize("config", [SQUEEZE, REPOSITION])
+def test_nothing_is_felt_without_touch(config: Any, open_springs: Any) -> None:
+    rig, task = open_springs(config.kind), make_task(config)
+    rig.reset()
+    up = rig.observe().arms["upper"].pose
+    feel = task.estimator(CanonicalGrid())
+    touching, _ = rig.step(Action({"upper": type(up)(up.position - [0, 0, 0.2e-3], up.quaternion)}))
+    assert feel(touching) is not None
+    away, _ = rig.step(Action({"upper": type(up)(up.position + [0, 0, 1e-3], up.quaternion)}))
+    assert feel(away) is None
 
 
 def test_grip_closes_until_the_contact_is_firm_then_holds(open_springs: Any) -> None:

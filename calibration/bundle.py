@@ -73,8 +73,9 @@ class Calibration(Config):
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
     forward: PhotometricModel  # slope -> colour
     inverse: InverseModel  # colour -> slope
-    skirt_length: Positive  # of the dent that a ball presses [m]
-    skirt_fraction: Annotated[float, Field(gt=0)]
+    # Of the dent that a ball presses [m], [-]; None: that of an elastic layer, as it is taken to be now
+    skirt_length: Positive | None = None
+    skirt_fraction: Annotated[float, Field(gt=0)] | None = None
     view: GelView | None = None  # where the gel lies in the native picture; None: the native picture is metric
     markers: Markers | None = None  # None: no dots are printed on the gel
     noise: CameraNoise | None = None  # of the picture that the models are for; None: not measured

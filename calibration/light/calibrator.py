@@ -1,6 +1,6 @@
 """From a few presses of a ball of known radius to the calibrated light of a sensor.
 
-Finds the contact circles, refines them with the gel's elastic skirt and the light all together, then fits the forward
+Finds the contact circles, refines them with the gel's thickness and the light all together, then fits the forward
 model (slope -> colour) and the inverse one (colour -> slope) to the same labels.
 """
 
@@ -21,7 +21,7 @@ from calibration.errors import BadFrames
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.lens.view import GelView
 from calibration.light.circle import NoCircle
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, Skirt, dent_gradient, rim_slope
+from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, rim_slope
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
 from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, untouched_mean
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
@@ -69,7 +69,8 @@ class LightFit:
     forward: PhotometricModel
     inverse: InverseModel
     size: ModelSize
-    skirt: Skirt  # [px]
+    thickness: float  # of the gel, as the skirts of the dents tell it [px]
+    radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
     predictions: tuple[PressPrediction, ...]
     left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
     warnings: tuple[str, ...]
@@ -97,8 +98,6 @@ class LightFit:
             gel_size=(columns * pixel_pitch, rows * pixel_pitch),
             forward=self.forward,
             inverse=self.inverse,
-            skirt_length=self.skirt.length * pixel_pitch,
-            skirt_fraction=self.skirt.fraction,
             view=view,
             markers=markers,
             noise=noise,
@@ -155,7 +154,7 @@ def calibrate_light(
             left_out.append((name, str(error)))
     presses, refined = _refined(found, left_out, ball)
     v, u = np.mgrid[: reference.shape[0], : reference.shape[1]].astype(np.float64)
-    labels = [dent_gradient(u, v, press.circle, refined.skirt, ball, RIM_BLUR) for press in presses]
+    labels = [dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR) for press in presses]
     forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     size = choose_size(forward_sets)
@@ -178,7 +177,8 @@ def calibrate_light(
         forward=_forward_model(all_equations, size, steepest),
         inverse=InverseModel(weights=tuple((float(x), float(y)) for x, y in inverse), steepest=steepest),
         size=size,
-        skirt=refined.skirt,
+        thickness=refined.thickness,
+        radius_uncertainty=refined.radius_uncertainty,
         predictions=predictions,
         left_out=tuple(left_out),
         warnings=(*_warnings(presses, ball, mean, len(left_out)), *_badly_predicted(predictions)),

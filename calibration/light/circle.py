@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.dent import MAX_RIM_RATIO
+from calibration.light.dent import MAX_RIM_RATIO, dent_slope
 
 Float64 = NDArray[np.float64]
 
@@ -38,14 +38,6 @@ class Circle:
     y: float
     radius: float
     explained: float  # share of the difference that the dent explains, 0 to 1
-
-
-def dent_slope(r: Float64, contact: float, ball: float) -> Float64:
-    """Slope of the surface at distance r from the axis of a ball in contact up to `contact`; all in one unit."""
-    inside = r / np.sqrt(np.maximum(ball**2 - r**2, 1e-12))
-    q = np.minimum(contact / np.maximum(r, 1e-12), 1.0)
-    rim = contact / np.sqrt(ball**2 - contact**2)
-    return np.where(r < contact, inside, rim * 2 / np.pi * (np.arcsin(q) / q - np.sqrt(1 - q * q)))
 
 
 def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_radius: float) -> Circle:

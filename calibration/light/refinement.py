@@ -1,7 +1,7 @@
-"""Contact circles and elastic skirt, refined together with the light that they imply.
+"""Contact circles and the thickness of the gel, refined together with the light that they imply.
 
 The weights of the light are linear given the geometry, so they are eliminated (variable projection, Golub and Pereyra
-1973; Kaufman's approximation): Levenberg-Marquardt steps on three numbers a press and two of the skirt lower the
+1973; Kaufman's approximation): Levenberg-Marquardt steps on three numbers a press and one of the gel lower the
 difference of colour that no light explains. No light is assumed, and circles need not be exact at first.
 """
 
@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, Skirt, dent_gradient
+from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient
 from calibration.light.photometry import features
 
 Float64 = NDArray[np.float64]
@@ -23,10 +24,12 @@ RIDGE = 1e-4
 RIM_BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
 MAX_STEPS = 25
 MIN_GAIN = 1e-4  # relative gain of a step, below which the refinement ends
-DELTA = 0.05  # step of finite differences [px]; of the skirt, relative
-FIRST_SKIRTS = [(length, fraction) for length in (0.1, 0.25, 0.5, 0.9) for fraction in (0.6, 1.0)]  # [ball radii, -]
-LENGTH_BOUNDS = (0.02, 2.0)  # of the skirt [ball radii]
-FRACTION_BOUNDS = (0.1, 1.5)  # of the skirt [-]
+DELTA = 0.05  # step of finite differences [px]; of the gel's thinness [-]
+# Thinness of the gel: the ball's radius over the gel's thickness
+FIRST_THINNESS = (0.1, 1.0)  # the refinement starts from a thick gel and from a thin one
+THINNESS_BOUNDS = (0.02, 3.0)
+RIVAL = 1.2  # times the least cost, up to which what the other start leads to is a solution too
+MAX_GROUPS = 8  # that are left out in turn to tell the uncertainty of radii
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +46,9 @@ class RefinedGeometry:
     """Geometry of all presses."""
 
     circles: tuple[ContactCircle, ...]
-    skirt: Skirt
+    thickness: float  # of the gel, as its skirts tell it [px]; above two ball radii it hardly matters
     unexplained: tuple[float, ...]  # share of the power of each press's change of colour
+    radius_uncertainty: float  # of the scale of all radii together [-]; NaN for a single press
 
 
 def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: float) -> RefinedGeometry:
@@ -52,11 +56,18 @@ def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: floa
 
     Fixed windows, so that two states compare: they are cut round `start` and stay.
     """
-    first = [
-        _Problem(windows, tuple(start), Skirt(length * ball, fraction), ball).solved()
-        for length, fraction in FIRST_SKIRTS
-    ]
-    state = min(first, key=lambda problem: problem.cost)
+    ends = sorted(
+        (_descended(_Problem(windows, tuple(start), thinness, ball).solved()) for thinness in FIRST_THINNESS),
+        key=lambda problem: problem.cost,
+    )
+    best = ends[0]
+    powers = [float((window.change**2).sum()) for window in windows]
+    shares = tuple(part / max(power, 1e-300) for part, power in zip(best.part_costs(), powers, strict=True))
+    return RefinedGeometry(best.circles, ball / best.thinness, shares, _radius_uncertainty(best, ends[1:]))
+
+
+def _descended(state: _Problem) -> _Problem:
+    """From `state` to the least cost near it, by Levenberg and Marquardt's steps."""
     damping = 1e-2
     for _ in range(MAX_STEPS):
         gradient, curvature = state.normal_equations()
@@ -72,10 +83,30 @@ def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: floa
         state, damping = trial, damping / 3
         if gain < MIN_GAIN:
             break
-    parts = state.part_costs()
-    powers = [float((window.change**2).sum()) for window in windows]
-    shares = tuple(part / max(power, 1e-300) for part, power in zip(parts, powers, strict=True))
-    return RefinedGeometry(state.circles, state.skirt, shares)
+    return state
+
+
+def _radius_uncertainty(best: _Problem, others: Sequence[_Problem]) -> float:
+    """Standard deviation of the scale of all radii [-]: by leaving out one group of presses after the other (the
+    jackknife), or what another solution as good says differently, if that is more."""
+    count = len(best.circles)
+    if count < 2:
+        return float("nan")
+    groups = min(count, MAX_GROUPS)
+    scales = []
+    for group in range(groups):
+        kept = [i for i in range(count) if i % groups != group]
+        refined = _descended(best.part(kept).solved())
+        scales.append(_scale(refined, best.part(kept)))
+    spread = np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2))
+    rivals = [abs(_scale(other, best)) for other in others if other.cost < RIVAL * best.cost]
+    return float(max([spread, *rivals]))
+
+
+def _scale(one: _Problem, other: _Problem) -> float:
+    """Mean logarithm of the ratio of radii."""
+    pairs = zip(one.circles, other.circles, strict=True)
+    return float(np.mean([np.log(circle.radius / was.radius) for circle, was in pairs]))
 
 
 @dataclass(slots=True, eq=False)
@@ -84,7 +115,7 @@ class _Problem:
 
     windows: Sequence[Window]
     circles: tuple[ContactCircle, ...]
-    skirt: Skirt
+    thinness: float
     ball: float
     cost: float = np.inf
     _terms: list[Float64] = field(default_factory=list)
@@ -92,8 +123,12 @@ class _Problem:
     _weights: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
     _residuals: list[Float64] = field(default_factory=list)
 
-    def solved(self) -> _Problem:
-        self._terms = [self._features(i, self.circles[i], self.skirt) for i in range(len(self.windows))]
+    def part(self, kept: Sequence[int]) -> _Problem:
+        """The same of some of the presses."""
+        return _Problem([self.windows[i] for i in kept], tuple(self.circles[i] for i in kept), self.thinness, self.ball)
+
+    def solved(self) -> Self:
+        self._terms = [self._features(i, self.circles[i], self.thinness) for i in range(len(self.windows))]
         square = sum((t.T @ t for t in self._terms), np.zeros((self._terms[0].shape[1],) * 2))
         right = sum(
             (t.T @ w.change for t, w in zip(self._terms, self.windows, strict=True)), np.zeros((len(square), 3))
@@ -108,27 +143,24 @@ class _Problem:
         return [float((residual**2).sum()) for residual in self._residuals]
 
     def normal_equations(self) -> tuple[Float64, Float64]:
-        """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then log length and
-        fraction of the skirt. What the light can explain is projected out."""
-        count = 3 * len(self.circles) + 2
+        """Gradient and Gauss-Newton curvature of half the cost by (x, y, radius) of each circle, then the thinness of
+        the gel. What the light can explain is projected out."""
+        count = 3 * len(self.circles) + 1
         gradient, curvature = np.zeros(count), np.zeros((count, count))
         onto = np.zeros((3, count, len(self._square)))  # by channel: what the weights of the light could explain
-        longer = replace(self.skirt, length=self.skirt.length * np.exp(DELTA))
-        stronger = replace(self.skirt, fraction=self.skirt.fraction + DELTA)
         for i, circle in enumerate(self.circles):
             moved = [
-                self._features(i, replace(circle, x=circle.x + DELTA), self.skirt),
-                self._features(i, replace(circle, y=circle.y + DELTA), self.skirt),
-                self._features(i, replace(circle, radius=circle.radius - DELTA), self.skirt),
-                self._features(i, circle, longer),
-                self._features(i, circle, stronger),
+                self._features(i, replace(circle, x=circle.x + DELTA), self.thinness),
+                self._features(i, replace(circle, y=circle.y + DELTA), self.thinness),
+                self._features(i, replace(circle, radius=circle.radius - DELTA), self.thinness),
+                self._features(i, circle, self.thinness + DELTA),
             ]
-            signs = (1, 1, -1, 1, 1)
-            # of the residual: (5, n, 3)
+            signs = (1, 1, -1, 1)
+            # of the residual: (4, n, 3)
             slopes = np.stack(
                 [-(m - self._terms[i]) @ self._weights * (s / DELTA) for m, s in zip(moved, signs, strict=True)]
             )
-            at = np.array([3 * i, 3 * i + 1, 3 * i + 2, count - 2, count - 1])
+            at = np.array([3 * i, 3 * i + 1, 3 * i + 2, count - 1])
             gradient[at] += np.einsum("pnc,nc->p", slopes, self._residuals[i])
             curvature[np.ix_(at, at)] += np.einsum("pnc,qnc->pq", slopes, slopes, optimize=True)
             onto[:, at] += np.einsum("pnc,nk->cpk", slopes, self._terms[i], optimize=True)
@@ -141,17 +173,12 @@ class _Problem:
             ContactCircle(
                 circle.x + dx, circle.y + dy, float(np.clip(circle.radius + dr, 1.0, MAX_RIM_RATIO * self.ball))
             )
-            for circle, (dx, dy, dr) in zip(self.circles, np.clip(step[:-2].reshape(-1, 3), -4, 4), strict=True)
+            for circle, (dx, dy, dr) in zip(self.circles, np.clip(step[:-1].reshape(-1, 3), -4, 4), strict=True)
         )
-        length = self.skirt.length * np.exp(np.clip(step[-2], -0.5, 0.5))
-        skirt = Skirt(
-            float(np.clip(length, LENGTH_BOUNDS[0] * self.ball, LENGTH_BOUNDS[1] * self.ball)),
-            float(np.clip(self.skirt.fraction + np.clip(step[-1], -0.3, 0.3), *FRACTION_BOUNDS)),
-        )
-        return _Problem(self.windows, circles, skirt, self.ball)
+        thinness = float(np.clip(self.thinness + np.clip(step[-1], -0.5, 0.5), *THINNESS_BOUNDS))
+        return _Problem(self.windows, circles, thinness, self.ball)
 
-    def _features(self, i: int, circle: ContactCircle, skirt: Skirt) -> Float64:
+    def _features(self, i: int, circle: ContactCircle, thinness: float) -> Float64:
         window = self.windows[i]
-        return features(
-            dent_gradient(window.u, window.v, circle, skirt, self.ball, RIM_BLUR), window.u, window.v, DEGREE, 0
-        )
+        gradient = dent_gradient(window.u, window.v, circle, self.ball / thinness, self.ball, RIM_BLUR)
+        return features(gradient, window.u, window.v, DEGREE, 0)

@@ -6,8 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
-from calibration.light.circle import dent_slope
+from calibration.light.dent import dent_slope
 from tacsim.models.sensor import Light, Lighting
 from tacsim.optics.render import shade
 
@@ -28,9 +29,10 @@ class Made:
 
 
 class HiddenSensor:
-    """Three lights of random colour, direction and gloss, an uneven background, a camera's noise."""
+    """Three lights of random colour, direction and gloss, an uneven background, a camera's noise. `spread` [px]: light
+    spreads so far in the gel before it is seen, a Gaussian's standard deviation."""
 
-    def __init__(self, seed: int, noise: float = 1.5, gain: float = 0.45) -> None:
+    def __init__(self, seed: int, noise: float = 1.5, gain: float = 0.45, spread: float = 0.0) -> None:
         self._rng = np.random.default_rng(seed)
         rng, turn = self._rng, self._rng.uniform(0, 2 * np.pi)
         lights = tuple(
@@ -46,7 +48,7 @@ class HiddenSensor:
         slope = rng.uniform(-20, 20, (2, 3))
         level = rng.uniform(90, 130, 3)
         self._base = level + (u / COLUMNS - 0.5)[..., None] * slope[0] + (v / ROWS - 0.5)[..., None] * slope[1]
-        self._noise = noise
+        self._noise, self._spread = noise, spread
 
     def empty(self) -> np.ndarray:
         return self.photograph(np.zeros((ROWS, COLUMNS, 2)))
@@ -76,5 +78,7 @@ class HiddenSensor:
     def photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
         flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self._lighting)
         change = 255 * (shade(gradient.astype(np.float32), self._lighting) - flat)
+        if self._spread:
+            change = gaussian_filter(change, (self._spread, self._spread, 0))
         noise = self._rng.normal(0, self._noise, (ROWS, COLUMNS, 3))
         return np.clip(np.rint(self._base + change + drift + noise), 0, 255).astype(np.uint8)

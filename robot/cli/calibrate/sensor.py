@@ -229,8 +229,13 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
     size = fit.size
     results.print(
         f"model: degree {size.degree} in the normal, {size.position} in the place; calibrated up to a slope of "
-        f"{fit.forward.steepest:.2f}; skirt {fit.skirt.length * pitch * 1e3:.2f} mm x {fit.skirt.fraction:.2f}"
+        f"{fit.forward.steepest:.2f}"
     )
+    if fit.predictions:
+        results.print(
+            f"contact radii ± {fit.radius_uncertainty:.1%}; gel {fit.thickness * pitch * 1e3:.1f} mm thick by the "
+            "slopes round the contacts"
+        )
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)
     for warning in fit.warnings:

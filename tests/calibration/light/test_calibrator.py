@@ -7,7 +7,7 @@ from calibration.errors import BadFrames
 from calibration.height.integration import Integrator
 from calibration.height.slope_polynomial import PolynomialSlopes, to_normal
 from calibration.light.calibrator import LightFit, calibrate_light, normal_angle
-from calibration.light.dent import ContactCircle, Skirt, dent_gradient
+from calibration.light.dent import ContactCircle, dent_gradient
 from calibration.markers.dots import DotEraser
 from tacsim.models.photometric import PhotometricLight, place_in_image, places_in_image
 from tests.calibration.dotted import draw, lattice_points
@@ -63,32 +63,44 @@ def test_normals_of_an_unseen_press_come_back_within_a_degree(
 
 
 def test_depth_of_an_unseen_press_comes_back(sensor: HiddenSensor, calibrated: tuple[LightFit, list[Made]]) -> None:
-    """Within 4 %: the true surface is Hertz's, whose skirt reaches farther than the one that is assumed."""
+    """Within 3 %: what is left is the skirt's far end, which is taken for a drift of the light."""
     unseen = sensor.press(0.5e-3, 150, 90)
     found = Integrator((ROWS, COLUMNS), PITCH)(found_slopes(calibrated[0], unseen.image))
     border = np.r_[unseen.height[0], unseen.height[-1], unseen.height[:, 0], unseen.height[:, -1]]
-    assert float(found.max()) == pytest.approx(float(unseen.height.max() - np.median(border)), rel=0.04)
+    assert float(found.max()) == pytest.approx(float(unseen.height.max() - np.median(border)), rel=0.03)
 
 
-def test_skirt_and_depth_come_back_where_the_gel_is_as_assumed() -> None:
-    """Dents with an exponential skirt, their rim smooth over a pixel as a gel's is, integrated along r in closed form.
-    What is left, 2 %, is the blur before the inverse."""
-    sensor, skirt = HiddenSensor(5), Skirt(0.25 * BALL_PX, 0.6)
+def test_thickness_of_a_thin_gel_comes_back() -> None:
+    """Dents of an elastic layer whose skirts fall off faster than Hertz's."""
+    sensor, thickness = HiddenSensor(5), 1.2 * BALL_PX
     v, u = np.mgrid[:ROWS, :COLUMNS].astype(float)
-
-    def pressed(x: float, y: float, radius: float) -> np.ndarray:
-        return sensor.photograph(dent_gradient(u, v, ContactCircle(x, y, radius), skirt, BALL_PX, 1.0))
-
     places = [(70, 60, 14), (190, 140, 12), (130, 100, 16), (60, 150, 13), (200, 60, 15), (100, 50, 10), (160, 60, 16)]
-    frames = [(f"{i}", pressed(*place)) for i, place in enumerate(places)]
+    circles = [ContactCircle(*place) for place in places]
+    frames = [
+        (f"{i}", sensor.photograph(dent_gradient(u, v, circle, thickness, BALL_PX, 1.0)))
+        for i, circle in enumerate(circles)
+    ]
     fit = calibrate_light(sensor.empty(), frames, BALL_PX)
-    assert fit.skirt.length == pytest.approx(skirt.length, rel=0.15)
-    assert fit.skirt.fraction == pytest.approx(skirt.fraction, rel=0.15)
-    radius = 15.0
-    rim = skirt.fraction * radius / np.sqrt(BALL_PX**2 - radius**2)
-    depth = (BALL_PX - np.sqrt(BALL_PX**2 - radius**2) + rim * skirt.length) * PITCH
-    found = Integrator((ROWS, COLUMNS), PITCH)(found_slopes(fit, pressed(125.0, 105.0, radius)))
-    assert float(found.max()) == pytest.approx(depth, rel=0.03)
+    assert fit.thickness == pytest.approx(thickness, rel=0.1)
+    for press, circle in zip(fit.presses, circles, strict=True):
+        assert press.circle.radius == pytest.approx(circle.radius, rel=0.02)
+
+
+@pytest.mark.parametrize("spread", [0.0, 3.0], ids=["sharp", "light spreads in the gel"])
+def test_any_presses_give_the_same_circles(spread: float) -> None:
+    """The skirt is not taken for a part of the contact, nor the reverse, whichever presses are used. (With a skirt
+    whose length and step are both free, circles were 3 % too large here, and 15 % too small where light spreads.)"""
+    sensor = HiddenSensor(3, spread=spread)
+    presses, empty, rng = sensor.presses(8), sensor.empty(), np.random.default_rng(0)
+    scales = []
+    for count in (3, 5, 8):
+        chosen = [presses[i] for i in rng.choice(8, count, replace=False)]
+        fit = calibrate_light(empty, named(chosen), BALL_PX)
+        ratios = [press.circle.radius / made.circle[2] for press, made in zip(fit.presses, chosen, strict=True)]
+        scales.append(float(np.mean(ratios)))
+        assert abs(scales[-1] - 1) < 0.015
+        assert fit.radius_uncertainty < 0.02
+    assert np.ptp(scales) < 0.01
 
 
 def test_forward_model_draws_an_unseen_press(sensor: HiddenSensor, calibrated: tuple[LightFit, list[Made]]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.light.circle import NoCircle, contact_circle, dent_slope
+from calibration.light.circle import NoCircle, contact_circle
 
 PITCH = 0.0625e-3
 
@@ -26,16 +26,6 @@ def test_the_circle_is_that_of_the_contact(
     assert (found.x, found.y) == pytest.approx(centre, abs=0.7)
     assert found.radius == pytest.approx(truth, abs=1.2)
     assert found.explained > 0.85
-
-
-def test_the_slope_is_the_balls_inside_meets_it_at_the_rim_and_dies_away() -> None:
-    r = np.array([0.5, 1.0 - 1e-9, 1.0 + 1e-9, 1.5, 20.0])
-    slope = dent_slope(r, 1.0, 3.0)
-    assert slope[0] == pytest.approx(0.5 / np.sqrt(9 - 0.25))
-    assert slope[1] == pytest.approx(slope[2], rel=1e-3)
-    assert slope[2] > slope[3] > slope[4]
-    # far away Hertz is a point force: u = 4 a^3 / (3 pi R r)
-    assert slope[4] * np.sqrt(9 - 1) == pytest.approx(4 / (3 * np.pi * 400), rel=0.01)
 
 
 def test_what_shows_no_ball_is_refused(press_image: Callable[..., Any]) -> None:

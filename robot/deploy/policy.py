@@ -7,6 +7,7 @@ from pathlib import Path
 from robot.deploy.onnx_policy import OnnxPolicy, misfits
 from robot.deploy.python_policy import PolicyNotFound as PolicyNotFound
 from robot.deploy.python_policy import policy_of_code
+from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.rig import require
@@ -16,7 +17,8 @@ from tacsim.tasks import Task
 def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: CanonicalGrid | None = None) -> Policy:
     """The policy called `name`, for a rig that delivers `spec` on this canonical grid (None: the usual one).
 
-    "scripted": the task's own. "grip": closes until it feels contact, on any rig. "path/to/file.onnx": a learned one.
+    "scripted": the task's own. "grip": closes until it feels contact, on any rig. "path/to/file.onnx": a learned one;
+    "learned": the shipped one of the task.
     "package.module:attribute": an object with needs, reset and __call__ as tacsim.Policy has them, a class of such
     objects (made without arguments), or a function from Observation to Action. Runs code of that module, so name only
     modules you trust; of an ONNX file nothing is run but its operators.
@@ -33,12 +35,25 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
         from tacsim.tasks.grip import Grip
 
         return Grip(spec)
+    if name == "learned":
+        return OnnxPolicy(_shipped(task), canonical or CanonicalGrid(), None if task is None else task.goal)
     if name.endswith(".onnx"):
         return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.goal)
     if ":" not in name:
-        allowed = "'scripted', 'grip', 'path/to/file.onnx', or 'package.module:attribute'"
+        allowed = "'scripted', 'grip', 'learned', 'path/to/file.onnx', or 'package.module:attribute'"
         raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}")
     return policy_of_code(name)
+
+
+def _shipped(task: Task | None) -> Path:
+    """The learned policy of a task that comes with tacsim."""
+    folder = config_root() / "policies"
+    path = folder / f"{'' if task is None else task.config.kind}.onnx"
+    if not path.is_file():
+        there = ", ".join(sorted(each.stem for each in folder.glob("*.onnx"))) or "(none)"
+        asked = "this rig has no task" if task is None else f"none is shipped for task '{task.config.kind}'"
+        raise PolicyNotFound(f"policy 'learned': {asked}; there are: {there}. Make one: tacsim train, or take 'scripted'")
+    return path
 
 
 def require_fit(rig: str, spec: RigSpec, policy: Policy, name: str, task: Task | None) -> None:

@@ -52,7 +52,9 @@ def _shipped(task: Task | None) -> Path:
     if not path.is_file():
         there = ", ".join(sorted(each.stem for each in folder.glob("*.onnx"))) or "(none)"
         asked = "this rig has no task" if task is None else f"none is shipped for task '{task.config.kind}'"
-        raise PolicyNotFound(f"policy 'learned': {asked}; there are: {there}. Make one: tacsim train, or take 'scripted'")
+        raise PolicyNotFound(
+            f"policy 'learned': {asked}; there are: {there}. Make one: tacsim train, or take 'scripted'"
+        )
     return path
 
 

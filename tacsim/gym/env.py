@@ -158,7 +158,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._truth_at_start = self._truth()
         self._effort = Effort(observation.arms)
         self._count, self.phase = 0, "running"
-        self._observation, self._teacher = observation, self.task.scripted(through=True)
+        self._observation, self._teacher = observation, self.task.teacher()
         self._flat: encode.Flat = self._view.begin(observation, self.task.goal)
 
     def _truth(self) -> Truth:
@@ -256,8 +256,10 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         return outcome.reward, info | dict(self.rig.diagnostics())
 
     def expert(self) -> NDArray[np.float32]:
-        """The action here of a teacher for those that learn: by the truth, or where the task knows none by that, of its
-        scripted policy. Zeros where no episode is running."""
+        """What a teacher does here: by the truth, or where the task knows no rule, its `teacher`.
+
+        Zeros where no episode is running.
+        """
         if self.phase != "running":
             return np.zeros(len(self.task.axes), np.float32)
         best = self.task.expert(self._truth(), self._truth_at_start)

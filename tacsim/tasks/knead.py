@@ -17,6 +17,8 @@ from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spre
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator
 
+OF_YIELD = 0.65  # best pressure of the scripted policy, over the yield stress: softer clay is rolled at less
+THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
 GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
 
 
@@ -99,6 +101,12 @@ class Knead:
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedKnead(self, through)
 
+    def teacher(self) -> Policy:
+        """As the scripted policy, but it knows how hard the clay is, and presses accordingly."""
+        body = self.config.scene.body
+        yields = None if body is None else body.material.yield_stress
+        return ScriptedKnead(self, False) if yields is None else ScriptedKnead(self, False, OF_YIELD * yields)
+
 
 class ScriptedKnead:
     """Rolls the body between the gels, a quarter turn to each side, at a light normal force: for a rod across its axis,
@@ -117,26 +125,25 @@ class ScriptedKnead:
         # The body turns by half of the sensor's way over its own radius.
         self._reach = 0.5 * np.pi * task.goal[2]
         self._start: FloatArray | None = None
-        self._way = 0.0
+        self._turns = 0  # how often it has turned, or passed the middle
 
     @property
     def needs(self) -> Needs:
         return Needs(BOTH, BOTH, height=True)
 
     def reset(self) -> None:
-        self._start, self._way = None, 0.0
+        self._start, self._turns = None, 0
 
     def __call__(self, observation: Observation) -> Action:
         lower, upper = observation.arms["lower"], observation.arms["upper"]
         if self._start is None:
             self._start = np.array(upper.pose.position)
         longest = self._task.config.max_step
-        self._way += 0.9 * longest
         force = -0.5 * float(lower.wrench[2] + upper.wrench[2])
         closer = float(np.clip(self.gain * (self._force - force), -longest, longest))
         if not self._through and estimated_height(observation) <= self._task.goal[2]:
             closer = -0.2 * longest
-        beside = np.clip(self._start[:2] + self._path() - upper.pose.position[:2], -longest, longest)
+        beside = self._beside(upper.pose.position[:2] - self._start[:2])
         return Action(
             {
                 "lower": Pose(lower.pose.position + [0.0, 0.0, closer], lower.pose.quaternion),
@@ -144,9 +151,16 @@ class ScriptedKnead:
             }
         )
 
-    def _path(self) -> FloatArray:
-        """(2,) where the upper sensor is now, from where it began [m]: to and fro through the middle."""
-        strokes, part = divmod(self._way / self._reach, 4.0)
-        there = part if part <= 1.0 else 2.0 - part if part <= 3.0 else part - 4.0
+    def _beside(self, now: FloatArray) -> FloatArray:
+        """(2,) step of the upper sensor, `now` so far beside where it began [m]: to one side, to the other, and through
+        the middle again."""
+        longest = self._task.config.max_step
+        while float(np.linalg.norm(left := self._aim() - now)) < THERE * longest:
+            self._turns += 1
+        return left * min(1.0, 0.9 * longest / float(np.linalg.norm(left)))
+
+    def _aim(self) -> FloatArray:
+        """(2,) where it goes, from where it began [m]."""
+        strokes, part = divmod(self._turns, 3)
         turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * strokes
-        return self._reach * there * np.array([np.cos(turn), np.sin(turn)])
+        return self._reach * (1.0, -1.0, 0.0)[part] * np.array([np.cos(turn), np.sin(turn)])

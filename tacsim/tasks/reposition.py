@@ -68,6 +68,9 @@ class Reposition:
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedReposition(self.config, through)
 
+    def teacher(self) -> Policy:
+        return self.scripted()
+
 
 class ScriptedReposition:
     """Moves the upper sensor at half of max_step until the estimated position of the body is the goal, then holds.

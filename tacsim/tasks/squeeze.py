@@ -64,6 +64,9 @@ class Squeeze:
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedSqueeze(self.config, through)
 
+    def teacher(self) -> Policy:
+        return self.scripted()
+
 
 class ScriptedSqueeze:
     """Closes both sensors alike at half of max_step until the estimated height of the body is the goal, then holds.

@@ -65,6 +65,10 @@ class Task(Protocol):
         """A policy that reaches the goal by touch alone, then holds; with `through` it moves on past the goal."""
         ...
 
+    def teacher(self) -> Policy:
+        """A policy that may know what only a simulation does: shows what to do where `expert` knows no rule."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:

@@ -42,7 +42,7 @@ def run(
     policy: Annotated[
         str | None,
         typer.Option(
-            help="scripted, grip, a learned one (FILE.onnx), or package.module:name.",
+            help="scripted, grip, learned (the shipped one), FILE.onnx, or package.module:name.",
             show_default="scripted; grip without a task",
         ),
     ] = None,

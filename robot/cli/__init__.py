@@ -15,12 +15,13 @@ from robot.cli.calibrate.sensor import calibrate
 from robot.cli.compare import compare
 from robot.cli.debug import debug
 from robot.cli.doctor import doctor, schema
+from robot.cli.episode.lerobot import lerobot
+from robot.cli.episode.recover import recover
 from robot.cli.errors import Guarded
 from robot.cli.learn.evaluate import evaluate
 from robot.cli.learn.export import export, policy
 from robot.cli.learn.train import train
 from robot.cli.mock import mock
-from robot.cli.recover import recover
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce
 from robot.cli.start import start
@@ -40,7 +41,7 @@ app.add_typer(export, name="export")
 COMMANDS = {
     app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor, start, train, evaluate),
     calibrate: (latency, lens, touch, hand_eye),
-    export: (policy,),
+    export: (policy, lerobot),
 }
 for group, commands in COMMANDS.items():
     for command in commands:

@@ -9,10 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibration.errors import error_context
-from calibration.normaliser import FrameNormaliser, normaliser_for_recording, normaliser_for_simulation
+from calibration.normaliser import (
+    FrameNormaliser,
+    normaliser_for_camera,
+    normaliser_for_recording,
+    normaliser_for_simulation,
+)
 from robot.rig import RIG_ATTACHMENT, CannotOpen
 from tacsim.config import load_rig
 from tacsim.interface import Arm, Normaliser, TactileFrame
+from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
@@ -52,7 +58,7 @@ def open_replay(config: RigConfig) -> Rig:
             sensors[name] = source = ReplaySensor(sensor, name, clock)
             stack.callback(source.close)
             with error_context(f"sensors.{name}"):
-                normaliser = _replay_normaliser(sensor, name, source.spec.image_shape, config.canonical)
+                normaliser = recorded_normaliser(sensor, name, source.spec.image_shape, config.canonical)
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
@@ -83,18 +89,22 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float
     return periods[shortest]
 
 
-def _replay_normaliser(
+def recorded_normaliser(
     config: ReplaySensorConfig, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
 ) -> FrameNormaliser:
-    """By the corners of the rig file; without them by what an episode says of its own sensor."""
-    original = None if config.corners is not None else _recorded_rig(Path(config.source or ""))
+    """By the corners or the calibration of the rig file; without them by what an episode says of its own sensor."""
+    own = config.corners is None and config.calibration is None
+    original = recorded_rig(Path(config.source or "")) if own else None
     sensor = None if original is None else original.sensors.get(name)
     if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
         return normaliser_for_simulation(sensor.model, original.scene.gel.size[:2], grid)
+    if original is not None and isinstance(sensor, CameraSensorConfig):
+        gel = sensor.size if original.scene is None else original.scene.gel.size[:2]
+        return normaliser_for_camera(sensor, gel, grid)
     return normaliser_for_recording(sensor if isinstance(sensor, ReplaySensorConfig) else config, image_shape, grid)
 
 
-def _recorded_rig(source: Path) -> RigConfig | None:
+def recorded_rig(source: Path) -> RigConfig | None:
     """The rig that an episode was recorded with; None where it is not known."""
     if source.suffix.lower() not in EPISODES:
         return None

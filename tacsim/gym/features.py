@@ -169,7 +169,7 @@ class FeatureEncoder:
                 np.concatenate([a.wrench[:3] / SCALES["force"], a.wrench[3:] / SCALES["torque"]]) for a in arms.values()
             ]
         elif quantity == "moved":
-            each = [_moved(se3.relative(self._start[name], arm.pose)) for name, arm in arms.items()]
+            each = [moved(self._start[name], arm.pose) for name, arm in arms.items()]
         else:
             first, *others = arms.values()
             each = [se3.relative(first.pose, arm.pose).position / SCALES["between"] for arm in others]
@@ -268,6 +268,7 @@ def _depths(touch: TactileObservation) -> FloatArray:
     return np.array([greatest, mean])
 
 
-def _moved(pose: Pose) -> FloatArray:
-    """(9,) of the pose relative to that at reset."""
-    return np.concatenate([pose.position / SCALES["moved"], (se3.two_columns(pose) - _UNTURNED) / SCALES["turn"]])
+def moved(start: Pose, pose: Pose) -> FloatArray:
+    """(9,) where an arm is, seen from where it was at reset, encoded: position, and two columns of the rotation."""
+    away = se3.relative(start, pose)
+    return np.concatenate([away.position / SCALES["moved"], (se3.two_columns(away) - _UNTURNED) / SCALES["turn"]])

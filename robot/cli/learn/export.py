@@ -1,4 +1,4 @@
-"""`tacsim export`: what was learned, as a file for a rig."""
+"""`tacsim export policy`: what was learned, as a file for a rig."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 from robot.cli.learn.train import require_torch
 from robot.cli.output import busy, results
 
-export = typer.Typer(no_args_is_help=True, help="Write what was learned as a file for a rig.")
+export = typer.Typer(no_args_is_help=True, help="Write policies and recordings as files for others.")
 
 
 def policy(

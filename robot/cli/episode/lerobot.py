@@ -1,0 +1,38 @@
+"""`tacsim export lerobot`: recorded episodes as a LeRobot data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from robot.cli.output import busy, counted, new_directory, notes, say_files, writing
+
+
+def lerobot(
+    episodes: Annotated[list[Path], typer.Argument(help="Recordings (episode.mcap), in the order they shall have.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="New folder of the data set.")],
+    task: Annotated[
+        str | None,
+        typer.Option(metavar="TEXT", help="The task in words.", show_default="made of each episode's task and goal"),
+    ] = None,
+    maps: Annotated[
+        bool, typer.Option("--maps/--no-maps", help="With heights, gradients and flow; without, it loads faster.")
+    ] = True,
+    cut: Annotated[bool, typer.Option("--cut", help="Take recordings that were cut off, up to there.")] = False,
+) -> None:
+    """Make a LeRobot data set (v3.0) of recorded episodes; for lerobot-train, Hugging Face datasets, pandas.
+
+    Pictures are PNG inside the files, without loss. Needs the extra 'export'.
+
+    Example: tacsim export lerobot runs/*/episode.mcap --out data/squeeze
+    """
+    folder = new_directory(out, "lerobot")
+    with busy("loading"):
+        from robot.export.lerobot import export_lerobot
+
+    with counted("exporting") as on_step, writing(folder.parent):
+        export_lerobot(episodes, folder, task=task, maps=maps, cut=cut, on_step=on_step)
+    notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")', markup=False)
+    say_files(folder)

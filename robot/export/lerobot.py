@@ -1,0 +1,201 @@
+"""Episodes -> a LeRobot data set."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.export.lerobot_files import Column, DataSet, write_json
+from robot.export.lerobot_mapping import (
+    IMAGE,
+    Feature,
+    LeRobotMapping,
+    Row,
+    frames_per_second,
+    outcome,
+    task_in_words,
+)
+from robot.export.statistics import ImageCounts, Statistics
+from robot.rig.recorded import ObservedEpisode, observe_episode
+from tacsim.interface import IncompatibleRig
+from tacsim.record.episode import EpisodeError
+from tacsim.record.images import encode_png
+
+OnStep = Callable[[int, int], None]
+
+
+def export_lerobot(
+    paths: Sequence[Path],
+    folder: Path,
+    *,
+    task: str | None = None,
+    maps: bool = True,
+    cut: bool = False,
+    on_step: OnStep = lambda done, total: None,
+) -> None:
+    """Writes the episodes, in this order, into a new folder: all of it, or nothing.
+
+    An episode of n + 1 steps has n frames: what was observed after step k, and the action of step k + 1. One episode
+    at a time is in memory.
+
+    Args:
+        task: in words, for policies that read them; None: made of the task and goal of each episode.
+        maps: with heights, gradients and flow.
+        cut: take recordings that were cut off, up to there.
+        on_step: told (steps done, steps in all).
+
+    Raises ValueError for episodes that make no data set, EpisodeError, OSError, and what normalising raises.
+    """
+    if util.find_spec("pyarrow") is None:
+        raise ValueError("data sets are written by pyarrow, which is not installed: pip install 'tacsim[export]'")
+    episodes = [observe_episode(path) for path in paths]
+    fps = _check(episodes, cut)
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial.mkdir()
+    try:
+        _write(episodes, partial, fps, task, maps, on_step)
+        partial.rename(folder)  # onto an empty folder, or nothing: onto another it fails
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _check(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
+    """Frames per second of all of them. Raises ValueError for what can be known before anything is written."""
+    if not episodes:
+        raise ValueError("no episode to export")
+    first = episodes[0]
+    for each in episodes:
+        episode, spec = each.episode, each.episode.meta.spec
+        if not episode.complete and not cut:
+            raise ValueError(
+                f"{each.path} was cut off after {len(episode.steps)} steps: leave it out, or take what is there (--cut)"
+            )
+        if len(episode.steps) < 2:
+            raise ValueError(f"{each.path} has no action: at least two steps are needed, it has {len(episode.steps)}")
+        if episode.dropped or episode.steps[-1].index != len(episode.steps) - 1:
+            raise ValueError(
+                f"{each.path}: the recorder dropped steps, so its frames do not follow each other evenly; leave it out"
+            )
+        if abs(spec.period - first.episode.meta.spec.period) > 1e-3 * first.episode.meta.spec.period:
+            raise ValueError(
+                f"a data set has one rate, but {first.path} has a step every {first.episode.meta.spec.period:g} s and "
+                f"{each.path} every {spec.period:g} s; make one data set of each"
+            )
+        if each.canonical != first.canonical:
+            raise ValueError(f"{first.path} and {each.path} differ in their canonical grids; make one data set of each")
+        try:
+            LeRobotMapping(spec, each.canonical)
+        except IncompatibleRig as unfit:
+            raise ValueError(f"{each.path}: {unfit}") from None
+    return frames_per_second(first.episode.meta.spec.period)
+
+
+def _write(
+    episodes: Sequence[ObservedEpisode], folder: Path, fps: float, task: str | None, maps: bool, on_step: OnStep
+) -> None:
+    total, done = sum(len(each.episode.steps) for each in episodes), 0
+    data: DataSet | None = None
+    features: dict[str, Feature] = {}
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        on_step(done, total)
+
+    for each in episodes:
+        meta = each.episode.meta
+        mapping = LeRobotMapping(meta.spec, each.canonical, maps=maps)
+        found, columns, images = _columns(each, mapping, count)
+        if data is None:
+            features, data = found, DataSet(folder, fps, meta.rig, found)
+            write_json(folder / "meta" / "tacsim.json", _about(episodes, mapping))
+        elif found != features:
+            raise ValueError(f"{episodes[0].path} and {each.path} do not fit together: {_difference(features, found)}")
+        data.add(columns, images, task_in_words(meta) if task is None else task)
+    assert data is not None
+    data.close()
+
+
+def _columns(
+    each: ObservedEpisode, mapping: LeRobotMapping, count: Callable[[], None]
+) -> tuple[dict[str, Feature], dict[str, Column], dict[str, Statistics]]:
+    """The features, columns, and statistics of the pictures of one episode."""
+    features: dict[str, Feature] = {}
+    rows: list[Row] = []
+    pictures: dict[str, list[bytes]] = {}
+    counts: dict[str, ImageCounts] = {}
+    before: Row | None = None
+    last = each.episode.steps[-1].index
+    for step, observation in each.steps():
+        if before is not None:
+            if step.action is None:
+                raise EpisodeError(f"{each.path}: step {step.index} has no action")
+            row = before | {"action": mapping.acted(step.action)} | outcome(step, step.index == last)
+            found = mapping.features(row)
+            features = features or found
+            if found != features:
+                raise ValueError(
+                    f"{each.path}: step {step.index} is unlike those before: {_difference(features, found)}"
+                )
+            for name in [key for key in row if key.startswith(IMAGE)]:
+                picture: NDArray[np.uint8] = row.pop(name)
+                pictures.setdefault(name, []).append(encode_png(picture))
+                counts.setdefault(name, ImageCounts()).add(picture)
+            rows.append(row)
+        try:
+            before = mapping.begin(observation) if before is None else mapping.observed(observation)
+        except IncompatibleRig as unfit:
+            what = f"{each.path}: step {step.index} lacks what the recording says it has: {unfit}"
+            raise EpisodeError(what) from None
+        count()
+    columns: dict[str, Column] = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+    for key, column in columns.items():
+        if not np.isfinite(column).all():
+            raise ValueError(f"{each.path}: {key} holds numbers that are not finite")
+    return features, columns | pictures, {key: found.statistics() for key, found in counts.items()}
+
+
+def _difference(first: dict[str, Feature], second: dict[str, Feature]) -> str:
+    """The first difference, in words."""
+    for name in (*first, *second):
+        if first.get(name) != second.get(name):
+            a, b = (_shown(each.get(name)) for each in (first, second))
+            return f"{name} is {a} in the one and {b} in the other"
+    return "nothing"
+
+
+def _shown(feature: Feature | None) -> str:
+    return "missing" if feature is None else f"{feature.dtype} {feature.shape}"
+
+
+def _about(episodes: Sequence[ObservedEpisode], mapping: LeRobotMapping) -> dict[str, Any]:
+    """What LeRobot has no place for: the scale of each number, and where the episodes are from."""
+    numbers = {"observation.state": mapping.state, "action": mapping.action}
+    return {
+        "scales": {key: dict(zip(each.names, each.scales, strict=True)) for key, each in numbers.items()},
+        "units": "a number times its scale is in SI units; height and flow are in m",
+        "canonical": episodes[0].canonical.model_dump(mode="json"),
+        "episodes": [
+            {
+                "source": each.path.name,
+                "rig": each.episode.meta.rig,
+                "task": each.episode.meta.task,
+                "goal": each.episode.meta.goal,
+                "policy": each.episode.meta.policy,
+                "seed": each.episode.meta.seed,
+                "complete": each.episode.complete,
+                "started": None if each.episode.meta.started is None else each.episode.meta.started.isoformat(),
+                "versions": dict(each.episode.meta.versions),
+            }
+            for each in episodes
+        ],
+    }

@@ -1,0 +1,247 @@
+"""The files of a LeRobot data set, v3.0, written by pyarrow alone.
+
+Format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, and where it differs from that page, LeRobot 0.6.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.export.lerobot_mapping import Feature
+from robot.export.statistics import Statistics, column_statistics, merged
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+VERSION = "v3.0"
+CHUNK = 1000  # files in a folder
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+FILE_SIZE = 100  # [MB] at which a file is followed by another
+EPISODES_AT_ONCE = 100  # rows that meta/episodes gathers into one row group
+COUNTERS = {name: Feature("int64", (1,), None) for name in ("frame_index", "episode_index", "index", "task_index")}
+OWN = {"timestamp": Feature("float32", (1,), None), **COUNTERS}  # columns that every data set has
+Column = NDArray[Any] | Sequence[bytes]  # (frames, ...), or PNG pictures
+
+
+class DataSet:
+    """A data set in the making, in a folder of its own. `close` makes it whole.
+
+    Args:
+        folder: exists, and is empty.
+        features: of the columns, without LeRobot's own (`OWN`).
+        file_size: [MB] at which a file is followed by another.
+
+    Raises OSError.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        fps: float,
+        robot: str,
+        features: Mapping[str, Feature],
+        *,
+        file_size: float = FILE_SIZE,
+    ) -> None:
+        self._folder, self._fps, self._robot, self._file_size = folder, fps, robot, file_size
+        self._features = {**features, **OWN}
+        self._tasks: list[str] = []
+        self._rows: list[dict[str, Any]] = []  # of meta/episodes, not yet written
+        self._statistics: list[dict[str, Statistics]] = []
+        self._episodes = self._frames = 0
+        self._data = _Files(folder / "data", file_size)
+        self._meta = _Files(folder / "meta" / "episodes", file_size)
+
+    def add(self, columns: Mapping[str, Column], images: Mapping[str, Statistics], task: str) -> None:
+        """One episode: its columns, and the statistics of its pictures by column."""
+        count = len(next(iter(columns.values())))
+        if task not in self._tasks:
+            self._tasks.append(task)
+        frame = np.arange(count)
+        own: dict[str, Column] = {
+            "timestamp": (frame / self._fps).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": np.full(count, self._episodes),
+            "index": self._frames + frame,
+            "task_index": np.full(count, self._tasks.index(task)),
+        }
+        whole = {**columns, **{name: np.asarray(each)[:, None] for name, each in own.items()}}
+        statistics = {
+            name: images[name] if feature.dtype == "image" else column_statistics(np.asarray(whole[name]))
+            for name, feature in self._features.items()
+        }
+        chunk, file = self._data.write(_table(self._features, whole), count)
+        self._rows.append(
+            {
+                "episode_index": self._episodes,
+                "tasks": [task],
+                "length": count,
+                "data/chunk_index": chunk,
+                "data/file_index": file,
+                "dataset_from_index": self._frames,
+                "dataset_to_index": self._frames + count,
+                **{f"stats/{name}/{key}": v.tolist() for name, each in statistics.items() for key, v in each.items()},
+            }
+        )
+        self._statistics.append(statistics)
+        self._episodes, self._frames = self._episodes + 1, self._frames + count
+        if len(self._rows) == EPISODES_AT_ONCE:
+            self._write_rows()
+
+    def close(self) -> None:
+        """Writes what belongs to the whole."""
+        if self._rows:
+            self._write_rows()
+        self._data.close()
+        self._meta.close()
+        _write_tasks(self._folder / "meta" / "tasks.parquet", self._tasks)
+        statistics = {name: merged([each[name] for each in self._statistics]) for name in self._features}
+        texts = {name: {key: value.tolist() for key, value in each.items()} for name, each in statistics.items()}
+        write_json(self._folder / "meta" / "stats.json", texts)
+        write_json(self._folder / "meta" / "info.json", self._info())
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "codebase_version": VERSION,
+            "robot_type": self._robot,
+            "fps": self._fps,
+            "total_episodes": self._episodes,
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": CHUNK,
+            "data_files_size_in_mb": self._file_size,
+            "video_files_size_in_mb": 200,
+            "splits": {"train": f"0:{self._episodes}"},
+            "data_path": f"data/{FILE}",
+            "video_path": None,
+            "features": {
+                name: {"dtype": each.dtype, "shape": list(each.shape), "names": each.names and list(each.names)}
+                for name, each in self._features.items()
+            },
+        }
+
+    def _write_rows(self) -> None:
+        import pyarrow as pa
+
+        table = pa.Table.from_pylist(self._rows)
+        chunk, file = self._meta.place(table.num_rows)
+        for name, value in (("chunk_index", chunk), ("file_index", file)):
+            table = table.append_column(f"meta/episodes/{name}", pa.array([value] * table.num_rows, pa.int64()))
+        self._meta.write(table, table.num_rows)
+        self._rows = []
+
+
+@dataclass(slots=True)
+class _Files:
+    """Parquet files of one kind. A table is one row group; a file that would grow beyond its size with the next is
+    followed by another."""
+
+    folder: Path
+    size: float  # [MB]
+    _number: int = 0  # of the file, over all chunks
+    _count: int = 0  # rows in it
+    _path: Path | None = None
+    _writer: Any = field(default=None)
+
+    def place(self, count: int) -> tuple[int, int]:
+        """Chunk and file of the next `count` rows. Begins a new file where they would not fit."""
+        if self._path is not None and self._count:
+            used = self._path.stat().st_size / 2**20
+            if used * (1 + count / self._count) >= self.size:
+                self.close()
+                self._number, self._count, self._path = self._number + 1, 0, None
+        return divmod(self._number, CHUNK)
+
+    def write(self, table: pa.Table, count: int) -> tuple[int, int]:
+        """Returns the chunk and the file that took it."""
+        from pyarrow import parquet
+
+        chunk, file = self.place(count)
+        if self._path is None:
+            self._path = self.folder / FILE.format(chunk_index=chunk, file_index=file)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            # Numbers of touch repeat nowhere, so a dictionary of them only takes room; pictures are PNG already.
+            self._writer = parquet.ParquetWriter(self._path, table.schema, compression="zstd", use_dictionary=False)
+        self._writer.write_table(table, row_group_size=max(count, 1))
+        self._count += count
+        return chunk, file
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+def _table(features: Mapping[str, Feature], columns: Mapping[str, Column]) -> pa.Table:
+    """With the types that Hugging Face's `datasets` expects, and what tells it of them."""
+    import pyarrow as pa
+
+    arrays = [_array(feature, columns[name]) for name, feature in features.items()]
+    told = {"info": {"features": {name: _told(feature) for name, feature in features.items()}}}
+    schema = pa.schema(
+        [pa.field(name, array.type) for name, array in zip(features, arrays, strict=True)],
+        metadata={"huggingface": json.dumps(told)},
+    )
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _array(feature: Feature, column: Column) -> pa.Array:
+    import pyarrow as pa
+
+    if feature.dtype == "image":
+        data = pa.array(column, pa.binary())
+        return pa.StructArray.from_arrays([data, pa.nulls(len(data), pa.string())], ["bytes", "path"])
+    numbers = np.ascontiguousarray(column)
+    array = pa.array(numbers.ravel())
+    if feature.shape == (1,):
+        return array
+    if len(feature.shape) == 1:
+        return pa.FixedSizeListArray.from_arrays(array, feature.shape[0])
+    for side in reversed(feature.shape):  # `datasets` keeps maps as lists of lists
+        array = pa.ListArray.from_arrays(np.arange(0, len(array) + 1, side, dtype=np.int32), array)
+    return array
+
+
+def _told(feature: Feature) -> dict[str, Any]:
+    """The feature in the words of `datasets`."""
+    if feature.dtype == "image":
+        return {"_type": "Image"}
+    number = {"dtype": feature.dtype, "_type": "Value"}
+    if feature.shape == (1,):
+        return number
+    if len(feature.shape) == 1:
+        return {"feature": number, "length": feature.shape[0], "_type": "List"}
+    return {"shape": list(feature.shape), "dtype": feature.dtype, "_type": f"Array{len(feature.shape)}D"}
+
+
+def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
+    """LeRobot reads this file with pandas, and wants `task` as its index."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    told = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+            for name, (kind, numpy) in types.items()
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }
+    schema = pa.schema([("task_index", pa.int64()), ("task", pa.string())], metadata={"pandas": json.dumps(told)})
+    parquet.write_table(pa.table([list(range(len(tasks))), list(tasks)], schema=schema), path)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Raises OSError; ValueError for a number that JSON does not have."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value, indent=4, allow_nan=False) + "\n", encoding="utf-8")

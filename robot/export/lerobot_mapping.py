@@ -1,0 +1,156 @@
+"""What an episode is called in LeRobot: the one place that knows its names.
+
+| feature                         | what                                                               |
+|---------------------------------|--------------------------------------------------------------------|
+| `observation.state`             | (n,) f32: poses relative to reset, wrenches, low-dimensional touch |
+| `observation.images.{sensor}`   | (H, W, 3) u8: the canonical picture                                |
+| `observation.height.{sensor}`   | (h, w) f32 [m], where it is known                                  |
+| `observation.gradient.{sensor}` | (h, w, 2) f32 [-], where it is known                               |
+| `observation.flow.{sensor}`     | (m, n, 2) f32 [m], of sensors with markers                         |
+| `action`                        | (9 arms,) f32: where each arm is asked to be, relative to reset    |
+| `next.reward`, `next.done`      | of the step that the action led to                                 |
+
+Numbers of `observation.state` and `action` are those of `tacsim.FeatureEncoder`: SI values over the scale of their
+quantity (`tacsim.gym.features.SCALES`). A pose is (9,): position, and what the first two columns of its rotation differ
+from those of no rotation. Policies such as ACT read the state, the images and the action, and leave the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, moved
+from tacsim.interface import Action, IncompatibleRig, Observation, Pose, RigSpec
+from tacsim.models.features import Features, Numbers, Quantity
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.record.episode import EpisodeMeta, Step
+
+Row = dict[str, NDArray[Any]]
+
+STATE, ACTION, REWARD, DONE = "observation.state", "action", "next.reward", "next.done"
+IMAGE = "observation.images."
+MAPS = {"height": "observation.height.", "gradient": "observation.gradient.", "flow": "observation.flow."}
+MAP_AXES = ("rows", "columns", "xy")
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """One column: kind of its numbers ("image": PNG in the file, uint8 here), shape, and names along its first axis
+    (of an image or a map: of its axes)."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None
+
+
+class LeRobotMapping:
+    """Observations and actions of a rig as LeRobot's features. It remembers the episode's start and where the arms were
+    last asked to go: `begin` it with the first observation of each episode.
+
+    maps: with heights, gradients and flow.
+    Raises IncompatibleRig for a rig without a sensor or an arm, or with a name that LeRobot does not allow.
+    """
+
+    def __init__(self, spec: RigSpec, canonical: CanonicalGrid, *, maps: bool = True) -> None:
+        for kind, names in (("sensor", tuple(spec.sensors)), ("arm", spec.arms)):
+            if not names:
+                raise IncompatibleRig(f"no {kind}: LeRobot's policies learn from pictures and actions of arms")
+            for name in names:
+                if "/" in name:
+                    raise IncompatibleRig(f"{kind} '{name}': LeRobot allows no '/' in names; rename it in the rig file")
+        self._maps = maps
+        self._encoder = FeatureEncoder(_seen(spec), canonical)
+        self._start: dict[str, Pose] = {}
+        self._asked: dict[str, Pose] = {}
+
+    @property
+    def state(self) -> Numbers:
+        """What the numbers of `observation.state` are."""
+        return self._encoder.inputs["touch"]
+
+    @property
+    def action(self) -> Numbers:
+        """What the numbers of `action` are."""
+        parts = [(f"{part}_{arm}", SCALES[kind]) for arm in self._encoder.features.arms for part, kind in _POSE]
+        return Numbers(names=tuple(name for name, _ in parts), scales=tuple(scale for _, scale in parts))
+
+    def begin(self, observation: Observation) -> Row:
+        """The first observation of an episode."""
+        self._start = {arm: observation.arms[arm].pose for arm in self._encoder.features.arms}
+        self._asked = dict(self._start)
+        return self._row(observation, self._encoder.begin(observation)["touch"])
+
+    def observed(self, observation: Observation) -> Row:
+        """Each later observation."""
+        return self._row(observation, self._encoder(observation)["touch"])
+
+    def acted(self, action: Action) -> NDArray[np.float32]:
+        """(9 arms,) where the arms are asked to be; one that holds is asked for the same once more."""
+        for arm in self._asked:
+            target = action.tool.get(arm)
+            if target is not None:
+                self._asked[arm] = target
+        poses = [moved(self._start[arm], pose) for arm, pose in self._asked.items()]
+        return np.concatenate(poses).astype(np.float32)
+
+    def features(self, row: Mapping[str, NDArray[Any]]) -> dict[str, Feature]:
+        """Of the columns of `row`, one of this rig's."""
+        return {key: self._feature(key, value) for key, value in row.items()}
+
+    def _feature(self, key: str, value: NDArray[Any]) -> Feature:
+        if key.startswith(IMAGE):
+            return Feature("image", value.shape, ("height", "width", "channels"))
+        names = {STATE: self.state.names, ACTION: self.action.names}.get(key)
+        return Feature(value.dtype.name, value.shape, MAP_AXES[: value.ndim] if value.ndim > 1 else names)
+
+    def _row(self, observation: Observation, state: NDArray[Any]) -> Row:
+        row: Row = {STATE: state}
+        row |= {IMAGE + name: touch.image for name, touch in observation.tactile.items()}
+        for kind, key in MAPS.items() if self._maps else ():
+            found = {key + name: getattr(touch, kind) for name, touch in observation.tactile.items()}
+            row |= {name: value for name, value in found.items() if value is not None}
+        return row
+
+
+_POSE = tuple(PARTS["moved"].items())
+
+
+def _seen(spec: RigSpec) -> Features:
+    """What each sensor delivers, and all arms."""
+    sensors = spec.sensors.values()
+    touch: list[Quantity] = ["moved", "wrench"]
+    touch += ["between"] if len(spec.arms) > 1 else []
+    touch += ["area"]
+    touch += ["depth", "centroid"] if all(sensor.height for sensor in sensors) else []
+    touch += ["shear"] if all(sensor.flow for sensor in sensors) else []
+    return Features(sensors=tuple(spec.sensors), arms=spec.arms, maps=(), touch=tuple(touch), goal=False)
+
+
+def outcome(step: Step, last: bool) -> Row:
+    """What followed an action: reward, where the episode has one, and whether the episode ended with it."""
+    row: Row = {} if step.reward is None else {REWARD: np.array([step.reward], np.float32)}
+    return row | {DONE: np.array([last])}
+
+
+def frames_per_second(period: float) -> int | float:
+    """Of a control period [s]: LeRobot wants a whole number, and gets it where there is one within a thousandth."""
+    rate = 1.0 / period
+    return round(rate) if abs(rate - round(rate)) <= 1e-3 * rate else rate
+
+
+def task_in_words(meta: EpisodeMeta) -> str:
+    """What policies that read language are told."""
+    goal = () if meta.goal is None else meta.goal if isinstance(meta.goal, tuple) else (meta.goal,)
+    sizes = [f"{1e3 * size:g} mm" for size in goal]
+    if meta.task == "squeeze" and len(sizes) == 1:
+        return f"squeeze the body to a height of {sizes[0]}"
+    if meta.task == "reposition" and len(sizes) == 2:
+        return f"move the body by {sizes[0]} in x and {sizes[1]} in y"
+    if meta.task == "knead" and len(sizes) == 3:
+        return f"knead the body to a size of {sizes[0]} by {sizes[1]} by {sizes[2]}"
+    return meta.task or "touch the body"

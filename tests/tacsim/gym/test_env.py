@@ -202,3 +202,35 @@ def test_environments_are_registered_once() -> None:
     register_envs()
     for name, task in ENVIRONMENTS.items():
         assert gymnasium.spec(name).kwargs == {"task": task}
+
+
+def test_any_policy_acts_as_an_environment_s_action(open_springs: Any) -> None:
+    """What it asks of the arms is where the step takes them, as float32 can say it."""
+    from tacsim.tasks.action import action_from
+
+    env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
+    env.reset(seed=3)
+    policy = env.task.scripted()
+    for _ in range(2):
+        wanted = policy(env._observation).tool
+        policy.reset()
+        vector = env.ask(policy)
+        policy.reset()
+        asked = action_from(vector, env.task.axes, env.task.config.max_step, env._targets).tool
+        for arm, pose in wanted.items():
+            now = asked[arm]
+            assert pose is not None and now is not None
+            assert np.abs(pose.position - now.position).max() < 1e-9
+        env.step(vector)
+
+
+def test_the_expert_is_the_tasks_by_the_truth_and_holds_where_nothing_runs(open_springs: Any) -> None:
+    env = TacsimEnv(open_springs("squeeze"), make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3)))
+    env.reset(seed=3)
+    best = env.task.expert(env._truth(), env._truth_at_start)
+    assert best is not None
+    assert env.expert().tolist() == best.astype(np.float32).tolist()
+    for _ in range(env.task.config.steps):
+        env.step(env.expert())
+    assert env.phase == "over"
+    assert env.expert().tolist() == [0.0, 0.0]

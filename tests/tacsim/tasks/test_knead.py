@@ -13,9 +13,10 @@ from robot.open import open_rig
 from tacsim.config import load_rig
 from tacsim.interface import FloatArray, Truth
 from tacsim.models.rig import KneadConfig
-from tacsim.models.scene import Body, Box, Indenter, Scene
+from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene
 from tacsim.tasks import judge, make_task
 from tacsim.tasks.action import action_from
+from tacsim.tasks.knead import Knead, ScriptedKnead
 
 QUICK = [
     "scene.preset=learn",
@@ -106,6 +107,31 @@ def test_the_scripted_policy_kneads_where_a_random_one_does_not(overrides: tuple
     assert len(true) > 15
     assert np.sqrt(np.mean((true - felt) ** 2)) < 0.1e-3
     assert spearmanr(true, felt)[0] > 0.6
+
+
+def test_the_scripted_policy_turns_where_the_sensor_stands_not_by_the_clock() -> None:
+    """An arm that does half of what it is asked turns a quarter turn of the rod to each side all the same."""
+    task = make_task(config())
+    assert isinstance(task, Knead)
+    diameter = task.goal[2]
+    for share in (1.0, 0.5):
+        policy, now, way = ScriptedKnead(task, True), np.zeros(2), []
+        for _ in range(int(300 / share)):
+            step = policy._beside(now)
+            assert np.linalg.norm(step) <= 0.9 * task.config.max_step + 1e-12
+            now = now + share * step
+            way.append(now.copy())
+        assert np.ptp(way, axis=0) == pytest.approx([0, np.pi * diameter], abs=2 * 0.2 * task.config.max_step)
+
+
+def test_the_teacher_presses_as_the_clay_can_bear() -> None:
+    """0.65 of the yield stress over the face of a cube of the body's volume, here 8 mm; elastic: as the scripted."""
+    for yields, newtons in ((10e3, 0.65 * 10e3 * 64e-6), (None, 12e3 * 64e-6)):
+        material = BodyMaterial(yield_stress=yields)
+        body = Body(geometry=Box(size=(8e-3, 8e-3, 8e-3)), material=material)
+        teacher = make_task(KneadConfig(kind="knead", scene=Scene(body=body))).teacher()
+        assert isinstance(teacher, ScriptedKnead)
+        assert teacher._force == pytest.approx(newtons)
 
 
 def test_its_environment_measures_at_the_end() -> None:

@@ -18,6 +18,7 @@ from robot.cli.doctor import doctor, schema
 from robot.cli.episode.lerobot import lerobot
 from robot.cli.episode.recover import recover
 from robot.cli.errors import Guarded
+from robot.cli.identify import body, gel, identify
 from robot.cli.learn.evaluate import evaluate
 from robot.cli.learn.export import export, policy
 from robot.cli.learn.train import train
@@ -38,10 +39,12 @@ app = typer.Typer(
 )
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(export, name="export")
+app.add_typer(identify, name="identify")
 COMMANDS = {
     app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor, start, train, evaluate),
     calibrate: (latency, lens, touch, hand_eye),
     export: (policy, lerobot),
+    identify: (gel, body),
 }
 for group, commands in COMMANDS.items():
     for command in commands:

@@ -33,7 +33,7 @@ WITHOUT_TASK = 40  # steps where neither a task nor a recording has an end
 
 def run(
     rig: Annotated[
-        str, typer.Argument(help="A rig (sim, mock, ur5e, ur5e-one, replay), or the path of its file.")
+        str, typer.Argument(help="A rig (sim, press, mock, ur5e, ur5e-one, replay), or the path of its file.")
     ] = "sim",
     task: Annotated[
         str | None,
@@ -42,7 +42,7 @@ def run(
     policy: Annotated[
         str | None,
         typer.Option(
-            help="scripted, grip, learned (the shipped one), FILE.onnx, or package.module:name.",
+            help="scripted, grip, learned (the shipped one), FILE.onnx, a motion (FILE.csv), or package.module:name.",
             show_default="scripted; grip without a task",
         ),
     ] = None,

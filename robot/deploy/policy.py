@@ -1,4 +1,5 @@
-"""Policies by name: the scripted one of a task, `grip`, a learned one in an ONNX file, or a person's Python code."""
+"""Policies by name: the scripted one of a task, `grip`, a learned one in an ONNX file, a motion in a CSV
+file, or a person's Python code."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from pathlib import Path
 from robot.deploy.onnx_policy import OnnxPolicy, misfits
 from robot.deploy.python_policy import PolicyNotFound as PolicyNotFound
 from robot.deploy.python_policy import policy_of_code
+from robot.deploy.target_script import TargetScript
 from tacsim.config import config_root
 from tacsim.interface import IncompatibleRig, Policy, RigSpec
 from tacsim.models.sensor import CanonicalGrid
@@ -18,7 +20,7 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
     """The policy called `name`, for a rig that delivers `spec` on this canonical grid (None: the usual one).
 
     "scripted": the task's own. "grip": closes until it feels contact, on any rig. "path/to/file.onnx": a learned one;
-    "learned": the shipped one of the task.
+    "learned": the shipped one of the task. "path/to/file.csv": a table of targets (robot.deploy.target_script).
     "package.module:attribute": an object with needs, reset and __call__ as tacsim.Policy has them, a class of such
     objects (made without arguments), or a function from Observation to Action. Runs code of that module, so name only
     modules you trust; of an ONNX file nothing is run but its operators.
@@ -39,8 +41,12 @@ def load_policy(name: str, task: Task | None, spec: RigSpec, canonical: Canonica
         return OnnxPolicy(_shipped(task), canonical or CanonicalGrid(), None if task is None else task.goal)
     if name.endswith(".onnx"):
         return OnnxPolicy(Path(name), canonical or CanonicalGrid(), None if task is None else task.goal)
+    if name.endswith(".csv"):
+        return TargetScript(Path(name))
     if ":" not in name:
-        allowed = "'scripted', 'grip', 'learned', 'path/to/file.onnx', or 'package.module:attribute'"
+        allowed = (
+            "'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or 'package.module:attribute'"
+        )
         raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}")
     return policy_of_code(name)
 

@@ -373,7 +373,7 @@ def test_policies_by_name() -> None:
     [
         (
             "scriptd",
-            "no policy 'scriptd'; allowed: 'scripted', 'grip', 'path/to/file.onnx', or 'package.module:attribute'",
+            "no policy 'scriptd'; allowed: 'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or ",
         ),
         ("my_policies:", "must have the form"),
         ("no_policies:hold", "no module 'no_policies'"),

@@ -1,0 +1,1 @@
+"""What gels and bodies are made of, from recorded presses and squeezes."""

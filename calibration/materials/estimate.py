@@ -1,0 +1,350 @@
+"""Least squares of a simulation against recorded presses: values, intervals, and what the data do not tell.
+
+Unknowns are the parameters of the materials, and for each press two nuisances that every rig has: the place of its
+sensor is off by a little along the closing direction, and the zero of its force sensor is off. These have a standard
+deviation given beforehand (a row of the system each). Gauss-Newton with Levenberg's damping: a whole Jacobian costs one
+batch of perturbed simulations.
+
+A coarse simulation finds the way; a finer one, run at the estimate, says by how much the coarse one is wrong there
+(space mapping: Bandler et al. 1994). How far that moved the estimate tells what is left of the mesh's error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from calibration.errors import CalibrationError
+from calibration.materials.parameters import Parameter, starts
+from tacsim.interface import FloatArray
+
+DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
+PLACE_DIFFERENCE = 0.02e-3  # the same of places [m]
+LONGEST = 0.7  # a step changes no free number by more: a factor of two
+MOST_STEPS, MOST_FINE = 12, 3
+SMALL_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
+SMALL_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
+SMALL_SPREAD = 0.3  # of their standard deviations, likewise
+SMALL_STEP = 0.01  # of the free numbers: the finer mesh changes nothing more
+UNTOLD = 0.6  # an interval of a free number that reaches farther each way tells nothing: a factor of 1.8
+HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
+HOPELESS = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
+UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
+COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
+SETTLED_ERROR = 0.005  # of any simulation: what its settling leaves
+MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
+
+
+class NotIdentified(CalibrationError):
+    """These presses do not tell what was asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Where a simulation is run."""
+
+    free: FloatArray  # (p,) free numbers of the parameters
+    places: FloatArray  # (t,) how much nearer than recorded the parts of each press are [m]
+
+
+Predict = Callable[[Sequence[Point]], list[FloatArray]]  # (m,) signals at each point
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """What was measured in all presses, one number a row."""
+
+    values: FloatArray  # (m,) [N, or m]
+    noise: FloatArray  # (m,) standard deviation
+    press: NDArray[np.int64]  # (m,) index of its press
+    channel: NDArray[np.int64]  # (m,) index into `channels`
+    time: FloatArray  # (m,) [s]
+    channels: tuple[str, ...]
+    force: NDArray[np.bool_]  # (c,) channels that are forces, whose zero may be off
+
+    @property
+    def presses(self) -> int:
+        return int(self.press.max()) + 1
+
+    def zeros(self) -> FloatArray:
+        """(m, z) columns of the zeros: one for each press and each force that it has."""
+        pairs = sorted({(p, c) for p, c in zip(self.press.tolist(), self.channel.tolist(), strict=True)})
+        columns = [(self.press == p) & (self.channel == c) for p, c in pairs if self.force[c]]
+        return np.stack(columns, axis=1).astype(np.float64) if columns else np.zeros((len(self.values), 0))
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """How well the nuisances are known beforehand: standard deviations."""
+
+    place: float  # [m]
+    zero: float  # [N]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """An estimate and what it rests on. n = p + t + z unknowns: parameters, places, zeros."""
+
+    parameters: tuple[Parameter, ...]
+    held: NDArray[np.bool_]  # (p,) those that the data do not tell: they stayed at their start
+    free: FloatArray  # (p,)
+    covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
+    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them
+    predicted: FloatArray  # (m,) with the zeros of the force
+    sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
+    system: FloatArray  # (m, n)
+    nuisances: FloatArray  # (t + z,)
+    priors: FloatArray  # (t + z,) standard deviations of the nuisances
+    runs: int = 0  # simulated presses
+
+    @property
+    def told(self) -> tuple[Parameter, ...]:
+        return tuple(each for each, held in zip(self.parameters, self.held, strict=True) if not held)
+
+    @property
+    def untold(self) -> tuple[Parameter, ...]:
+        return tuple(each for each, held in zip(self.parameters, self.held, strict=True) if held)
+
+    @property
+    def freedom(self) -> int:
+        return max(1, len(self.predicted) - len(self.told))
+
+    def value(self, name: str) -> float:
+        index = self._index(name)
+        return self.parameters[index].value(float(self.free[index]))
+
+    def half(self, name: str) -> float:
+        """Half the 95 % interval of a free number."""
+        index = self._index(name)
+        return float(student.ppf(0.975, self.freedom) * np.sqrt(self.covariance[index, index]))
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """95 %."""
+        index = self._index(name)
+        return self.parameters[index].between(float(self.free[index]), self.half(name))
+
+    def with_sigma(self, sigma: FloatArray) -> Fit:
+        """What its intervals were if the signals had these standard deviations."""
+        p = len(self.free)
+        spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
+        return replace(self, sigma=sigma, covariance=spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2))
+
+    def influence(self, change: FloatArray) -> FloatArray:
+        """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
+        covariance = covariance_of(self.system, self.sigma, self.priors, self.held, 0.0)
+        found: FloatArray = -(covariance @ self.system.T @ (change / self.sigma**2))[: len(self.free)]
+        return found
+
+    def _index(self, name: str) -> int:
+        return [each.name for each in self.parameters].index(name)
+
+
+def covariance_of(
+    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = HELD
+) -> FloatArray:
+    """(n, n) of all unknowns, from the system (m, n), whose last columns have `priors`. Parameters that are held have
+    no variance themselves; `spread` is what they may be off, as far as the others go."""
+    p, n = len(held), system.shape[1]
+    free = np.concatenate([~held, np.ones(n - p, np.bool_)])
+    known = np.concatenate([np.full(p, UNKNOWN), priors])[free]
+    rows = system / sigma[:, None]
+    scaled = rows[:, free] * known  # by what is known beforehand: then the information is never singular
+    found = np.zeros((n, n))
+    found[np.ix_(free, free)] = np.linalg.inv(scaled.T @ scaled + np.eye(len(known))) * np.outer(known, known)
+    for index in np.flatnonzero(held):
+        moved = found @ (rows.T @ rows[:, index])
+        found = found + spread**2 * np.outer(moved, moved)
+    return found
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """A point, its signals, and the system linearised there."""
+
+    point: Point
+    zeros: FloatArray
+    predicted: FloatArray  # (m,) without the zeros
+    system: FloatArray
+
+
+class _Fitter:
+    def __init__(self, signals: Signals, parameters: Sequence[Parameter], priors: Priors) -> None:
+        self.signals, self.parameters = signals, tuple(parameters)
+        self.zero_columns = signals.zeros()
+        self.priors = np.array([priors.place] * signals.presses + [priors.zero] * self.zero_columns.shape[1])
+        self.sigma = signals.noise
+        self.held = np.zeros(len(self.parameters), np.bool_)
+        self.runs = 0
+        limits = np.array([each.bounds for each in self.parameters])
+        self.low, self.high = limits[:, 0], limits[:, 1]
+
+    def linearise(self, predict: Predict, point: Point, zeros: FloatArray) -> _State:
+        """One batch: the point itself, each free number changed a little, and all places at once."""
+        steps = np.where(point.free + DIFFERENCE > self.high, -DIFFERENCE, DIFFERENCE)
+        points = [point, *(replace(point, free=point.free + step) for step in np.diag(steps))]
+        points.append(replace(point, places=point.places + PLACE_DIFFERENCE))
+        found = self.run(predict, points)
+        base = found[0]
+        columns = [(found[1 + k] - base) / step for k, step in enumerate(steps)]
+        by_place = (found[-1] - base) / PLACE_DIFFERENCE
+        columns += [np.where(self.signals.press == p, by_place, 0.0) for p in range(self.signals.presses)]
+        return _State(point, zeros, base, np.column_stack([*columns, self.zero_columns]))
+
+    def run(self, predict: Predict, points: Sequence[Point]) -> list[FloatArray]:
+        self.runs += len(points) * self.signals.presses
+        return predict(points)
+
+    def nuisances(self, state: _State) -> FloatArray:
+        return np.concatenate([state.point.places, state.zeros])
+
+    def residual(self, state: _State) -> FloatArray:
+        found: FloatArray = self.signals.values - state.predicted - self.zero_columns @ state.zeros
+        return found
+
+    def cost(self, state: _State) -> float:
+        squares = float(((self.residual(state) / self.sigma) ** 2).sum())
+        return squares + float(((self.nuisances(state) / self.priors) ** 2).sum())
+
+    def step(self, state: _State, damping: float) -> FloatArray:
+        """(n,) the damped least-squares step; 0 for parameters that are held."""
+        p, n = len(self.held), state.system.shape[1]
+        rows = state.system / self.sigma[:, None]
+        rows[:, :p][:, self.held] = 0.0
+        known = np.zeros((n - p, n))
+        known[:, p:] = np.diag(1.0 / self.priors)
+        whole = np.vstack([rows, known])
+        right = np.concatenate([self.residual(state) / self.sigma, -self.nuisances(state) / self.priors])
+        if damping > 0:
+            whole = np.vstack([whole, np.diag(np.sqrt(damping * (whole**2).sum(axis=0)))])
+            right = np.concatenate([right, np.zeros(n)])
+        found: FloatArray = np.linalg.lstsq(whole, right, rcond=1e-12)[0]
+        return found
+
+    def moved(self, state: _State, step: FloatArray) -> tuple[Point, FloatArray]:
+        """Point and zeros after a step, within the bounds."""
+        p, t = len(self.held), self.signals.presses
+        free = np.clip(state.point.free + np.clip(step[:p], -LONGEST, LONGEST), self.low, self.high)
+        return Point(free, state.point.places + step[p : p + t]), state.zeros + step[p + t :]
+
+    def stepped(self, state: _State) -> _State:
+        """After a whole step, and with what is held back at its start, as the system foresees it."""
+        back = np.where(self.held, starts(self.parameters) - state.point.free, 0.0)
+        begun = _State(
+            replace(state.point, free=state.point.free + back), state.zeros,
+            state.predicted + state.system[:, : len(back)] @ back, state.system,
+        )  # fmt: skip
+        state, (point, zeros) = begun, self.moved(begun, self.step(begun, 0.0))
+        change = np.concatenate([point.free - state.point.free, point.places - state.point.places])
+        return _State(point, zeros, state.predicted + state.system[:, : len(change)] @ change, state.system)
+
+    def reach(self, state: _State) -> FloatArray:
+        """(p,) half the 95 % intervals of the free numbers, as far as the noise alone goes; 0 for those held."""
+        sigma = np.hypot(self.signals.noise, SETTLED_ERROR * np.abs(state.predicted))
+        covariance = covariance_of(state.system, sigma, self.priors, self.held, 0.0)
+        found: FloatArray = 1.96 * np.sqrt(np.diag(covariance))[: len(self.held)]
+        return found
+
+    def hold(self, state: _State, reach: FloatArray, limit: float) -> bool:
+        """Holds the parameter that is told least, if it is told too little. Raises NotIdentified for the last one."""
+        worst = int(np.argmax(np.where(self.held, 0.0, reach)))
+        if reach[worst] <= limit:
+            return False
+        self.held[worst] = True
+        if self.held.all():
+            names = ", ".join(each.name for each in self.parameters)
+            raise NotIdentified(
+                f"these recordings tell nothing of {names}: what they would change is lost in the noise; record with a "
+                "better force sensor, press deeper or more often"
+            )
+        return True
+
+
+def estimate(
+    levels: Sequence[Predict],
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    priors: Priors,
+    coarse_error: float = COARSE_ERROR,
+    on_step: Callable[[str], None] = lambda words: None,
+) -> Fit:
+    """Fits the parameters to the signals.
+
+    levels: the simulation on meshes from coarse to fine. The coarsest, off by a share of about `coarse_error`, finds
+    the way; the last but one gives the Jacobian; the finest puts it right. on_step: told what is being done.
+
+    Parameters whose interval would reach farther than a factor of 1.8 each way are held at their start, the least told
+    first (`Fit.untold`). Raises NotIdentified when nothing is told.
+    """
+    fitter = _Fitter(signals, parameters, priors)
+    begin = Point(starts(parameters), np.zeros(signals.presses))
+    on_step("first run")
+    state = fitter.linearise(levels[0], begin, np.zeros(fitter.zero_columns.shape[1]))
+    while fitter.hold(state, fitter.reach(state), HOPELESS):
+        pass
+    state = _coarse(fitter, levels[0], state, coarse_error, on_step)
+    for level in levels[1:-1]:
+        on_step("next mesh")
+        state = fitter.stepped(fitter.linearise(level, state.point, state.zeros))
+    while fitter.hold(state, fitter.reach(state), UNTOLD):
+        state = fitter.stepped(state)
+    while True:
+        fit = _refined(fitter, state, levels[-1] if len(levels) > 1 else None, on_step)
+        if not fitter.hold(state, np.array([fit.half(each.name) for each in parameters]), UNTOLD):
+            return fit
+        state = fitter.stepped(state)
+
+
+def _coarse(fitter: _Fitter, predict: Predict, state: _State, error: float, on_step: Callable[[str], None]) -> _State:
+    damping = 1e-3
+    for count in range(MOST_STEPS):
+        fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
+        on_step(f"step {count + 1}")
+        after = fitter.linearise(predict, *fitter.moved(state, fitter.step(state, damping)))
+        gain = fitter.cost(state) - fitter.cost(after)
+        if gain > 0:
+            state, damping = after, damping / 10
+        else:
+            damping = max(damping, 1e-3) * 10
+        if abs(gain) < max(SMALL_GAIN, SMALL_SHARE * fitter.cost(state)):
+            break
+    return state
+
+
+def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Callable[[str], None]) -> Fit:
+    """Goes on with the differences between a finer simulation and the coarse one, and ends with the intervals."""
+    p = len(fitter.held)
+    begun, coarse = state.point.free, state.predicted
+    for count in range(0 if fine is None else MOST_FINE):
+        assert fine is not None
+        on_step(f"finer mesh, run {count + 1}")
+        exact = fitter.run(fine, [state.point])[0]
+        if count == 0:
+            off = np.abs(exact - coarse)
+        noise, settled = fitter.signals.noise, SETTLED_ERROR * np.abs(exact)
+        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT / 2 * off) ** 2)
+        here = _State(state.point, state.zeros, exact, state.system)
+        state = fitter.stepped(here)
+        spread = np.diag(covariance_of(state.system, fitter.sigma, fitter.priors, fitter.held, 0.0))[:p]
+        if (np.abs(state.point.free - here.point.free) < np.maximum(SMALL_STEP, SMALL_SPREAD * np.sqrt(spread))).all():
+            break
+    shift = state.point.free - begun
+    fit = Fit(
+        parameters=fitter.parameters,
+        held=fitter.held.copy(),
+        free=state.point.free,
+        covariance=np.zeros((p, p)),
+        mesh_shift=shift,
+        predicted=state.predicted + fitter.zero_columns @ state.zeros,
+        sigma=fitter.sigma,
+        system=state.system,
+        nuisances=fitter.nuisances(state),
+        priors=fitter.priors,
+        runs=fitter.runs,
+    )
+    scatter = float(((fitter.residual(state) / fitter.sigma) ** 2).sum() / fit.freedom)
+    noisier = fit.with_sigma(fitter.sigma * max(1.0, np.sqrt(scatter)))
+    return replace(fit, covariance=noisier.covariance)

@@ -1,0 +1,227 @@
+"""`tacsim identify …`: what a gel or a body is made of, from recorded presses or squeezes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from robot.cli.errors import UNUSABLE, complain
+from robot.cli.options import Out, Overrides, length, quantities, quantity
+from robot.cli.output import busy, new_directory, notes, one_bar, results, say_files, show_table, warn, writing
+
+if TYPE_CHECKING:
+    from calibration.materials.presses import Noise
+    from robot.studies.identify.identify import Identified, Kind
+    from tacsim.interface import Pose
+    from tacsim.models.scene import Scene
+
+UR_NOISE, OTHER_NOISE = 1.0, 0.02  # [N]
+OUTLOOK = (1.0, 0.1, 0.01)  # force sensors that the result is looked at with [N]
+
+identify = typer.Typer(no_args_is_help=True, help="What a gel or a body is made of, from recorded presses.")
+
+Recorded = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Episodes (.mcap), tables (.csv: x, y, z, fx, fy, fz), or folders of them.", show_default=False
+    ),
+]
+Fitted = Annotated[
+    str | None, typer.Option("--fit", metavar="NAMES", help="Only these, with commas between.", show_default="all")
+]
+ForceNoise = Annotated[
+    Any,
+    typer.Option(
+        parser=quantity("force", 1e-6, 1e3), metavar="FORCE", help="Standard deviation of a reading of force.",
+        show_default="1 N recorded by a UR's own, else 0.02 N",
+    ),
+]  # fmt: skip
+ZeroError = Annotated[
+    Any,
+    typer.Option(
+        parser=quantity("force", 1e-6, 1e3), metavar="FORCE", help="How far the zero of the force may be off.",
+        show_default="ten times the noise",
+    ),
+]  # fmt: skip
+PlaceError = Annotated[Any, length("How far the place of the contact may be off along the press.", 1e-9, 1e-2)]
+Preset = Annotated[
+    Literal["learn", "draft", "standard"] | None, typer.Option(help="Resolution.", show_default="standard")
+]
+Moments = Annotated[int, typer.Option(min=4, max=1000, help="Of a press, that are simulated.")]
+Motions = Annotated[
+    Path | None,
+    typer.Option(
+        help="Only write motions that tell all, for `tacsim run RIG --policy FILE.csv`, into this new folder."
+    ),
+]
+
+
+def gel(
+    presses: Recorded = None,
+    scene: Annotated[str, typer.Option(help="What was pressed: a scene with an indenter.")] = "press",
+    indenter: Annotated[
+        Any,
+        typer.Option(
+            parser=quantities("length", 3), metavar="X,Y,Z",
+            help="Where the centre of the indenter lies in the rig's world.", show_default="where the scene puts it",
+        ),
+    ] = None,
+    fit: Fitted = None,
+    force_noise: ForceNoise = None,
+    zero_error: ZeroError = None,
+    place_error: PlaceError = "0.02 mm",
+    preset: Preset = None,
+    moments: Moments = 16,
+    motions: Motions = None,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:  # fmt: skip
+    """A gel's stiffness, Poisson's ratio and friction: material.yaml, scene.yaml, identified.json, identified.png.
+
+    The presses are simulated again until forces (and heights and flow, where recorded) agree. What they do not tell is
+    named, with the motion that would tell it. A table's z is the height of the indenter's lowest point above the gel.
+
+    Example: tacsim identify gel runs/presses --force-noise '10 mN' --out runs/my-gel
+    """
+    overrides = [*([f"preset={preset or 'standard'}"]), *(set_ or [])]
+    where = None
+    if indenter is not None:
+        from tacsim.interface import Pose
+
+        where = Pose(list(indenter))  # type: ignore[arg-type]
+    task = _Task("gel", scene, overrides, fit, moments)
+    task.run(presses or [], motions, (force_noise, zero_error, place_error), out, where)
+
+
+def body(
+    squeezes: Recorded = None,
+    scene: Annotated[str, typer.Option(help="What was squeezed: a scene with a body.")] = "squeeze",
+    gel_error: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Standard deviation of the gels' stiffness, as a share of it.")
+    ] = 0.0,
+    fit: Fitted = None,
+    force_noise: ForceNoise = None,
+    zero_error: ZeroError = None,
+    place_error: PlaceError = "0.02 mm",
+    preset: Preset = None,
+    moments: Moments = 16,
+    motions: Motions = None,
+    set_: Overrides = None,
+    out: Out = None,
+) -> None:
+    """A body's stiffness, yield, hardening and friction to each gel: the same files as of a gel.
+
+    Each recording begins with a fresh body of the scene's shape; name the gel's material by --set gel.material=FILE. A
+    table's z is the gap between the two gels.
+
+    Example: tacsim identify body runs/squeezes --set gel.material=runs/my-gel/material.yaml --out runs/my-clay
+    """
+    overrides = [*([f"preset={preset or 'standard'}"]), *(set_ or [])]
+    task = _Task("body", scene, overrides, fit, moments, gel_error)
+    task.run(squeezes or [], motions, (force_noise, zero_error, place_error), out, None)
+
+
+class _Task:
+    """What both commands do."""
+
+    def __init__(
+        self, kind: Kind, scene: str, overrides: list[str], fit: str | None, moments: int, gel_error: float = 0.0
+    ) -> None:
+        from tacsim.config import load_scene
+
+        self.kind, self.moments, self.gel_error = kind, moments, gel_error
+        self.wanted = [] if fit is None else [name.strip() for name in fit.split(",")]
+        self.scene: Scene = load_scene(scene, overrides)
+        needs, has = ("an indenter", self.scene.indenter) if kind == "gel" else ("a body", self.scene.body)
+        if has is None:
+            raise typer.BadParameter(f"scene '{self.scene.name}' has not {needs}", param_hint="--scene")
+        if self.scene.physics == "seed":
+            raise typer.BadParameter("physics 'seed' cannot be identified; use 'hybrid'", param_hint="--set")
+
+    def run(
+        self,
+        sources: list[Path],
+        motions: Path | None,
+        errors: tuple[float | None, float | None, float],
+        out: Path | None,
+        indenter: Pose | None,
+    ) -> None:
+        if motions is not None:
+            self._write_motions(motions)
+            return
+        if not sources:
+            raise typer.BadParameter(
+                "name recordings, or --motions FOLDER for what to record", param_hint="PRESSES or SQUEEZES"
+            )
+        folder = new_directory(out, f"identify-{self.kind}")
+        with busy("loading"):
+            from calibration.materials.estimate import Priors
+            from calibration.materials.presses import Noise
+            from robot.studies.identify.identify import identify
+            from robot.studies.identify.recordings import Recordings, find_recordings, read_all
+            from tacsim.physics.failure.dump import dumps_in
+        force, zero, place = errors
+        with one_bar("reading") as bar:
+            recordings = Recordings(self.scene, indenter)
+            presses = read_all(recordings, find_recordings(sources), bar.count)
+            if force is None:
+                force = UR_NOISE if recordings.from_ur else OTHER_NOISE
+                notes.print(f"force noise taken as {force:g} N; give your sensor's by --force-noise")
+            noise = Noise(force=force)
+            with dumps_in(folder.with_name(f"{folder.name}-diverged")):
+                found = identify(
+                    self.kind, self.scene, recordings, presses, noise,
+                    Priors(place, 10 * force if zero is None else zero),
+                    wanted=self.wanted, most_moments=self.moments, gel_error=self.gel_error,
+                    on_step=bar.say, on_run=bar.count,
+                )  # fmt: skip
+        self._tell(found, folder, noise)
+
+    def _tell(self, found: Identified, folder: Path, noise: Noise) -> None:
+        from robot.studies.identify.identify import outlook
+        from robot.studies.identify.motions import WHAT_TELLS, WORDS
+        from robot.studies.identify.results import told, write
+
+        with busy("drawing"), writing(folder.parent):
+            files = write(folder, found)
+        title = f"{self.kind.capitalize()}, {len(found.presses)} recordings, {found.fit.runs} simulated"
+        show_table(title, ("", "value", "95 %"), told(found), left={0})
+        looks = {sensor: outlook(found, sensor) for sensor in dict.fromkeys((noise.force, *OUTLOOK))}
+        rows = [(each.name, *(_reach(look[each.name]) for look in looks.values())) for each in found.fit.told]
+        show_table("With another force sensor, 95 %", ("noise", *(f"{one:g} N" for one in looks)), rows, left={0})
+        for each in found.fit.untold:
+            motion = WHAT_TELLS[self.kind][each.name]
+            warn(
+                f"{each.name} is not told by these recordings and stays as it was; '{motion}' would tell it: "
+                f"{WORDS[motion]} (tacsim identify {self.kind} --motions FOLDER writes it)"
+            )
+        say_files(*files)
+        for finding in found.findings:
+            complain(finding.words)
+        if found.findings:
+            complain(f"no material is written: {folder / 'identified.png'} shows why")
+            raise typer.Exit(UNUSABLE)
+        if self.wanted and (missing := [each.name for each in found.fit.untold]):
+            complain(f"asked for and not told: {', '.join(missing)}")
+            raise typer.Exit(UNUSABLE)
+
+    def _write_motions(self, folder: Path) -> None:
+        from robot.studies.identify.motions import motions
+
+        new_directory(folder, "motions")
+        rig = "press" if self.kind == "gel" else "sim"
+        with writing(folder, new=True):
+            for name, table in motions(self.scene).items():
+                path = folder / f"{name}.csv"
+                path.write_text(table, encoding="utf-8")
+                steps = len(table.splitlines()) - 1
+                results.print(f"tacsim run {rig} --policy {path} --steps {steps} --out runs/{name}", markup=False)
+
+
+def _reach(half: float) -> str:
+    """Half an interval of a free number, in words."""
+    from calibration.materials.estimate import UNTOLD
+
+    return f"± {100 * half:.2g} %" if half < UNTOLD else "nothing"

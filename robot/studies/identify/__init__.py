@@ -1,0 +1,1 @@
+"""From recorded presses and squeezes to materials."""

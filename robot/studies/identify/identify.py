@@ -1,0 +1,142 @@
+"""Materials from recorded presses and squeezes: what is asked, how it is fitted, and whether to believe it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from calibration.materials.checks import Finding, findings
+from calibration.materials.estimate import Fit, Priors, Signals, estimate
+from calibration.materials.parameters import Parameter
+from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
+from robot.studies.identify.recordings import Recordings
+from robot.studies.identify.simulation import Simulation, coarser, scene_with
+from tacsim.models.scene import Scene, lame
+
+Kind = Literal["gel", "body"]
+FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
+LEAST_FRICTION, MOST_FRICTION = 0.01, 5.0
+MOST_POISSON = 0.499
+YIELD_SHARE = 0.06  # of a body that the scene thinks elastic: where the fit begins, over its stiffness
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identified:
+    """A fit, what it was made from, and what speaks against it."""
+
+    kind: Kind
+    scene: Scene  # with the materials found
+    fit: Fit
+    presses: tuple[Press, ...]
+    signals: Signals
+    findings: tuple[Finding, ...]
+    noise: Noise
+
+
+def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
+    """All that can be asked, beginning at what the scene says."""
+    if kind == "gel":
+        assert scene.indenter is not None
+        gel = scene.gel.material
+        nu, mu = min(gel.poisson_ratio, 0.49), min(max(scene.indenter.friction, 0.1), 1.0)
+        return (
+            _around("youngs_modulus", gel.youngs_modulus),
+            Parameter("poisson_ratio", nu, 0.0, MOST_POISSON, "volume"),
+            Parameter("friction", mu, LEAST_FRICTION, MOST_FRICTION),
+        )
+    assert scene.body is not None
+    material = scene.body.material
+    limit, (shear, _) = material.elastic_limit, lame(material)
+    strength = math.sqrt(1.5) * 2 * shear * limit if math.isfinite(limit) else YIELD_SHARE * material.youngs_modulus
+    frictions = (
+        Parameter(f"friction_{name}", min(max(mu, 0.1), 1.0), LEAST_FRICTION, MOST_FRICTION)
+        for name, mu in scene.friction.items()
+    )
+    return (
+        _around("youngs_modulus", material.youngs_modulus),
+        _around("yield_stress", strength),
+        Parameter("hardening_modulus", material.hardening_modulus, 0.0, FACTOR * strength, "linear", strength),
+        *frictions,
+    )
+
+
+def _around(name: str, value: float) -> Parameter:
+    return Parameter(name, value, value / FACTOR, value * FACTOR)
+
+
+def identify(
+    kind: Kind,
+    scene: Scene,
+    recordings: Recordings,
+    presses: Sequence[Press],
+    noise: Noise,
+    priors: Priors,
+    *,
+    wanted: Sequence[str] = (),
+    most_moments: int = 16,
+    two_meshes: bool = True,
+    gel_error: float = 0.0,
+    on_step: Callable[[str], None] = lambda words: None,
+    on_run: Callable[[int, int], None] = lambda done, total: None,
+) -> Identified:
+    """Fits the materials of `scene` to the presses.
+
+    wanted: names of parameters; empty: all. most_moments: of a press, that are simulated. two_meshes: the way is found
+    on coarser meshes, and put right on the scene's own; else the scene's own does all. gel_error: standard
+    deviation of the gels' stiffness, as a share of it, carried into the body's intervals.
+
+    Raises NotIdentified, ValueError for a name that is none, SimulationDiverged.
+    """
+    parameters = parameters_of(kind, scene)
+    names = [each.name for each in parameters]
+    unknown = [name for name in wanted if name not in names]
+    if unknown:
+        raise ValueError(f"'{unknown[0]}' is nothing that can be identified of a {kind}; allowed: {', '.join(names)}")
+    parameters = tuple(each for each in parameters if not wanted or each.name in wanted)
+    taken = tuple(thinned(gathered(press), most_moments) for press in presses)
+    signals = signals_of(taken, noise)
+    start = scene_with(scene, {each.name: each.start for each in parameters})
+    exact = Simulation(start, parameters, taken, recordings.seen, on_run)
+    if two_meshes:
+        levels = [replace(exact, scene=coarser(start)), exact]
+        if kind == "body":
+            levels.insert(0, replace(exact, scene=coarser(levels[0].scene)))
+    else:
+        levels = [exact]
+    fit = estimate(levels, signals, parameters, priors, on_step=on_step)
+    if gel_error > 0 and kind == "body":
+        fit = _with_gel_error(fit, signals, gel_error)
+    found = scene_with(start, {each.name: fit.value(each.name) for each in fit.parameters})
+    against = findings(fit, signals, tuple(press.name for press in taken))
+    return Identified(kind, found, fit, taken, signals, tuple(against), noise)
+
+
+def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:
+    """The fit whose intervals know that the gels' stiffness is known to a share `error` only.
+
+    Forces are homogeneous of degree one in all moduli and stresses, heights of degree zero (quasi-statics), so the
+    derivative by the gels' modulus needs no simulation: it is what the body's leave of the force itself.
+    """
+    force = signals.force[signals.channel]
+    by_gel = np.where(force, fit.predicted, 0.0)
+    for index, each in enumerate(fit.parameters):
+        if each.name in ("youngs_modulus", "yield_stress"):
+            by_gel = by_gel - fit.system[:, index]
+        elif each.name == "hardening_modulus":
+            by_gel = by_gel - fit.free[index] * fit.system[:, index]
+    shift = fit.influence(by_gel)
+    return replace(fit, covariance=fit.covariance + error**2 * np.outer(shift, shift))
+
+
+def outlook(identified: Identified, force_noise: float) -> dict[str, float]:
+    """Half the 95 % interval of each parameter (of its free number) with another force sensor: without a new run."""
+    fit, signals = identified.fit, identified.signals
+    force = signals.force[signals.channel]
+    scale = np.where(force, force_noise / identified.noise.force, 1.0)
+    sigma = np.sqrt(np.maximum(fit.sigma**2 - signals.noise**2, 0.0) + (signals.noise * scale) ** 2)
+    other = fit.with_sigma(sigma)
+    return {each.name: other.half(each.name) for each in fit.told}

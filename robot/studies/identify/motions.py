@@ -1,0 +1,102 @@
+"""Motions that tell what a material is: scripts of targets for `tacsim run RIG --policy FILE.csv`."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+
+from tacsim.geometry.shapes import extent
+from tacsim.models.scene import Scene
+
+PRESS_DEPTH, SLIDE_DEPTH = 0.25, 0.2  # of the gel's thickness
+SLIDE, STEP = 2.0e-3, 0.1e-3  # how far a gel is slid, and in what steps it is pressed [m]
+SQUEEZED, HELD = 0.4, 0.12  # of the body's height: how far it is closed, to squeeze it and to slide on it
+BODY_STEP, BODY_SLIDE = 0.04, 0.5  # of its height: a step, a slide
+TILT = math.radians(8.0)
+REST = 3  # periods before the touch and after it, clear of everything: they tell the zero of the force
+CLEAR = 0.3e-3  # how far a gel goes back from where it touched [m]
+
+WHAT_TELLS = {
+    "gel": {"youngs_modulus": "press", "poisson_ratio": "press", "friction": "slide"},
+    "body": {
+        "youngs_modulus": "squeeze", "yield_stress": "squeeze", "hardening_modulus": "squeeze",
+        "friction_upper": "tilt", "friction_lower": "tilt",
+    },
+}  # fmt: skip
+WORDS = {
+    "press": "a ball pressed in by a quarter of the gel's thickness, heights recorded (a calibrated sensor)",
+    "slide": "a gel pressed, then slid sideways until it slips",
+    "squeeze": "the body closed by two fifths of its height, opened a little on the way, and closed on",
+    "tilt": "the upper gel tilted by 8 degrees and slid both ways: the gel that slips first changes with the way",
+}
+Row = tuple[float, float, float]  # x, z [m], tilt about y [rad], along the axes of the sensor at the start
+
+
+def motions(scene: Scene) -> dict[str, str]:
+    """Tables of targets by the name of the motion."""
+    if scene.indenter is not None:
+        thickness = scene.gel.size[2]
+        return {
+            "press": _table("lower", _pressed(PRESS_DEPTH * thickness)),
+            "slide": _table("lower", _slid(SLIDE_DEPTH * thickness)),
+        }
+    assert scene.body is not None
+    height = float(extent(scene.body.geometry)[2])
+    width = float(extent(scene.body.geometry)[0])
+    return {
+        "squeeze": _table("upper", _squeezed(height)),
+        "slide": _table("upper", _dragged(height, width, 0.0)),
+        "tilt": _table("upper", _dragged(height, width, TILT)),
+    }
+
+
+def _pressed(depth: float) -> list[Row]:
+    down = _line((0, -CLEAR, 0), (0, depth, 0), STEP)
+    return [*[(0.0, -CLEAR, 0.0)] * REST, *down, *down[::-2], *[(0.0, -CLEAR, 0.0)] * REST]
+
+
+def _slid(depth: float) -> list[Row]:
+    there = _line((0, depth, 0), (SLIDE, depth, 0), 2 * STEP)
+    back = _line((SLIDE, depth, 0), (SLIDE, -CLEAR, 0), 2 * STEP)
+    return [*[(0.0, -CLEAR, 0.0)] * REST, *_line((0, -CLEAR, 0), (0, depth, 0), STEP), *there, *back,
+            *[(SLIDE, -CLEAR, 0.0)] * REST]  # fmt: skip
+
+
+def _squeezed(height: float) -> list[Row]:
+    step, closed = BODY_STEP * height, SQUEEZED * height
+    half = closed / 2
+    legs = [(-CLEAR, half), (half, half - 2 * step), (half - 2 * step, closed), (closed, closed - 5 * step)]
+    path = [row for a, b in legs for row in _line((0, a, 0), (0, b, 0), step)]
+    end = (0.0, closed - 5 * step, 0.0)
+    return [*[(0.0, -CLEAR, 0.0)] * REST, *path, *[end] * REST]
+
+
+def _dragged(height: float, width: float, tilt: float) -> list[Row]:
+    lift = CLEAR + width / 2 * math.sin(tilt)  # until an edge touches
+    far, deep, step = BODY_SLIDE * height, HELD * height, BODY_STEP * height
+    start = (0.0, -lift, tilt)
+    path = _line(start, (0, deep, tilt), step) + _line((0, deep, tilt), (far, deep, tilt), 2 * step)
+    path += _line((far, deep, tilt), (-far if tilt else 0.0, deep, tilt), 2 * step)
+    end = (path[-1][0], -lift, tilt)
+    return [*[start] * REST, *path, *_line(path[-1], end, 2 * step), *[end] * REST]
+
+
+def _line(a: Sequence[float], b: Sequence[float], step: float) -> list[Row]:
+    """From a to b in even steps, a left out."""
+    count = max(1, math.ceil(math.dist(a[:2], b[:2]) / step - 1e-9))
+    found = []
+    for k in range(1, count + 1):
+        s = k / count
+        x, z, tilt = (p + (q - p) * s for p, q in zip(a, b, strict=True))
+        found.append((x, z, tilt))
+    return found
+
+
+def _table(arm: str, rows: Sequence[Row]) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([f"{arm}.x", f"{arm}.z", f"{arm}.ry"])
+    table.writerows([[f"{value:.6g}" for value in row] for row in rows])
+    return text.getvalue()

@@ -1,0 +1,243 @@
+"""Recorded presses and squeezes from files: episodes of any rig, or CSV tables of poses and forces."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibration.errors import CalibrationError
+from calibration.materials.presses import Press
+from robot.rig.replay_rig import open_replay, recorded_rig
+from robot.studies.identify.simulation import Seen, shape_signals
+from tacsim import pose as se3
+from tacsim.geometry.shapes import extent
+from tacsim.interface import Action, EndOfEpisode, Observation, Pose
+from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
+from tacsim.models.scene import Scene
+from tacsim.models.sensor import CanonicalGrid, Markers
+from tacsim.physics.worlds.press import CLEARANCE
+from tacsim.record.reader import EpisodeFile
+from tacsim.record.sources import read_columns
+
+TABLE, EPISODE = ".csv", ".mcap"
+FORCES = ("fx", "fy", "fz")
+FEWEST = 3  # moments of a press
+
+
+class BadRecording(CalibrationError):
+    """A recording that holds no press or squeeze of this scene."""
+
+
+class Recordings:
+    """Presses read for one scene, and how their sensors saw.
+
+    Args:
+        scene: what is thought to have been pressed; nothing of it but shapes is used here.
+        indenter: where its centre lies in the world, for rigs that carry the sensor to it; None: as the scene puts it.
+    """
+
+    def __init__(self, scene: Scene, indenter: Pose | None = None) -> None:
+        self.scene, self._indenter = scene, indenter
+        self.seen: dict[str, Seen] = {}
+        self.from_ur = False  # at least one was recorded by a UR's own force sensor
+        self.scene_sensors = scene.sensors
+
+    def read(self, path: Path) -> Press:
+        """Raises BadRecording, EpisodeError."""
+        press = self._table(path) if path.suffix.lower() == TABLE else self._episode(path)
+        if len(press.time) < FEWEST:
+            raise BadRecording(f"{path}: {len(press.time)} moments; a press needs at least {FEWEST}")
+        if not any(name.rpartition(".")[2] in FORCES for name in press.readings):
+            raise BadRecording(
+                f"{path}: no forces; give a recording with an arm that feels them, or columns fx, fy, fz"
+            )
+        return press
+
+    # ------------------------------------------------------------------ tables
+
+    def _table(self, path: Path) -> Press:
+        """A CSV file: x, y, z [m], fx, fy, fz [N] on the sensor `lower`, in its axes, and perhaps time [s].
+
+        z: how high the lowest point of the indenter is above the untouched gel, or the gap between the two gels.
+        """
+        there = _header(path)
+        forces = [name for name in FORCES if name in there]
+        timed = ["time"] if "time" in there else []
+        rows = np.array(read_columns(path, ["x", "y", "z", *timed, *forces]))
+        time = rows[:, 3] if timed else np.arange(len(rows), dtype=np.float64)
+        if (np.diff(time) < 0).any():
+            raise BadRecording(f"{path}: column 'time' goes back; give the moments in their order")
+        if self.scene.indenter is not None:
+            up = np.array([0.0, 0.0, float(extent(self.scene.indenter.geometry)[2]) / 2])
+            turned = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, self.scene.indenter.yaw]).quaternion
+            poses = {"indenter": tuple(Pose(row[:3] + up, turned) for row in rows)}
+        else:
+            poses = {
+                "lower": (Pose(),) * len(rows),
+                "upper": tuple(Pose(row[:3], se3.HALF_TURN_X.quaternion) for row in rows),
+            }
+        readings = {f"lower.{name}": rows[:, 3 + len(timed) + k] for k, name in enumerate(forces)}
+        return Press(path.stem, poses, readings, time, np.ones(len(rows), np.int64))
+
+    # ------------------------------------------------------------------ episodes
+
+    def _episode(self, path: Path) -> Press:
+        with EpisodeFile(path) as file:
+            meta = file.meta
+        original = recorded_rig(path)
+        carriers = {name: sensor.arm for name, sensor in meta.spec.sensors.items()}
+        config = RigConfig(
+            name="recorded",
+            clock="replay",
+            arms={name: ReplayArmConfig(driver="replay", source=str(path)) for name in meta.spec.arms},
+            sensors={
+                name: ReplaySensorConfig(driver="replay", source=str(path), arm=arm) for name, arm in carriers.items()
+            },
+            canonical=CanonicalGrid() if original is None else original.canonical,
+        )
+        self.from_ur |= original is not None and any(
+            arm.driver == "ur" and arm.mock is None for arm in original.arms.values()
+        )
+        roles = self._roles(path, list(carriers))
+        with open_replay(config) as rig:
+            observations = [rig.reset()]
+            while True:
+                try:
+                    observations.append(rig.step(Action())[0])
+                except EndOfEpisode:
+                    break
+        name = path.parent.name if path.stem == "episode" else path.stem
+        readings: dict[str, list[float]] = {}
+        for role, sensor in roles.items():
+            arm = carriers[sensor]
+            self._see(role, sensor, observations[0], config.canonical, original)
+            for observation in observations:
+                for channel, value in self._felt(role, sensor, arm, observation).items():
+                    readings.setdefault(channel, []).append(value)
+        whole = {key: np.array(values) for key, values in readings.items() if len(values) == len(observations)}
+        poses = self._poses(path, roles, carriers, observations, original)
+        time = np.array([each.time for each in observations])
+        return Press(name, poses, whole, time, np.ones(len(time), np.int64))
+
+    def _roles(self, path: Path, sensors: Sequence[str]) -> dict[str, str]:
+        """The recorded sensor of each gel of the scene."""
+        wanted = self.scene.sensors
+        if len(wanted) == 1 and len(sensors) == 1:
+            return {wanted[0]: sensors[0]}
+        missing = [name for name in wanted if name not in sensors]
+        if missing:
+            raise BadRecording(
+                f"{path}: recorded with the sensors {', '.join(sensors)}; scene '{self.scene.name}' needs "
+                f"{', '.join(wanted)}"
+            )
+        return {name: name for name in wanted}
+
+    def _see(self, role: str, sensor: str, first: Observation, grid: CanonicalGrid, original: RigConfig | None) -> None:
+        touch = first.tactile[sensor]
+        if touch.height is None:
+            return
+        config = None if original is None else original.sensors.get(sensor)
+        model = getattr(config, "model", None) if isinstance(config, SimSensorConfig) else None
+        markers: Markers | None = None if model is None else model.markers
+        self.seen[role] = Seen(grid, markers, touch.valid)
+
+    def _felt(self, role: str, sensor: str, arm: str | None, now: Observation) -> dict[str, float]:
+        felt = {}
+        if arm is not None and arm in now.arms:
+            wrench = now.arms[arm].wrench
+            felt = {f"{role}.{name}": float(wrench[k]) for k, name in enumerate(FORCES)}
+        elif "indenter" in now.arms:
+            felt = {f"{role}.{name}": -float(now.arms["indenter"].wrench[k]) for k, name in enumerate(FORCES)}
+        touch = now.tactile[sensor]
+        if role in self.seen:
+            flow = touch.flow if self.seen[role].markers is not None else None
+            felt |= shape_signals(role, touch.height, flow, touch.valid)
+        return felt
+
+    def _poses(
+        self,
+        path: Path,
+        roles: dict[str, str],
+        carriers: dict[str, str | None],
+        observations: Sequence[Observation],
+        original: RigConfig | None,
+    ) -> dict[str, tuple[Pose, ...]]:
+        if self.scene.indenter is None:
+            arms = {role: carriers[sensor] for role, sensor in roles.items()}
+            without = [role for role, arm in arms.items() if arm is None]
+            if without:
+                raise BadRecording(f"{path}: no arm carried sensor '{without[0]}', so where it was is not known")
+            return {
+                role: tuple(each.arms[arm].pose for each in observations)
+                for role, arm in arms.items()
+                if arm is not None
+            }
+        arm = carriers[roles["lower"]]
+        found = []
+        for each in observations:
+            sensor = Pose() if arm is None or arm not in each.arms else each.arms[arm].pose
+            indenter = each.arms["indenter"].pose if "indenter" in each.arms else self._place(path, original)
+            found.append(se3.relative(sensor, indenter))
+        return {"indenter": tuple(found)}
+
+    def _place(self, path: Path, original: RigConfig | None) -> Pose:
+        """Where an indenter lies that no arm carries."""
+        if self._indenter is not None:
+            return self._indenter
+        if original is None or original.scene is None or original.clock != "sim":
+            raise BadRecording(
+                f"{path}: where the indenter lies is not known; give its centre by --indenter X,Y,Z (the world of the "
+                "rig; `tacsim calibrate touch` finds it)"
+            )
+        assert self.scene.indenter is not None
+        height = float(extent(self.scene.indenter.geometry)[2]) / 2 + CLEARANCE
+        return Pose(
+            np.array([0.0, 0.0, height]),
+            se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, self.scene.indenter.yaw]).quaternion,
+        )
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return [name.strip() for name in next(csv.reader(file), [])]
+    except (OSError, UnicodeDecodeError, csv.Error) as failure:
+        raise BadRecording(f"{path}: no readable CSV file: {failure}") from failure
+
+
+def find_recordings(sources: Sequence[Path]) -> list[Path]:
+    """The files that are named, or that lie in the named folders (a run's episode.mcap, *.csv), each once. Raises
+    BadRecording."""
+    found: list[Path] = []
+    for source in sources:
+        if source.is_dir():
+            inside = sorted(
+                path
+                for pattern in ("*", "*/episode.mcap")
+                for path in source.glob(pattern)
+                if path.is_file() and path.suffix.lower() in (TABLE, EPISODE)
+            )
+            if not inside:
+                raise BadRecording(f"{source}: no recordings in this folder ({TABLE} or {EPISODE})")
+            found += inside
+        elif not source.is_file():
+            raise BadRecording(f"{source}: no such file or folder")
+        elif source.suffix.lower() not in (TABLE, EPISODE):
+            raise BadRecording(f"{source}: no recording; allowed: {TABLE}, {EPISODE}, or a folder of them")
+        else:
+            found.append(source)
+    return list(dict.fromkeys(found))
+
+
+def read_all(
+    recordings: Recordings, paths: Sequence[Path], on_file: Callable[[int, int], None] = lambda done, total: None
+) -> tuple[Press, ...]:
+    """Every press. Raises BadRecording, EpisodeError."""
+    presses = []
+    for index, path in enumerate(paths):
+        on_file(index, len(paths))
+        presses.append(recordings.read(path))
+    return tuple(presses)

@@ -1,0 +1,182 @@
+"""Recorded motions run again in simulation, with other materials, many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.materials.estimate import Point
+from calibration.materials.parameters import Parameter
+from calibration.materials.presses import Press
+from tacsim import pose as se3
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.scene import Scene
+from tacsim.models.sensor import CanonicalGrid, Markers
+from tacsim.optics.surface import surface_map
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.physics.worlds.batch import Batch
+
+Job = tuple[tuple[float, ...], float, int]  # values of the parameters, place [m], index of the press
+AT_ONCE = 16  # presses in one batch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """How a sensor's heights and flow were found, so that the simulated ones are found alike."""
+
+    grid: CanonicalGrid
+    markers: Markers | None
+    valid: NDArray[np.bool_]  # (h, w)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """The presses by the simulator: what `estimate` calls.
+
+    Quasi-static forces are proportional to all moduli and stresses together, and the shape depends on their ratios
+    alone. So a gel under a rigid indenter is run at the stiffness of the scene, and its forces are scaled: exactly.
+    """
+
+    scene: Scene
+    parameters: tuple[Parameter, ...]
+    presses: tuple[Press, ...]
+    seen: Mapping[str, Seen]
+    on_run: Callable[[int, int], None] = lambda done, total: None
+
+    def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
+        """(m,) signals at each point, in the order of `signals_of`. Raises SimulationDiverged."""
+        keys = [[self._key(point, place, index) for index, place in enumerate(point.places)] for point in points]
+        jobs = list(dict.fromkeys(key for each in keys for key in each))
+        ran: dict[Job, FloatArray] = {}
+        for begin in range(0, len(jobs), AT_ONCE):
+            part = jobs[begin : begin + AT_ONCE]
+            self.on_run(begin, len(jobs))
+            ran |= zip(part, self._run(part), strict=True)
+        self.on_run(len(jobs), len(jobs))
+        result = []
+        for point, each in zip(points, keys, strict=True):
+            scale = self._values(point).get("youngs_modulus", 1.0) / self._stiffness if self._scaled else 1.0
+            rows = []
+            for press, key in zip(self.presses, each, strict=True):
+                for row, (name, values) in enumerate(press.readings.items()):
+                    force = name.rpartition(".")[2] in ("fx", "fy", "fz")
+                    rows.append(ran[key][row, np.isfinite(values)] * (scale if force else 1.0))
+            result.append(np.concatenate(rows))
+        return result
+
+    @property
+    def _scaled(self) -> bool:
+        return self.scene.indenter is not None
+
+    @property
+    def _stiffness(self) -> float:
+        return self.scene.gel.material.youngs_modulus
+
+    def _values(self, point: Point) -> dict[str, float]:
+        return {each.name: each.value(float(free)) for each, free in zip(self.parameters, point.free, strict=True)}
+
+    def _key(self, point: Point, place: float, index: int) -> Job:
+        values = self._values(point)
+        if self._scaled:
+            values["youngs_modulus"] = self._stiffness
+        return tuple(values[each.name] for each in self.parameters), float(place), index
+
+    def _run(self, jobs: Sequence[Job]) -> list[FloatArray]:
+        """(channels, moments) of each job."""
+        names = [each.name for each in self.parameters]
+        scenes = [scene_with(self.scene, dict(zip(names, values, strict=True))) for values, _, _ in jobs]
+        batch = Batch(scenes)
+        paths = [_path(self.presses[index], place) for _, place, index in jobs]
+        for world, path in zip(batch.worlds, paths, strict=True):
+            first = {part: poses[0] for part, poses in path.items()}
+            clear = {part: world.pose(part) for part in first}
+            world.place({
+                part: Pose(np.array([*pose.position[:2], clear[part].position[2]]), clear[part].quaternion)
+                for part, pose in first.items()
+            })  # fmt: skip
+        found: list[list[list[float]]] = [[] for _ in jobs]
+        lengths = [len(self.presses[index].time) for _, _, index in jobs]
+        for moment in range(max(lengths)):
+            targets = [
+                {part: poses[moment] for part, poses in path.items()} if moment < length else None
+                for path, length in zip(paths, lengths, strict=True)
+            ]
+            for member, ended in enumerate(batch.move(targets)):
+                if isinstance(ended, SimulationDiverged):
+                    raise ended
+                if targets[member] is not None:
+                    found[member].append(self._signals(batch, member, self.presses[jobs[member][2]]))
+        return [np.array(rows).T for rows in found]
+
+    def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
+        """One number for each channel of the press, as the world is now."""
+        world = batch.worlds[member]
+        felt: dict[str, float] = {}
+        for sensor in world.sensors:
+            wrench = world.wrench(sensor)
+            felt |= {f"{sensor}.{name}": float(wrench[k]) for k, name in enumerate(("fx", "fy", "fz"))}
+            if sensor in self.seen:
+                seen = self.seen[sensor]
+                surface = surface_map(world.surface(sensor), seen.grid, seen.markers)
+                felt |= shape_signals(sensor, surface.height, surface.flow, seen.valid)
+        return [felt[name] for name in press.readings]
+
+
+def shape_signals(
+    sensor: str, height: NDArray[np.float32] | None, flow: NDArray[np.float32] | None, valid: NDArray[np.bool_]
+) -> dict[str, float]:
+    """What is fitted of a sensor's height map and flow: root mean square height, mean flow [m]."""
+    found = {}
+    if height is not None:
+        found[f"{sensor}.dent"] = float(np.sqrt(np.mean(height[valid].astype(np.float64) ** 2)))
+    if flow is not None:
+        mean = flow.reshape(-1, 2).astype(np.float64).mean(axis=0)
+        found |= {f"{sensor}.slip_x": float(mean[0]), f"{sensor}.slip_y": float(mean[1])}
+    return found
+
+
+def _path(press: Press, place: float) -> dict[str, list[Pose]]:
+    """The poses of a press whose parts were nearer to each other by `place` [m] than recorded."""
+    path = {part: list(poses) for part, poses in press.poses.items()}
+    if "indenter" in path:
+        path["indenter"] = [
+            Pose(pose.position - np.array([0.0, 0.0, place]), pose.quaternion) for pose in path["indenter"]
+        ]
+    else:
+        path["upper"] = [se3.along_z(pose, place) for pose in path["upper"]]
+    return path
+
+
+def scene_with(scene: Scene, values: Mapping[str, float]) -> Scene:
+    """The scene with these materials and frictions, by the names of the parameters."""
+    if scene.indenter is not None:
+        gel = {name: values[name] for name in ("youngs_modulus", "poisson_ratio") if name in values}
+        indenter = {"friction": values["friction"]} if "friction" in values else {}
+        return scene.model_copy(
+            update={
+                "gel": scene.gel.model_copy(update={"material": scene.gel.material.model_copy(update=gel)}),
+                "indenter": scene.indenter.model_copy(update=indenter),
+            }
+        )
+    assert scene.body is not None
+    material = {
+        name: values[name] for name in ("youngs_modulus", "yield_stress", "hardening_modulus") if name in values
+    }
+    if "yield_stress" in material:
+        material |= {"yield_norm": "uniaxial", "yield_strain": None}  # type: ignore[dict-item]
+    friction = {name: values.get(f"friction_{name}", scene.friction[name]) for name in scene.friction}
+    body = scene.body.model_copy(update={"material": scene.body.material.model_copy(update=material)})
+    return scene.model_copy(update={"body": body, "friction": friction})
+
+
+def coarser(scene: Scene) -> Scene:
+    """The scene on a mesh twice as coarse, where the gel still has two layers of elements."""
+    return scene.model_copy(
+        update={
+            "element_size": min(2 * scene.element, scene.gel.size[2] / 2),
+            "particle_spacing": 2 * scene.spacing,
+        }
+    )

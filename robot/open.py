@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robot.common.code import CodeNotFound as CodeNotFound
+from robot.common.code import attribute
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
 from tacsim.config import LoadedRig, load, load_rig
@@ -13,7 +15,7 @@ from tacsim.interface import RigSpec
 from tacsim.models.features import Features
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import ReplaySensorConfig, RigConfig
+from tacsim.models.rig import ReplaySensorConfig, RigConfig, TaskConfig
 from tacsim.rig import Rig
 
 if TYPE_CHECKING:
@@ -29,10 +31,37 @@ ARM_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"ur"}}
 SENSOR_DRIVERS = {"sim": {"sim"}, "replay": {"replay"}, "wall": {"camera", "sim"}}
 
 
+def load_with_task(rig: str | Path, task: str | TaskConfig | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
+    """`load_rig`, where the task may also be one of a person's own, "package.module:attribute": its configuration, or
+    the class of that, which has a default for everything.
+
+    Runs code of that module, so name only modules you trust. Raises ConfigError, and CodeNotFound for a name that leads
+    to no task.
+    """
+    if isinstance(task, str) and ":" in task:
+        try:
+            found = attribute(task)
+        except CodeNotFound as failure:
+            raise CodeNotFound(f"task {failure}") from failure
+        task = _task_of(found, task)
+    return load_rig(rig, task=task, overrides=overrides)
+
+
+def _task_of(found: object, name: str) -> TaskConfig:
+    if isinstance(found, type) and issubclass(found, TaskConfig):
+        try:
+            found = found.model_validate({})
+        except ValueError as failure:
+            raise CodeNotFound(f"task '{name}': not all of it has a default: {failure}") from failure
+    if not isinstance(found, TaskConfig):
+        raise CodeNotFound(f"task '{name}' is a {type(found).__name__}, not the configuration of a task")
+    return found
+
+
 def open_rig(
     rig: str | Path | LoadedRig | RigConfig,
     *,
-    task: str | None = None,
+    task: str | TaskConfig | None = None,
     overrides: Sequence[str] = (),
     confirm: Callable[[str], bool] | None = None,
     dry_run: bool = False,
@@ -44,7 +73,7 @@ def open_rig(
     Use it as a context manager: ``with open_rig("sim") as rig: observation = rig.reset()``. Opening moves nothing.
 
     Args:
-        task, overrides: as for tacsim.config.load_rig; not for a configuration that is loaded already.
+        task, overrides: as for `load_with_task`; not for a configuration that is loaded already.
         confirm: asks a person a question and returns the answer; real arms approach nothing without a yes.
         dry_run: a rig of hardware does everything but move.
         check: is told what the rig delivers, before anything of its hardware is opened; raises to refuse it.
@@ -61,7 +90,7 @@ def open_rig(
             raise TypeError("open_rig: task and overrides belong to load_rig; this rig is loaded already")
         config = rig.config if isinstance(rig, LoadedRig) else rig
     else:
-        config = load_rig(rig, task=task, overrides=overrides).config
+        config = load_with_task(rig, task, overrides).config
     _check_parts(config)
     if dry_run and config.clock != "wall":
         raise CannotOpen(f"rig '{config.name}': a dry run is for hardware; this rig moves no real or mock arm")
@@ -87,7 +116,7 @@ def open_rig(
 
 
 def make_env(
-    task: str = "squeeze",
+    task: str | TaskConfig = "squeeze",
     rig: str | Path = "sim",
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
@@ -118,7 +147,7 @@ def make_env(
 
 def make_vector_env(
     num_envs: int = 1,
-    task: str = "squeeze",
+    task: str | TaskConfig = "squeeze",
     rig: str | Path = "sim",
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
@@ -172,12 +201,12 @@ def _env_of_hardware(config: RigConfig, render_mode: str | None, features: Featu
 
 
 def _rigs_of_episodes(
-    task: str, rig: str | Path, overrides: Sequence[str], variants: Sequence[Sequence[str]]
+    task: str | TaskConfig, rig: str | Path, overrides: Sequence[str], variants: Sequence[Sequence[str]]
 ) -> list[tuple[RigConfig, str]]:
     """The rig without a variant, then with each, and the variant in words."""
     found = []
     for more in ((), *variants):
-        config = load_rig(rig, task=task, overrides=[*overrides, *more]).config
+        config = load_with_task(rig, task, [*overrides, *more]).config
         if config.task is None:
             raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
         _check_parts(config)

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import Placement as Placement
     from tacsim.models.hardware import UrArmConfig as UrArmConfig
     from tacsim.models.hardware import Workspace as Workspace
+    from tacsim.models.quantity import Length as Length
     from tacsim.models.randomisation import Randomisation as Randomisation
     from tacsim.models.rig import KneadConfig as KneadConfig
     from tacsim.models.rig import ReplayArmConfig as ReplayArmConfig
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from tacsim.models.rig import SimArmConfig as SimArmConfig
     from tacsim.models.rig import SimSensorConfig as SimSensorConfig
     from tacsim.models.rig import SqueezeConfig as SqueezeConfig
+    from tacsim.models.rig import TaskConfig as TaskConfig
     from tacsim.models.scene import Body as Body
     from tacsim.models.scene import BodyMaterial as BodyMaterial
     from tacsim.models.scene import Box as Box
@@ -99,6 +101,8 @@ if TYPE_CHECKING:
     from tacsim.report.report import write_report as write_report
     from tacsim.rig import Reset as Reset
     from tacsim.rig import Rig as Rig
+    from tacsim.tasks import Axis as Axis
+    from tacsim.tasks import Estimator as Estimator
     from tacsim.tasks import Knead as Knead
     from tacsim.tasks import Outcome as Outcome
     from tacsim.tasks import Reposition as Reposition
@@ -106,6 +110,7 @@ if TYPE_CHECKING:
     from tacsim.tasks import Task as Task
     from tacsim.tasks import judge as judge
     from tacsim.tasks import make_task as make_task
+    from tacsim.tasks import register_task as register_task
     from tacsim.tasks.grip import Grip as Grip
 else:
     __getattr__, __dir__ = public_names(__name__)

@@ -43,13 +43,22 @@ def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
     from calibration.errors import CalibrationError
     from robot.deploy.policy import PolicyNotFound
-    from robot.open import CannotOpen
+    from robot.open import CannotOpen, CodeNotFound
     from robot.train.run_folder import RunError
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
     from tacsim.physics.failure.dump import DumpError
 
-    unusable = (ConfigError, CannotOpen, PolicyNotFound, IncompatibleRig, CalibrationError, DumpError, RunError)
+    unusable = (
+        ConfigError,
+        CannotOpen,
+        CodeNotFound,
+        PolicyNotFound,
+        IncompatibleRig,
+        CalibrationError,
+        DumpError,
+        RunError,
+    )
     if isinstance(error, unusable):
         return str(error), UNUSABLE
     if _refused(error):

@@ -37,7 +37,10 @@ def run(
     ] = "sim",
     task: Annotated[
         str | None,
-        typer.Option(help="squeeze, reposition, knead, or the path of a task file.", show_default="the rig's own"),
+        typer.Option(
+            help="squeeze, reposition, knead, the path of a task file, or package.module:name.",
+            show_default="the rig's own",
+        ),
     ] = None,
     policy: Annotated[
         str | None,
@@ -62,9 +65,10 @@ def run(
 
     Example: tacsim run sim --task squeeze --steps 30 --out runs/first
     """
-    from tacsim.config import load_rig
+    from robot.open import load_with_task
 
-    loaded = load_rig(rig, task=task, overrides=set_ or [])
+    sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
+    loaded = load_with_task(rig, task, set_ or [])
     own_task = loaded.config.task
     if not dry_run:
         require_person(loaded.config)
@@ -73,7 +77,6 @@ def run(
         endless = NO_END if loaded.config.clock == "replay" else WITHOUT_TASK
         steps = endless if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
-    sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     with Interrupt() as interrupt:
         failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run)
         if interrupt():

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import re
 from collections.abc import Callable
-from pathlib import Path
 
+from robot.common.code import CodeNotFound, attribute
 from tacsim.interface import Action, Needs, Observation, Policy
-
-PACKAGES = ("tacsim", "calibration", "robot")
 
 
 class PolicyNotFound(ValueError):
@@ -38,40 +34,11 @@ def policy_of_code(name: str) -> Policy:
 
     Runs code of that module. Raises PolicyNotFound.
     """
-    return _as_policy(_attribute(name), name)
-
-
-def _attribute(name: str) -> object:
-    module_name, _, path = name.partition(":")
-    if not path or not all(part.isidentifier() for part in [*module_name.split("."), *path.split(".")]):
-        raise PolicyNotFound(f"policy '{name}' must have the form 'package.module:attribute'")
     try:
-        found: object = importlib.import_module(module_name)
-    except ModuleNotFoundError as failure:
-        missing = failure.name or ""
-        if not missing or not (module_name + ".").startswith(missing + "."):
-            why = f"module '{module_name}' itself imports '{missing}', which is missing{_namesake(missing)}"
-        else:
-            why = f"no module '{missing}'; is its folder on PYTHONPATH?{_namesake(missing)}"
-        raise PolicyNotFound(f"policy '{name}': {why}") from failure
-    except (Exception, SystemExit) as failure:  # a script may end Python when it is imported
-        why = f"importing '{module_name}' failed: {failure!r}{_namesake(str(failure))}"
-        raise PolicyNotFound(f"policy '{name}': {why}") from failure
-    for part in path.split("."):
-        if not hasattr(found, part):
-            raise PolicyNotFound(f"policy '{name}': '{module_name}' has no '{path}'{_namesake(module_name)}")
-        found = getattr(found, part)
-    return found
-
-
-def _namesake(words: str) -> str:
-    """What to add to an error that speaks of one of our packages: a file in the working folder has the same name."""
-    ours = Path(__file__).resolve().parents[2]
-    for package in PACKAGES:
-        for path in (Path(package).absolute(), Path(f"{package}.py").absolute()):
-            if re.search(rf"\b{package}\b", words) and path.exists() and path.resolve() != ours / package:
-                return f". '{package}' is a package of tacsim, {path} is not imported: rename it"
-    return ""
+        found = attribute(name)
+    except CodeNotFound as failure:
+        raise PolicyNotFound(f"policy {failure}") from failure
+    return _as_policy(found, name)
 
 
 def _as_policy(found: object, name: str) -> Policy:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,7 +15,7 @@ from pydantic_core import core_schema
 
 from tacsim.config.errors import did_you_mean
 from tacsim.models.randomisation import Randomisation
-from tacsim.models.rig import KneadConfig, RepositionConfig, RigConfig, SqueezeConfig, TaskConfig
+from tacsim.models.rig import TASKS, RigConfig, any_task
 from tacsim.models.scene import BodyMaterial, GelMaterial, Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.models.training import Training
@@ -29,20 +29,20 @@ class Kind:
 
     name: str
     folder: str
-    models: tuple[type[BaseModel], ...]
-    annotation: Any
+    models: Sequence[type[BaseModel]]  # of a task: those that are known at present
+    annotate: Callable[[], Any]  # what a file holds
 
 
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("rig", "rigs", (RigConfig,), RigConfig),
-        Kind("task", "tasks", (SqueezeConfig, RepositionConfig, KneadConfig), TaskConfig),
-        Kind("scene", "scenes", (Scene,), Scene),
-        Kind("sensor", "sensors", (SensorModel,), SensorModel),
-        Kind("randomisation", "randomisations", (Randomisation,), Randomisation),
-        Kind("training", "trainings", (Training,), Training),
-        Kind("material", "materials", (GelMaterial, BodyMaterial), GelMaterial | BodyMaterial),
+        Kind("rig", "rigs", (RigConfig,), lambda: RigConfig),
+        Kind("task", "tasks", TASKS, any_task),
+        Kind("scene", "scenes", (Scene,), lambda: Scene),
+        Kind("sensor", "sensors", (SensorModel,), lambda: SensorModel),
+        Kind("randomisation", "randomisations", (Randomisation,), lambda: Randomisation),
+        Kind("training", "trainings", (Training,), lambda: Training),
+        Kind("material", "materials", (GelMaterial, BodyMaterial), lambda: GelMaterial | BodyMaterial),
     )
 }
 
@@ -121,7 +121,7 @@ def json_schema(kind: str = "rig") -> dict[str, Any]:
 
     Raises KeyError on another kind.
     """
-    schema = TypeAdapter(KINDS[kind].annotation).json_schema(schema_generator=_Generator, mode="validation")
+    schema = TypeAdapter(KINDS[kind].annotate()).json_schema(schema_generator=_Generator, mode="validation")
     schema["$schema"] = _Generator.schema_dialect
     schema["title"] = f"tacsim {kind}"
     return schema

@@ -16,7 +16,7 @@ from tacsim.config.kinds import NotFound, is_name, kind_of, shipped_file
 from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply, parse_override, read_file
 from tacsim.models.hardware import UrArmConfig, weakened_limits
-from tacsim.models.rig import RigConfig, TaskConfig
+from tacsim.models.rig import RigConfig, TaskConfig, any_task
 from tacsim.models.scene import Scene
 from tacsim.models.sensor import SensorModel
 
@@ -37,20 +37,19 @@ class LoadedRig:
         return f"{head}\n{dump(self.config.model_dump(mode='json'))}"
 
 
-def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
+def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides: Sequence[str] = ()) -> LoadedRig:
     """Reads a rig by its name ("sim") or path.
 
-    `task` (a name or path) replaces the file's task. `overrides` are texts ``key.sub=value``; those of ``task`` are
-    applied first. If any part of the rig is simulated, ``scene`` is the rig's own, else the task's, so that
-    ``scene.preset=standard`` works in both cases. In a rig without a simulated part it is None.
+    `task` (a name or path, or the task itself) replaces the file's task. `overrides` are texts ``key.sub=value``; those
+    of ``task`` are applied first. If any part of the rig is simulated, ``scene`` is the rig's own, else the task's, so
+    that ``scene.preset=standard`` works in both cases. In a rig without a simulated part it is None.
 
     Raises ConfigError with every problem found; overrides must not weaken the limits of a real arm.
     """
     state = LoadState()
     root = _open(RigConfig, rig, state)
     if task is not None:
-        place = Place(f"--task {task}")
-        root = apply(root, RigConfig, Override(("task",), Node(task, place, Path.cwd(), text=task)), state)
+        root = apply(root, RigConfig, Override(("task",), _task(task)), state)
     given = [parsed for text in overrides if (parsed := parse_override(text, state)) is not None]
     of_task = [override for override in given if override.path[0] == "task"]
     of_rest = [override for override in given if override.path[0] != "task"]
@@ -68,6 +67,12 @@ def load_rig(rig: str | Path, *, task: str | None = None, overrides: Sequence[st
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
     return LoadedRig(config, tuple(dict.fromkeys(state.sources)))
+
+
+def _task(task: str | TaskConfig) -> Node:
+    if isinstance(task, str):
+        return Node(task, Place(f"--task {task}"), Path.cwd(), text=task)
+    return from_plain(task.model_dump(mode="json"), Place(f"--task {task.kind}"), Path.cwd())
 
 
 def _with_one_scene(config: RigConfig) -> RigConfig:
@@ -132,7 +137,7 @@ def _scene_of_task(root: Node) -> Node:
     task = root.items.get("task")
     if _has(root, "scene") or task is None or not task.items:
         return root
-    scene = task.items.get("scene") or from_plain(default(TaskConfig, task, "scene"), task.place, task.folder)
+    scene = task.items.get("scene") or from_plain(default(any_task(), task, "scene"), task.place, task.folder)
     return root if scene.is_empty else replace(root, value={**root.items, "scene": scene})
 
 
@@ -172,7 +177,7 @@ def load_sensor(source: str | Path, overrides: Sequence[str] = ()) -> SensorMode
 
 def load_task(source: str | Path, overrides: Sequence[str] = ()) -> TaskConfig:
     """Reads a task of any kind. Raises ConfigError."""
-    config: TaskConfig = _load(TaskConfig, source, overrides)
+    config: TaskConfig = _load(any_task(), source, overrides)
     return config
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self, Union, get_args
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -71,13 +71,13 @@ ArmConfig = Annotated[SimArmConfig | UrArmConfig | ReplayArmConfig, Field(discri
 SensorConfig = Annotated[SimSensorConfig | CameraSensorConfig | ReplaySensorConfig, Field(discriminator="driver")]
 
 
-class SqueezeConfig(Config):
-    """Squeeze the body to a height: distance = |height - goal|; actions move both sensors along world z."""
+class TaskConfig(Config):
+    """What every task has. One of your own derives from it, says its `kind: Literal["..."]`, adds what it is about, and
+    is made known by `tacsim.register_task`."""
 
-    kind: Literal["squeeze"]
+    kind: str
     scene: Scene = Scene()
-    goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
-    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3  # largest motion of one sensor in a control step [m]
+    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3  # largest motion of one sensor in a control step, each axis [m]
     touch_force: Annotated[Force, Field(gt=0)] = 0.05  # reset approaches until this [N]
     placement: Annotated[Length, Field(ge=0)] = 0.0  # reset starts at most this far beside the body, by the seed [m]
     success: Annotated[Length, Field(gt=0)] = 0.1e-3  # distance that counts as reached [m]
@@ -88,42 +88,43 @@ class SqueezeConfig(Config):
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
 
 
-class RepositionConfig(Config):
+class SqueezeConfig(TaskConfig):
+    """Squeeze the body to a height: distance = |height - goal|; actions move both sensors along world z."""
+
+    kind: Literal["squeeze"]
+    goal: Annotated[Length, Field(gt=0)] = 7e-3  # desired height [m]
+
+
+class RepositionConfig(TaskConfig):
     """Move the body in the plane: distance = |position - goal|_2; actions move the upper sensor in world x, y."""
 
     kind: Literal["reposition"]
-    scene: Scene = Scene()
     goal: tuple[Length, Length] = (2e-3, 2e-3)  # desired displacement of the centre of mass, world x, y [m]
-    max_step: Annotated[Length, Field(gt=0)] = 0.2e-3
     # Normal forces along the z of their sensors (tacsim.control.load_controller), by arm; an arm without one holds its
     # height. [N]
     loads: dict[Name, Annotated[Force, Field(gt=0)]] = {}
     touch_force: Annotated[Force, Field(gt=0)] = 1.0  # at less, the upper gel slides
-    placement: Annotated[Length, Field(ge=0)] = 0.0
-    success: Annotated[Length, Field(gt=0)] = 0.1e-3
-    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
-    force_limit: Annotated[Force, Field(gt=0)] | None = None
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40
 
 
-class KneadConfig(Config):
+class KneadConfig(TaskConfig):
     """Knead the body to a rod or a ball of its volume: distance = Chamfer's, between them; actions move both sensors
     along world z, and the upper one in x, y."""
 
     kind: Literal["knead"]
-    scene: Scene = Scene()
     shape: Literal["rod", "ball"] = "rod"  # a rod lies along world x
     slenderness: Annotated[float, Field(ge=0.5, le=10)] = 2.0  # of a rod: length over diameter
     max_step: Annotated[Length, Field(gt=0)] = 0.5e-3
     touch_force: Annotated[Force, Field(gt=0)] = 0.2
-    placement: Annotated[Length, Field(ge=0)] = 0.0
     success: Annotated[Length, Field(gt=0)] = 0.2e-3
-    reward_scale: Annotated[Length, Field(gt=0)] = 1e-3
-    force_limit: Annotated[Force, Field(gt=0)] | None = None
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 200
 
 
-TaskConfig = Annotated[SqueezeConfig | RepositionConfig | KneadConfig, Field(discriminator="kind")]
+TASKS: list[type[TaskConfig]] = [SqueezeConfig, RepositionConfig, KneadConfig]  # shipped ones, and those made known
+
+
+def any_task() -> Any:
+    """The annotation of a task of any known kind."""
+    return Annotated[Union[tuple(TASKS)], Field(discriminator="kind")]  # noqa: UP007  # of as many as there are
 
 
 SimMotion = Literal["settled", "flowing", "dynamic"]
@@ -141,7 +142,7 @@ class RigConfig(Config):
     name: str
     clock: Literal["sim", "wall", "replay"]
     period: Annotated[Time, Field(gt=0)] = 0.1  # control period; a replay takes that of its recording [s]
-    task: TaskConfig | None = None
+    task: Annotated[SqueezeConfig | RepositionConfig | KneadConfig, Field(discriminator="kind")] | None = None
     scene: Scene | None = None  # overrides the task's scene
     arms: dict[Name, ArmConfig] = {}
     sensors: dict[Name, SensorConfig] = Field(min_length=1)
@@ -202,3 +203,27 @@ class RigConfig(Config):
                 other = apart.arms[1 - apart.arms.index(arm)]
                 found[other] = max(apart.distance, found.get(other, 0.0))
         return found
+
+
+def know_task(config: type[TaskConfig]) -> None:
+    """Files and rigs may have tasks of this kind from now on. Raises ValueError for one without a kind of its own."""
+    kinds = get_args(config.model_fields["kind"].annotation)
+    if len(kinds) != 1:
+        raise ValueError(f"{config.__name__} must derive from tacsim.TaskConfig and say its kind: Literal['...']")
+    same = [each for each in TASKS if get_args(each.model_fields["kind"].annotation) == kinds]
+    if any(_path(each) != _path(config) for each in same):
+        raise ValueError(
+            f"{config.__name__}: there is a task of kind '{kinds[0]}' already, {_path(same[0])}; name it otherwise"
+        )
+    TASKS[:] = [each for each in TASKS if each not in same] + [config]
+    rigs_of_known_tasks()
+
+
+def rigs_of_known_tasks() -> None:
+    """RigConfig takes the tasks that TASKS lists."""
+    RigConfig.model_fields["task"].annotation = any_task() | None
+    RigConfig.model_rebuild(force=True)
+
+
+def _path(config: type[TaskConfig]) -> str:
+    return f"{config.__module__}.{config.__qualname__}"

@@ -15,7 +15,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.felt_shape import FeltShape
 from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spread
 from tacsim.tasks.squeeze import BOTH, estimated_height
-from tacsim.tasks.task import Axis, Estimator
+from tacsim.tasks.task import Axis, Estimator, Task
 
 OF_YIELD = 0.65  # best pressure of the scripted policy, over the yield stress: softer clay is rolled at less
 THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
@@ -23,14 +23,10 @@ GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
 
 
 @dataclass(frozen=True)
-class Knead:
+class Knead(Task):
     """distance = Chamfer's between the body and the solid, both at one place."""
 
     config: KneadConfig
-
-    @property
-    def needs(self) -> Needs:
-        return Needs(arms=BOTH)
 
     @property
     def needs_to_feel(self) -> Needs:
@@ -94,9 +90,6 @@ class Knead:
             return None if points is None else chamfer(points, self.solid, self.volume)
 
         return felt
-
-    def expert(self, truth: Truth, start: Truth) -> None:
-        return None
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedKnead(self, through)

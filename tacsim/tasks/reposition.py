@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,21 +11,17 @@ from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
 from tacsim.models.rig import RepositionConfig
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.task import Axis, Estimator
+from tacsim.tasks.task import Axis, Estimator, Task
 
 REACHED = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 LEAST_FORCE = 0.01  # a smaller normal force counts as no contact [N]
 
 
 @dataclass(frozen=True, slots=True)
-class Reposition:
+class Reposition(Task):
     """distance = ||position - goal||_2, position = centre of mass minus its value at reset, world x and y."""
 
     config: RepositionConfig
-
-    @property
-    def needs(self) -> Needs:
-        return Needs(arms=frozenset({"upper"}))
 
     @property
     def needs_to_feel(self) -> Needs:
@@ -43,9 +38,6 @@ class Reposition:
     def distance(self, truth: Truth, start: Truth) -> float:
         moved = truth.position[:2] - start.position[:2]
         return math.hypot(moved[0] - self.config.goal[0], moved[1] - self.config.goal[1])
-
-    def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
-        return {}
 
     def estimator(self, canonical: CanonicalGrid) -> Estimator:
         start: FloatArray | None = None
@@ -67,9 +59,6 @@ class Reposition:
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedReposition(self.config, through)
-
-    def teacher(self) -> Policy:
-        return self.scripted()
 
 
 class ScriptedReposition:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
 from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.task import Axis, Estimator
+from tacsim.tasks.task import Axis, Estimator, Task
 
 BOTH = frozenset({"lower", "upper"})
 LEAST_SHARE = 0.1  # of the sensors' way that a body is taken to give
@@ -18,14 +17,10 @@ REACHED = 0.01e-3  # the scripted policy holds when its estimate is this close t
 
 
 @dataclass(frozen=True, slots=True)
-class Squeeze:
+class Squeeze(Task):
     """distance = |height - goal|, height = z-extent of the body."""
 
     config: SqueezeConfig
-
-    @property
-    def needs(self) -> Needs:
-        return Needs(arms=BOTH)
 
     @property
     def needs_to_feel(self) -> Needs:
@@ -41,9 +36,6 @@ class Squeeze:
 
     def distance(self, truth: Truth, start: Truth) -> float:
         return abs(truth.height - self.config.goal)
-
-    def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
-        return {}
 
     def estimator(self, canonical: CanonicalGrid) -> Estimator:
         def felt(observation: Observation) -> float | None:
@@ -63,9 +55,6 @@ class Squeeze:
 
     def scripted(self, *, through: bool = False) -> Policy:
         return ScriptedSqueeze(self.config, through)
-
-    def teacher(self) -> Policy:
-        return self.scripted()
 
 
 class ScriptedSqueeze:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from tacsim.interface import FloatArray, Needs, Observation, Policy, Truth
 from tacsim.models.rig import TaskConfig
@@ -23,51 +23,58 @@ class Axis:
     direction: tuple[float, float, float]  # unit vector, world
 
 
-class Task(Protocol):
-    """A goal for the body between the sensors. Immutable: the state of an episode is in the two truths."""
+class Task(ABC):
+    """A goal for the body between the sensors. Immutable: the state of an episode is in the two truths.
+
+    One of your own derives from it, and must have `config`, `axes`, `goal` and `distance`; all else has a default.
+    """
+
+    config: TaskConfig
 
     @property
-    def config(self) -> TaskConfig: ...
+    @abstractmethod
+    def axes(self) -> tuple[Axis, ...]:
+        """Of its action."""
+
+    @property
+    @abstractmethod
+    def goal(self) -> float | tuple[float, ...]:
+        """In numbers [m]: what a learned policy is told."""
+
+    @abstractmethod
+    def distance(self, truth: Truth, start: Truth) -> float:
+        """Distance of the body from the goal [m]; `start` is the truth just after reset."""
+
     @property
     def needs(self) -> Needs:
-        """What it needs of a rig; the policy has needs of its own."""
-        ...
+        """What it needs of a rig, the arms that it moves by default; the policy has needs of its own."""
+        return Needs(arms=frozenset(axis.arm for axis in self.axes))
 
     @property
     def needs_to_feel(self) -> Needs:
         """What `estimator` needs besides; a rig that does not know the truth must have it."""
-        ...
-
-    @property
-    def axes(self) -> tuple[Axis, ...]: ...
-    @property
-    def goal(self) -> float | tuple[float, ...]:
-        """In numbers [m]: what a learned policy is told."""
-        ...
-
-    def distance(self, truth: Truth, start: Truth) -> float:
-        """Distance of the body from the goal [m]; `start` is the truth just after reset."""
-        ...
+        return Needs(truth=True)
 
     def measures(self, truth: Truth, start: Truth) -> Mapping[str, float]:
         """What else is said of the body at the end of an episode."""
-        ...
+        return {}
 
     def estimator(self, canonical: CanonicalGrid) -> Estimator:
         """The distance by touch alone, as it exists on hardware: a new one for each episode."""
-        ...
+        return lambda observation: None
 
     def expert(self, truth: Truth, start: Truth) -> FloatArray | None:
         """The best action vector, by the truth; None where no rule for it is known."""
-        ...
+        return None
 
     def scripted(self, *, through: bool = False) -> Policy:
-        """A policy that reaches the goal by touch alone, then holds; with `through` it moves on past the goal."""
-        ...
+        """A policy that reaches the goal by touch alone, then holds; with `through` it moves on past the goal. Raises
+        ValueError where there is none."""
+        raise ValueError(f"task '{self.config.kind}' has no scripted policy; name one of your own")
 
     def teacher(self) -> Policy:
         """A policy that may know what only a simulation does: shows what to do where `expert` knows no rule."""
-        ...
+        return self.scripted()
 
 
 @dataclass(frozen=True, slots=True)

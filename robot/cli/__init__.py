@@ -17,6 +17,7 @@ from robot.cli.debug import debug
 from robot.cli.doctor import doctor, schema
 from robot.cli.episode.lerobot import lerobot
 from robot.cli.episode.recover import recover
+from robot.cli.episode.view import view
 from robot.cli.errors import Guarded
 from robot.cli.identify import body, gel, identify
 from robot.cli.learn.evaluate import evaluate
@@ -41,7 +42,23 @@ app.add_typer(calibrate, name="calibrate")
 app.add_typer(export, name="export")
 app.add_typer(identify, name="identify")
 COMMANDS = {
-    app: (run, press, reproduce, replay, recover, mock, bench, compare, debug, schema, doctor, start, train, evaluate),
+    app: (
+        run,
+        press,
+        reproduce,
+        replay,
+        view,
+        recover,
+        mock,
+        bench,
+        compare,
+        debug,
+        schema,
+        doctor,
+        start,
+        train,
+        evaluate,
+    ),
     calibrate: (latency, lens, touch, hand_eye),
     export: (policy, lerobot),
     identify: (gel, body),

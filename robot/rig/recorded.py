@@ -10,7 +10,7 @@ from calibration.errors import error_context
 from calibration.normaliser import FrameNormaliser
 from robot.rig.replay_rig import recorded_normaliser, recorded_rig
 from tacsim.interface import Observation, TactileFrame
-from tacsim.models.rig import ReplaySensorConfig
+from tacsim.models.rig import ReplaySensorConfig, RigConfig
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeError, Step
 from tacsim.record.images import reference_image
@@ -23,7 +23,11 @@ class ObservedEpisode:
 
     path: Path
     episode: Episode
-    canonical: CanonicalGrid
+    rig: RigConfig | None  # that recorded it, where it is known
+
+    @property
+    def canonical(self) -> CanonicalGrid:
+        return CanonicalGrid() if self.rig is None else self.rig.canonical
 
     def steps(self) -> Iterator[tuple[Step, Observation]]:
         """Each step and what was observed after it, one at a time in memory.
@@ -56,5 +60,4 @@ class ObservedEpisode:
 
 def observe_episode(path: Path) -> ObservedEpisode:
     """The episode in a file, seen on the canonical grid that it was recorded with. Raises EpisodeError, ConfigError."""
-    rig = recorded_rig(path)
-    return ObservedEpisode(path, read_episode(path), CanonicalGrid() if rig is None else rig.canonical)
+    return ObservedEpisode(path, read_episode(path), recorded_rig(path))

@@ -1,0 +1,215 @@
+"""What an episode is in Rerun: its entities, and how they are laid out on the screen.
+
+| entity                              | what                                                                   |
+|-------------------------------------|------------------------------------------------------------------------|
+| `/world/{sensor}/gel`               | surface at the sensor's pose, coloured by height                       |
+| `/world/{sensor}/flow`              | displacement of its markers                                            |
+| `/world/{arm}`                      | pose of the sensor that the arm carries                                |
+| `/world/{arm}/force`                | what the object does to it, 1 mm a newton                              |
+| `/world/asked/{arm}`                | where the arm was asked to be                                          |
+| `/camera/{sensor}`                  | the picture as it came                                                 |
+| `/canonical/{sensor}`               | the picture as a policy sees it                                        |
+| `/force`, `/torque`, `/joints`      | numbers of the arms [N, N m, rad]                                      |
+| `/task/reward`, `/task/distance`    | of the step [-, mm]                                                    |
+| `/limits/{arm}`                     | targets shortened or refused so far                                    |
+| `/status/{arm}`                     | the driver's status, in words, when it changed                         |
+| `/diagnostics/{name}`               | all other numbers of the step                                          |
+
+Time lines: `time` [s] since reset, on the rig's clock, and `step`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.arm.status import ArmStatus
+from tacsim.interface import ArmState, Observation, Pose, RigSpec, TactileObservation
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.optics.grid import canonical_cells
+from tacsim.record.episode import ArmPackages, Step
+from tacsim.record.images import encode_png
+from tacsim.report.series import LIMITS
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+AXES = {"x": (220, 60, 60), "y": (60, 180, 60), "z": (70, 110, 240)}
+MOST_DEPTH = 1e-3  # [m] drawn in the last colour
+COLOURS = np.array([(70, 70, 90), (60, 120, 190), (90, 200, 130), (250, 230, 60)], np.float64)  # by depth
+FORCE_LENGTH = 1e-3  # [m] of an arrow for each newton
+ARROW = 0.1e-3  # radius [m]
+
+
+class EpisodeLog:
+    """Writes the steps of an episode into a recording of Rerun, each as it comes.
+
+    lattices: by sensor, where its markers rest (m, n, 2), sensor frame [m]; without, no flow is drawn.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        spec: RigSpec,
+        canonical: CanonicalGrid,
+        lattices: Mapping[str, NDArray[np.float64]],
+    ) -> None:
+        self._recording, self._spec, self._lattices = recording, spec, lattices
+        self._cells = canonical_cells(canonical).points()
+        self._begin: float | None = None
+        self._status: dict[str, int] = {}
+        self._meshed: set[str] = set()
+
+    def step(self, step: Step, observation: Observation) -> None:
+        """All that is known of one step."""
+        import rerun as rr
+
+        if self._begin is None:
+            self._begin = step.time
+            self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._at(step.time)
+        self._recording.set_time("step", sequence=step.index)
+        for name, state in observation.arms.items():
+            self._arm(name, state)
+        for name, touch in observation.tactile.items():
+            self._sensor(name, touch, observation.arms)
+            self._picture(f"camera/{name}", step.frames[name].image)
+        for name, asked in ({} if step.action is None else step.action.tool).items():
+            if asked is not None:
+                self._points(f"world/asked/{name}", asked)
+        self._numbers(step)
+        for name, packages in step.packages.items():
+            self._statuses(name, packages)
+
+    def _at(self, time: float) -> None:
+        assert self._begin is not None
+        self._recording.set_time("time", duration=time - self._begin)
+
+    def _arm(self, name: str, state: ArmState) -> None:
+        import rerun as rr
+
+        self._place(f"world/{name}", state.pose)
+        force = [FORCE_LENGTH * state.wrench[:3]]
+        arrow = rr.Arrows3D(vectors=force, origins=[(0, 0, 0)], radii=[3 * ARROW], colors=[(250, 140, 30)])
+        self._recording.log(f"world/{name}/force", arrow)
+        for kind, values in (("force", state.wrench[:3]), ("torque", state.wrench[3:])):
+            for axis, value in zip(AXES, values, strict=True):
+                self._number(f"{kind}/{name}/{axis}", float(value))
+        for joint, angle in enumerate(() if state.joints is None else state.joints):
+            self._number(f"joints/{name}/joint_{joint + 1}", float(angle))
+
+    def _sensor(self, name: str, touch: TactileObservation, arms: Mapping[str, ArmState]) -> None:
+        import rerun as rr
+
+        self._picture(f"canonical/{name}", touch.image)
+        carrier = self._spec.sensors[name].arm
+        if carrier is not None and carrier != name and carrier in arms:
+            self._place(f"world/{name}", arms[carrier].pose)
+        if touch.height is None:
+            return
+        if name not in self._meshed:
+            triangles = rr.Mesh3D.from_fields(triangle_indices=_triangles(touch.valid))
+            self._recording.log(f"world/{name}/gel", triangles, static=True)
+            self._meshed.add(name)
+        height = touch.height[touch.valid].astype(np.float64)
+        points = np.column_stack([self._cells[touch.valid], -height])  # z is out of the gel
+        mesh = rr.Mesh3D.from_fields(vertex_positions=points.astype(np.float32), vertex_colors=_colours(height))
+        self._recording.log(f"world/{name}/gel", mesh)
+        lattice = self._lattices.get(name)
+        if touch.flow is not None and lattice is not None and lattice.shape == touch.flow.shape:
+            vectors = np.dstack([touch.flow, np.zeros(touch.flow.shape[:2])]).reshape(-1, 3)
+            origins = np.dstack([lattice, np.full(lattice.shape[:2], ARROW)]).reshape(-1, 3)
+            arrows = rr.Arrows3D(vectors=vectors, origins=origins, radii=[ARROW / 2], colors=[(240, 240, 240)])
+            self._recording.log(f"world/{name}/flow", arrows)
+
+    def _numbers(self, step: Step) -> None:
+        if step.reward is not None:
+            self._number("task/reward", step.reward)
+        if step.distance is not None:
+            self._number("task/distance", 1e3 * step.distance)
+        self._number("diagnostics/seconds", step.seconds)
+        for name, value in step.info.items():
+            limit = name.removeprefix(LIMITS)
+            self._number(f"diagnostics/{name}" if limit == name else f"limits/{limit}", value)
+
+    def _statuses(self, name: str, packages: ArmPackages) -> None:
+        """Changes alone, at their own times."""
+        import rerun as rr
+
+        for time, status in zip(packages.time.tolist(), packages.status.tolist(), strict=True):
+            if self._status.get(name) != status:
+                self._status[name] = status
+                self._at(time)
+                words = ArmStatus(status).name if status in set(ArmStatus) else f"status {status}"
+                fine = status < ArmStatus.FORCE_LIMIT
+                level = rr.TextLogLevel.INFO if fine else rr.TextLogLevel.ERROR
+                self._recording.log(f"status/{name}", rr.TextLog(words, level=level))
+
+    def _place(self, entity: str, pose: Pose) -> None:
+        import rerun as rr
+
+        turn = rr.Quaternion(xyzw=pose.quaternion)
+        self._recording.log(entity, rr.Transform3D(translation=pose.position, quaternion=turn))
+
+    def _points(self, entity: str, pose: Pose) -> None:
+        import rerun as rr
+
+        self._recording.log(entity, rr.Points3D([pose.position], radii=[5 * ARROW], colors=[(250, 80, 200)]))
+
+    def _picture(self, entity: str, image: NDArray[np.uint8]) -> None:
+        import rerun as rr
+
+        self._recording.log(entity, rr.EncodedImage(contents=encode_png(image), media_type="image/png"))
+
+    def _number(self, entity: str, value: float) -> None:
+        import rerun as rr
+
+        self._recording.log(entity, rr.Scalars([value]))
+
+
+def blueprint(spec: RigSpec) -> rrb.Blueprint:
+    """The gels in space on the left, pictures in the middle, numbers on the right."""
+    import rerun.blueprint as rrb
+
+    pictures = [
+        rrb.Spatial2DView(origin=f"/{kind}/{name}", name=f"{kind} {name}")
+        for name in spec.sensors
+        for kind in ("camera", "canonical")
+    ]
+    plots = {
+        "force": "force [N]",
+        "task": "reward, distance [mm]",
+        "limits": "limits hit",
+        "diagnostics": "diagnostics",
+    }
+    numbers = [rrb.TimeSeriesView(origin=f"/{origin}", name=name) for origin, name in plots.items()]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(origin="/world", name="gels"),
+            rrb.Grid(*pictures, grid_columns=2),
+            rrb.Vertical(*numbers, rrb.TextLogView(origin="/status", name="status")),
+            column_shares=[3, 3, 2],
+        ),
+        rrb.TimePanel(state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def _triangles(valid: NDArray[np.bool_]) -> NDArray[np.uint32]:
+    """(k, 3) numbers of the valid cells, counted along rows: two for each four neighbours that are all valid."""
+    number = np.cumsum(valid.ravel()).reshape(valid.shape) - 1
+    whole = valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:] & valid[1:, 1:]
+    a, b, c, d = (part[whole] for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]))
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)]).astype(np.uint32)
+
+
+def _colours(height: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(n, 3) by depth, from 0 to MOST_DEPTH."""
+    share = np.clip(height / MOST_DEPTH, 0.0, 1.0) * (len(COLOURS) - 1)
+    channels = [np.interp(share, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
+    found: NDArray[np.uint8] = np.stack(channels, axis=1).astype(np.uint8)
+    return found

@@ -1,0 +1,124 @@
+"""An episode in Rerun: every entity is there on one time line, in a file that its own reader takes for whole."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.export.rerun_log import EpisodeLog, _colours, _triangles
+from robot.rig.recorded import observe_episode
+from tacsim.optics.grid import canonical_cells
+from tests.robot.cli.invoked import START, environment, tacsim
+from tests.robot.export.made_up import NAMES, record
+
+needs_rerun = pytest.mark.skipif(util.find_spec("rerun") is None, reason="needs the extra 'viz'")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_triangles_join_valid_cells_alone_and_cover_them_once() -> None:
+    valid = np.ones((4, 5), bool)
+    valid[0, 0] = valid[3, 4] = False
+    cells = np.argwhere(valid)[:, ::-1].astype(float)  # x, y in the order in which they are counted
+    corners = cells[_triangles(valid)]
+    (ax, ay), (bx, by) = (np.moveaxis(corners[:, k] - corners[:, 0], 1, 0) for k in (1, 2))
+    areas = 0.5 * (ax * by - ay * bx)
+    assert np.allclose(areas, 0.5)  # all turn one way
+    assert areas.sum() == 12 - 2  # squares, but for those with a corner that is missing
+
+
+def test_colours_grow_with_depth_and_end() -> None:
+    colours = _colours(np.array([-1e-3, 0.0, 1e-3, 9.0])).tolist()
+    assert colours[0] == colours[1] and colours[2] == colours[3] and colours[1] != colours[2]
+
+
+@pytest.mark.skipif(util.find_spec("rerun") is not None, reason="rerun is here")
+def test_without_rerun_it_says_what_to_install() -> None:
+    path, _ = record("a.mcap", 2)
+    done = tacsim("view", str(path), "--save", "a.rrd")
+    assert done.exit_code == 2 and "pip install 'tacsim[viz]'" in done.stderr.replace("\n", " ")
+
+
+class Kept:
+    """Takes the place of a recording of Rerun."""
+
+    def __init__(self) -> None:
+        self.now: dict[str, float] = {}
+        self.logged: dict[str, list[tuple[dict[str, float], Any]]] = {}
+
+    def set_time(self, timeline: str, *, sequence: int | None = None, duration: float | None = None) -> None:
+        self.now[timeline] = float(sequence if duration is None else duration)
+
+    def log(self, entity: str, value: Any, *, static: bool = False) -> None:
+        self.logged.setdefault(entity, []).append(({} if static else dict(self.now), value))
+
+
+@needs_rerun
+def test_all_of_a_step_is_logged_at_its_time() -> None:
+    path, steps = record("a.mcap", 3)
+    observed, kept = observe_episode(path), Kept()
+    lattice = np.zeros((5, 7, 2))
+    log = EpisodeLog(kept, observed.episode.meta.spec, observed.canonical, dict.fromkeys(NAMES, lattice))  # type: ignore[arg-type]
+    seen = []
+    for step, observation in observed.steps():
+        log.step(step, observation)
+        seen.append(observation.tactile["upper"])
+    wanted = {f"{kind}/{name}" for kind in ("world", "world/asked", "camera", "canonical") for name in NAMES}
+    wanted |= {f"world/{name}/{part}" for name in NAMES for part in ("gel", "flow", "force")}
+    wanted |= {f"{kind}/{name}/{axis}" for kind in ("force", "torque") for name in NAMES for axis in "xyz"}
+    assert wanted | {"world", "task/reward", "task/distance", "diagnostics/seconds"} == set(kept.logged)
+    assert [at for at, _ in kept.logged["force/upper/z"]] == [
+        {"time": pytest.approx(0.1 * k), "step": k} for k in range(3)
+    ]
+    forces = [value.scalars.as_arrow_array().to_pylist() for _, value in kept.logged["force/upper/z"]]
+    assert forces == [[step.arms["upper"].wrench[2]] for step in steps]
+    (_, triangles), *meshes = kept.logged["world/upper/gel"]
+    assert kept.logged["world/upper/gel"][0][0] == {} and triangles.vertex_positions is None
+    corners = np.array(meshes[1][1].vertex_positions.as_arrow_array().to_pylist())
+    height, valid = seen[1].height, seen[1].valid
+    assert height is not None
+    assert np.allclose(corners[:, 2], -height[valid]) and np.ptp(corners[:, 2]) > 1e-3  # pressed in: below the rest
+    assert np.allclose(corners[:, :2], canonical_cells(observed.canonical).points()[valid])
+
+
+@needs_rerun
+def test_the_file_is_whole_and_never_written_over(tmp_path: Path) -> None:
+    path, _ = record("a.mcap", 3)
+    assert tacsim("view", str(path), "--save", "a.rrd").exit_code == 0
+    command = [sys.executable, "-m", "rerun", "rrd", "verify", "a.rrd"]
+    verified = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert verified.returncode == 0 and "1 file verified without error" in verified.stdout + verified.stderr
+    before = Path("a.rrd").read_bytes()
+    again = tacsim("view", str(path), "--save", "a.rrd")
+    assert again.exit_code == 1 and "a.rrd: exists already" in again.stderr
+    assert Path("a.rrd").read_bytes() == before
+    assert tacsim("view", str(path), "--save", "a.txt").exit_code == 2
+    assert "none.mcap: no such file" in tacsim("view", "none.mcap", "--save", "b.rrd").stderr
+    assert "a.mcap" in tacsim("view", str(path), "--save", "a.mcap/b.rrd").stderr
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.mcap", "a.rrd"]
+
+
+@needs_rerun
+def test_a_full_disk_leaves_no_file(tmp_path: Path) -> None:
+    path, _ = record("a.mcap", 5)
+
+    process = subprocess.run(
+        [*START, "view", str(path), "--save", "a.rrd"],
+        env=environment() | {"RUST_LOG": "off"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert process.returncode == 1 and "a.rrd: File too large" in process.stderr
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "a.mcap"]

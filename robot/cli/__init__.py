@@ -23,6 +23,7 @@ from robot.cli.identify import body, gel, identify
 from robot.cli.learn.evaluate import evaluate
 from robot.cli.learn.export import export, policy
 from robot.cli.learn.train import train
+from robot.cli.learn.transfer import transfer
 from robot.cli.mock import mock
 from robot.cli.run import replay, run
 from robot.cli.simulate import press, reproduce
@@ -58,6 +59,7 @@ COMMANDS = {
         start,
         train,
         evaluate,
+        transfer,
     ),
     calibrate: (latency, lens, touch, hand_eye),
     export: (policy, lerobot),

@@ -57,21 +57,17 @@ class Judged:
     @property
     def success(self) -> Interval:
         """Share, by Wilson's interval."""
-        from scipy import stats
-
-        count, total = sum(each.success for each in self.episodes), len(self.episodes)
-        low, high = stats.binomtest(count, total).proportion_ci(method="wilson")
-        return Interval(count / total, float(low), float(high))
+        return wilson(sum(each.success for each in self.episodes), len(self.episodes))
 
     @property
     def distance(self) -> Interval:
         """Mean [m], by bootstrap."""
-        return _bootstrap(np.array([each.distance for each in self.episodes]))
+        return bootstrap(np.array([each.distance for each in self.episodes]))
 
     @property
     def improvement(self) -> Interval:
         """Mean, by bootstrap."""
-        return _bootstrap(np.array([each.improvement for each in self.episodes]))
+        return bootstrap(np.array([each.improvement for each in self.episodes]))
 
     @property
     def peak_force(self) -> tuple[float, float]:
@@ -157,7 +153,15 @@ def _fitting(name: str, env: TacsimEnv, canonical: CanonicalGrid) -> Policy | No
     return policy
 
 
-def _bootstrap(values: NDArray[np.float64]) -> Interval:
+def wilson(count: int, total: int) -> Interval:
+    """A share, by Wilson's interval."""
+    from scipy import stats
+
+    low, high = stats.binomtest(count, total).proportion_ci(method="wilson")
+    return Interval(count / total, float(low), float(high))
+
+
+def bootstrap(values: NDArray[np.float64]) -> Interval:
     """The mean of (n,) values."""
     chosen = np.random.default_rng(0).integers(len(values), size=(RESAMPLED, len(values)))
     low, high = np.quantile(values[chosen].mean(axis=1), [0.025, 0.975])

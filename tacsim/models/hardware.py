@@ -107,6 +107,8 @@ class MockArmConfig(Config):
     joints: tuple[Angle, Angle, Angle, Angle, Angle, Angle] | None = None  # at power-on; None: at the arm's `start`
     # Of PolyScope, which the controller claims: "5.11", "5.11.0.108150". A text: YAML reads 5.10 without quotes as 5.1.
     version: str | None = None
+    # Where the file believes the sensor to be, seen from where the mock has it: what a calibration leaves of error.
+    error: Placement = Placement()
     # Controller and worker ask for real-time priority, as the worker of a real arm does: to measure timing. Otherwise
     # they share a busy machine with whatever else the mock rig needs.
     realtime: bool = False
@@ -170,6 +172,7 @@ class MockCameraConfig(Config):
 
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
     quality: Annotated[int, Field(ge=50, le=100)] = 95  # of JPEG
+    delay: Annotated[int, Field(ge=0, le=1)] = 0  # 1: its pictures are those of one motion of the cell ago
 
 
 class CameraSensorConfig(Config):

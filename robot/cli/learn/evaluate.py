@@ -71,9 +71,9 @@ def _show(judged: list[Judged]) -> None:
         rows.append(
             (
                 each.policy,
-                _text(each.success, 100, 0),
-                _text(each.distance, 1e3, 3),
-                _text(each.improvement, 100, 0),
+                interval_text(each.success, 100, 0),
+                interval_text(each.distance, 1e3, 3),
+                interval_text(each.improvement, 100, 0),
                 f"{mean:.1f}, {most:.1f}",
             )
         )
@@ -81,6 +81,6 @@ def _show(judged: list[Judged]) -> None:
     show_table(f"{len(judged[0].episodes)} unseen episodes, 95 % intervals", columns, rows, left={0})
 
 
-def _text(interval: Interval, scale: float, digits: int) -> str:
+def interval_text(interval: Interval, scale: float, digits: int) -> str:
     value, low, high = (f"{scale * number:.{digits}f}" for number in (interval.value, interval.low, interval.high))
     return f"{value} ({low} to {high})"

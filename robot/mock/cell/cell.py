@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from urllib.parse import urlsplit
@@ -49,7 +50,7 @@ class MockCell(Closing):
         self._arms = {
             name: arm for name, arm in config.arms.items() if isinstance(arm, UrArmConfig) and arm.mock is not None
         }
-        self._frames = {name: ArmFrames.of(arm) for name, arm in self._arms.items()}
+        self._frames = {name: _true_frames(arm) for name, arm in self._arms.items()}
         self._sensor_on: dict[str, str] = {}  # by arm: the sensor on it
         for name, sensor in config.sensors.items():
             if sensor.arm in self._arms:
@@ -57,8 +58,14 @@ class MockCell(Closing):
         self.faults: dict[str, FaultClient] = {}
         self.cameras: dict[str, MockCamera] = {}
         self._sim_server: SimServer | None = None
+        self._delays = {
+            name: sensor.mock.delay
+            for name, sensor in config.sensors.items()
+            if isinstance(sensor, CameraSensorConfig) and sensor.mock is not None
+        }
         self._scene_frame: SceneFrame | None = None
         self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its picture, and the number of that
+        self._late: dict[str, deque[NDArray[np.uint8]]] = {}  # by camera: the last pictures, oldest first
         self._lock = threading.Lock()  # of what follows from a step
         self._stop = threading.Event()
         self._follower: threading.Thread | None = None  # while running free
@@ -159,6 +166,7 @@ class MockCell(Closing):
         """Puts a fresh body between the sensors, as a person does at a real rig. Raises SimServerError."""
         if self._sim_server is not None:
             with self._lock:
+                self._late.clear()
                 self._distribute(self._sim_server.place(self.poses()))
 
     def step(self, pause: float = 0.0) -> Mapping[str, int]:
@@ -179,7 +187,9 @@ class MockCell(Closing):
                 self.faults[arm].wrench(self._at_tool(arm, scene_frame.wrenches[sensor]).tolist())
         time.sleep(pause)
         for name, camera in self.cameras.items():  # which go on showing their last picture
-            picture = scene_frame.images[name]
+            late = self._late.setdefault(name, deque(maxlen=1 + self._delays[name]))
+            late.append(scene_frame.images[name])
+            picture = late[0]
             if name not in self._pushed or not np.array_equal(self._pushed[name][0], picture):
                 self._pushed[name] = picture, camera.push(picture)
         return {name: number for name, (_, number) in self._pushed.items()}
@@ -229,6 +239,14 @@ class MockCell(Closing):
         if self._follower is not None:
             self._follower.join(5.0)
         self._mocks.close()  # each is closed even when another fails
+
+
+def _true_frames(arm: UrArmConfig) -> ArmFrames:
+    """Where the mock has its sensor: not quite where the arm's file believes it to be, if it has an error."""
+    believed = ArmFrames.of(arm)
+    assert arm.mock is not None
+    sensor = believed.tool_from_sensor @ np.linalg.inv(se3.to_matrix(arm.mock.error.pose))
+    return ArmFrames(believed.world_from_base, believed.flange_from_tool, sensor)
 
 
 def _models(config: RigConfig) -> dict[str, SensorModel]:

@@ -1,0 +1,216 @@
+"""The same policies in simulation and on the mock rig, whose hidden twin differs: what of their success is kept.
+
+Each episode is played twice by each policy: in the simulation, which has of the twin only what a person sees of it (the
+task and the body's shape), and on the mock rig, over the real wire, with all that the twin was drawn to be.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
+from robot.deploy.policy import load_policy, require_fit
+from robot.open import open_rig
+from robot.train.evaluate import Interval, bootstrap, wilson
+from tacsim.config import LoadedRig, load_rig
+from tacsim.models.randomisation import Randomisation
+from tacsim.record.episode import Episode
+from tacsim.report.series import FELT
+from tacsim.rig import Rig
+from tacsim.tasks import make_task
+
+Side = Literal["simulation", "twin"]
+SIDES: tuple[Side, ...] = ("simulation", "twin")
+RIGS = {"simulation": "sim", "twin": "mock"}
+SEEN = ("task.", "scene.body.geometry")  # of a twin, by a person
+ROWS = "episodes.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What is compared; its folder goes on only with the same."""
+
+    task: str
+    policies: tuple[str, ...]
+    twins: Randomisation
+    episodes: int  # of each policy on each side
+    changing: int  # every so many episodes another twin
+    steps: int | None  # of an episode; None: the task's
+    overrides: tuple[str, ...]  # of both rigs
+
+    @property
+    def text(self) -> str:
+        whole = asdict(self) | {"twins": self.twins.model_dump(mode="json")}
+        return json.dumps(whole, indent=1) + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """How one episode ended."""
+
+    policy: str
+    side: Side
+    episode: int
+    distance: float | None  # by the truth [m]; None where it never began
+    felt: float | None  # by touch alone [m]
+    success: bool
+    peak_force: float  # [N]
+    error: str = ""  # what ended it early
+
+
+def play(study: Study, folder: Path, tell: Callable[[str, int, int], None]) -> list[Played]:
+    """All episodes, those that the folder has already read from there; each is written to it as it ends. Raises
+    ValueError where the folder has another study, and what opening rigs and reading policies raises."""
+    rows, settings = folder / ROWS, folder / "study.json"
+    if settings.exists():
+        if settings.read_text(encoding="utf-8") != study.text:
+            raise ValueError(
+                f"{folder} has a study of other settings; name another folder, or give those of study.json"
+            )
+    else:
+        settings.write_text(study.text, encoding="utf-8")
+    done = {(each.policy, each.side, each.episode): each for each in _read(rows)}
+    _write(rows, done.values())  # without a line that was cut off, which the next would be glued to
+    total = len(SIDES) * len(study.policies) * study.episodes
+    with rows.open("a", encoding="utf-8") as file:
+        for side in SIDES:
+            for twin in range(-(-study.episodes // study.changing)):
+                first = twin * study.changing
+                numbers = range(first, min(first + study.changing, study.episodes))
+                left = [(p, n) for p in study.policies for n in numbers if (p, side, n) not in done]
+                for each in _on_twin(study, side, twin, left):
+                    done[each.policy, each.side, each.episode] = each
+                    file.write(_line(each))
+                    file.flush()
+                    tell(f"{each.policy}: {side}", len(done), total)
+    return [done[p, side, n] for p in study.policies for side in SIDES for n in range(study.episodes)]
+
+
+def _read(rows: Path) -> Iterator[Played]:
+    """Those that were written whole."""
+    for line in rows.read_text(encoding="utf-8").splitlines() if rows.exists() else []:
+        try:
+            yield Played(**json.loads(line))
+        except (json.JSONDecodeError, TypeError):  # the last line of a run that was killed
+            continue
+
+
+def _write(rows: Path, played: Iterable[Played]) -> None:
+    whole = rows.with_suffix(".new")
+    whole.write_text("".join(map(_line, played)), encoding="utf-8")
+    whole.replace(rows)
+
+
+def _line(played: Played) -> str:
+    return json.dumps(asdict(played)) + "\n"
+
+
+def _on_twin(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
+    if not left:
+        return
+    loaded = _loaded(study, side, twin, left[0][1])
+    with open_rig(loaded) as rig:
+        for policy, number in left:
+            yield _episode(study, side, rig, _loaded(study, side, twin, number), policy, number)
+
+
+def _loaded(study: Study, side: Side, twin: int, number: int) -> LoadedRig:
+    """The rig of an episode: its task's values are drawn anew for each episode, all others for each twin."""
+    drawn = study.twins.model_copy(update={"draws": max(study.episodes, twin + 1)}).drawn()
+    words = [word for word in drawn[twin] if not word.startswith("task.")]
+    words += [word for word in drawn[number] if word.startswith("task.")]
+    if side == "simulation":
+        words = [word for word in words if word.startswith(SEEN)]
+    return load_rig(RIGS[side], task=study.task, overrides=[*study.overrides, *words])
+
+
+def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str, number: int) -> Played:
+    assert loaded.config.task is not None
+    task, canonical = make_task(loaded.config.task), loaded.config.canonical
+    acts = load_policy(policy, task, rig.spec, canonical)
+    require_fit(rig.name, rig.spec, acts, policy, task)
+    steps = task.config.steps if study.steps is None else study.steps
+    error = ""
+    try:
+        episode: Episode = run_episode(rig, acts, task, steps, setup=EpisodeSetup(policy, number, canonical=canonical))
+    except EpisodeFailed as failed:
+        episode, error = failed.episode, str(failed)
+    distances = [step.distance for step in episode.steps if step.distance is not None]
+    forces = [abs(float(arm.wrench[2])) for step in episode.steps for arm in step.arms.values()]
+    last = distances[-1] if distances else None
+    most = task.config.force_limit
+    within = not error and (most is None or max(forces) <= most)
+    return Played(
+        policy,
+        side,
+        number,
+        last,
+        episode.steps[-1].info.get(FELT) if episode.steps else None,
+        success=last is not None and last <= task.config.success and within,
+        peak_force=max(forces, default=0.0),
+        error=error,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One policy on one side."""
+
+    policy: str
+    side: Side
+    success: Interval  # share
+    distance: Interval | None  # mean [m]; None where no episode began
+    agreement: float | None  # root mean square of felt minus true distance [m]
+    failures: int  # episodes that an error ended
+
+
+def summary(played: Sequence[Played]) -> list[Row]:
+    """By policy and side, in their order."""
+    rows = []
+    for policy, side in dict.fromkeys((each.policy, each.side) for each in played):
+        mine = [each for each in played if (each.policy, each.side) == (policy, side)]
+        known = [each.distance for each in mine if each.distance is not None]
+        gaps = [each.felt - each.distance for each in mine if each.felt is not None and each.distance is not None]
+        rows.append(
+            Row(
+                policy,
+                side,
+                wilson(sum(each.success for each in mine), len(mine)),
+                bootstrap(np.array(known)) if known else None,
+                float(np.sqrt(np.mean(np.square(gaps)))) if gaps else None,
+                sum(bool(each.error) for each in mine),
+            )
+        )
+    return rows
+
+
+def picture(rows: Sequence[Row], path: Path) -> None:
+    """Success and distance of each policy on both sides, with their intervals."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 1.6 + 0.7 * len(rows) / 2), layout="constrained")
+    names = list(dict.fromkeys(row.policy for row in rows))
+    for axes, what, scale, unit in zip(
+        figure.subplots(1, 2, sharey=True), ("success", "distance"), (100, 1e3), ("%", "mm"), strict=True
+    ):
+        for side, colour, shift in (("simulation", "#9fb4c8", -0.15), ("twin", "#1f3a5f", 0.15)):
+            there = [(row, getattr(row, what)) for row in rows if row.side == side]
+            mine = [(names.index(row.policy) + shift, interval) for row, interval in there if interval is not None]
+            if not mine:
+                continue
+            values = scale * np.array([each.value for _, each in mine])
+            away = scale * np.abs(np.array([[i.value - i.low, i.high - i.value] for _, i in mine]).T)
+            axes.errorbar(values, [y for y, _ in mine], xerr=away, fmt="o", color=colour, label=side, capsize=3)
+        axes.set_title(what, loc="left", fontsize=10)
+        axes.set_xlabel(unit)
+        axes.set_yticks(range(len(names)), [Path(name).stem.replace("$", r"\$") for name in names])
+        axes.set_xlim(left=0)
+    axes.invert_yaxis()
+    axes.legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=120)

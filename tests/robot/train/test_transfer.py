@@ -1,0 +1,172 @@
+"""The same policies on both sides of the gap: how a twin differs, what a killed study keeps, what the table says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.mock.cell.cell import MockCell, _true_frames
+from robot.mock.cell.sim_server import SceneFrame
+from robot.mock.fixtures import rig_addresses
+from robot.open import open_rig
+from robot.train import transfer
+from robot.train.transfer import Played, Side, Study, _loaded, picture, play, summary
+from tacsim.config import load, load_rig
+from tacsim.interface import Action, Pose
+from tacsim.models.hardware import UrArmConfig
+from tacsim.models.randomisation import Randomisation
+from tests.robot.cli.invoked import tacsim
+from tests.robot.rig.test_hardware_rig_simulated import SMALL, TINY
+
+TWIN = {
+    "task.goal": {"uniform": ["3.3 mm", "3.6 mm"]},
+    "scene.body.geometry.size": {"uniform": [["3.8 mm", "3.8 mm", "4 mm"], ["4 mm", "4 mm", "4.2 mm"]]},
+    "scene.body.material.yield_stress": {"log_uniform": ["6 kPa", "20 kPa"]},
+    "arms.lower.mock.error.position": {"choice": [["0.2 mm", "-0.1 mm", "0"]]},
+    "sensors.upper.mock.delay": {"choice": [1]},
+}
+TWINS = Randomisation.model_validate({"draws": 8, "values": TWIN})
+
+
+def study(**changed: Any) -> Study:
+    whole: dict[str, Any] = {
+        "task": "squeeze", "policies": ("scripted", "grip"), "twins": TWINS, "episodes": 5, "changing": 2, "steps": 2,
+        "overrides": (),
+    }  # fmt: skip
+    return Study(**{**whole, **changed})
+
+
+def test_the_simulation_has_of_a_twin_what_a_person_sees() -> None:
+    twin, simulation = (_loaded(study(), side, 1, 3).config for side in ("twin", "simulation"))
+    assert twin.task is not None and simulation.task is not None and twin.scene is not None
+    assert simulation.scene is not None and twin.scene.body is not None and simulation.scene.body is not None
+    assert twin.task.goal == simulation.task.goal  # type: ignore[attr-defined]
+    assert twin.scene.body.geometry == simulation.scene.body.geometry
+    usual = load_rig("sim", task="squeeze").config.scene
+    assert usual is not None and usual.body is not None
+    assert simulation.scene.body.material == usual.body.material != twin.scene.body.material
+    same, other = (_loaded(study(), "twin", 1, number).config for number in (3, 2))
+    assert same == twin and other.scene is not None
+    assert other.scene.body == twin.scene.body and other.task.goal != twin.task.goal  # type: ignore[union-attr]
+
+
+def test_the_shipped_twin_fits_both_rigs() -> None:
+    for side in transfer.SIDES:
+        for number in range(3):
+            config = _loaded(study(twins=load(Randomisation, "squeeze-twin")), side, number, number).config
+            assert config.scene is not None
+            assert config.scene.preset == ("standard" if side == "twin" else "draft")
+
+
+def test_a_mock_has_its_sensor_beside_where_the_file_believes_it() -> None:
+    arm = load_rig("mock").config.arms["lower"]
+    assert isinstance(arm, UrArmConfig) and arm.mock is not None
+    error = {"position": (1e-4, 0.0, 0.0)}
+    shifted = UrArmConfig.model_validate(arm.model_dump() | {"mock": {"error": error}})
+    one, other = _true_frames(arm), _true_frames(shifted)
+    moved = other.tool_from_sensor[:3, 3] - one.tool_from_sensor[:3, 3]
+    assert moved == pytest.approx(-one.tool_from_sensor[:3, 0] * 1e-4)  # it believes to be further along its own x
+
+
+def test_late_pictures_are_those_of_the_motion_before() -> None:
+    class Camera:
+        def __init__(self) -> None:
+            self.shown: list[int] = []
+
+        def push(self, image: np.ndarray) -> int:
+            self.shown.append(int(image[0, 0, 0]))
+            return len(self.shown)
+
+    cell = MockCell.__new__(MockCell)
+    prompt, late = Camera(), Camera()
+    cell.cameras = {"prompt": prompt, "late": late}  # type: ignore[dict-item]
+    cell._delays, cell._late, cell._pushed, cell._sensor_on = {"prompt": 0, "late": 1}, {}, {}, {}
+    for number in (5, 6, 7):
+        image = np.full((2, 2, 3), number, np.uint8)
+        cell._distribute(SceneFrame(0, 0.0, {"prompt": image, "late": image}, {}, {}, None, {}, 0.0))
+    assert prompt.shown == [5, 6, 7]
+    assert late.shown == [5, 6]  # the first one is shown until another has become old
+
+
+def fake(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
+    for policy, number in left:
+        yield Played(policy, side, number, 1e-4 * (number + (side == "twin")), 1e-4 * number, number < 3, 1.0)
+
+
+def test_a_study_that_is_killed_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer, "_on_twin", fake)
+    whole = play(study(), tmp_path, lambda *_: None)
+    assert [(each.policy, each.side, each.episode) for each in whole] == [
+        (policy, side, n) for policy in ("scripted", "grip") for side in ("simulation", "twin") for n in range(5)
+    ]
+    path = tmp_path / transfer.ROWS
+    lines = path.read_text().splitlines()
+    assert len(lines) == 20
+    path.write_text("\n".join(lines[:7]) + "\n" + lines[7][:30])  # killed while it wrote
+    asked: list[tuple[str, int]] = []
+
+    def rest(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
+        asked.extend(left)
+        return fake(study, side, twin, left)
+
+    monkeypatch.setattr(transfer, "_on_twin", rest)
+    assert play(study(), tmp_path, lambda *_: None) == whole
+    assert len(asked) == 13
+    assert play(study(), tmp_path, lambda *_: None) == whole
+    assert len(asked) == 13  # what was mended is whole now
+    with pytest.raises(ValueError, match="has a study of other settings; name another folder"):
+        play(study(steps=3), tmp_path, lambda *_: None)
+
+
+def test_the_table_says_success_distance_and_how_well_it_is_felt(tmp_path: Path) -> None:
+    rows = [row for side in transfer.SIDES for row in fake(study(), side, 0, [("p", n) for n in range(5)])]
+    rows.append(Played("q", "twin", 0, None, None, False, 0.0, "no touch"))
+    one, other, nothing = summary(rows)
+    assert (one.side, one.success.value, other.side) == ("simulation", 0.6, "twin")
+    assert one.distance is not None and one.distance.value == pytest.approx(2e-4)
+    assert other.agreement == pytest.approx(1e-4)
+    assert (nothing.distance, nothing.agreement, nothing.failures) == (None, None, 1)
+    picture([one, other, nothing], tmp_path / "transfer.png")
+    assert (tmp_path / "transfer.png").stat().st_size > 5000
+
+
+@pytest.mark.deep
+def test_a_twin_is_believed_elsewhere_and_its_pictures_are_late() -> None:
+    words = ["arms.lower.mock.error.position=[0.2 mm, -0.1 mm, 0]", "sensors.upper.mock.delay=1"]
+    with open_rig(
+        "mock", task="squeeze", overrides=[*SMALL, *TINY, *rig_addresses(), "scene.preset=learn", *words]
+    ) as rig:
+        observation, truth = rig.reset(), rig.truth()
+        assert truth is not None
+        believed = {name: arm.pose.position for name, arm in observation.arms.items()}
+        away = [believed[name] - truth.poses[name].position for name in ("lower", "upper")]
+        assert away[0] == pytest.approx([0.2e-3, -0.1e-3, 0.0], abs=20e-6)
+        assert away[1] == pytest.approx(np.zeros(3), abs=20e-6)
+        before = rig.frames["upper"].image
+        arms = observation.arms
+        step = {"lower": 0.1e-3, "upper": -0.1e-3}
+        rig.step(Action({n: Pose(arms[n].pose.position + [0, 0, z], arms[n].pose.quaternion) for n, z in step.items()}))
+        late = np.abs(rig.frames["upper"].image.astype(int) - before).mean()
+        rig.step(Action({}))
+        now = np.abs(rig.frames["upper"].image.astype(int) - before).mean()
+        assert now > 2 * late
+
+
+@pytest.mark.deep
+def test_the_command_makes_table_picture_and_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "twin.yaml").write_text(json.dumps({"draws": 2, "values": TWIN}))
+    sets = [part for word in (*TINY, "scene.preset=learn") for part in ("--set", word)]
+    words = ("transfer", "squeeze", "--policy", "scripted", "--twin", "twin.yaml", "--episodes", "2", "--steps", "2")
+    for _ in range(2):  # the second time it reads
+        result = tacsim(*words, "--out", "t", *sets)
+        assert result.exit_code == 0, result.output
+    assert "scripted" in result.stdout and "twin" in result.stdout
+    rows = json.loads((tmp_path / "t" / "transfer.json").read_text())
+    assert [(row["side"], row["failures"]) for row in rows] == [("simulation", 0), ("twin", 0)]
+    assert (tmp_path / "t" / "transfer.png").exists()

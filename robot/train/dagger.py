@@ -21,6 +21,7 @@ from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.text import printable
 from tacsim.models.training import Training
 
+LEAST_SPREAD = 0.02  # of an axis's actions: less of it is not learned more exactly
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -79,6 +80,7 @@ class Dagger:
         wanted = torch.from_numpy(actions)
         if number == 0:
             self.actor.layers.normalise_by(tensors)
+        spread = wanted.std(dim=0, unbiased=False).clamp(min=LEAST_SPREAD)  # small steps count as much as large ones
         random = torch.Generator().manual_seed(self._seed * 1000 + number)
         optimiser = torch.optim.Adam(self.actor.parameters(), lr=settings.rate)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
@@ -88,7 +90,7 @@ class Dagger:
             total = 0.0
             for part in torch.randperm(len(wanted), generator=random).split(settings.batch):
                 answer = self.actor(*(tensors[key][part] for key in self.actor.keys))
-                loss = torch.nn.functional.mse_loss(answer, wanted[part])
+                loss = torch.mean(((answer - wanted[part]) / spread) ** 2)
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()

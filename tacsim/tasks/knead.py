@@ -19,6 +19,7 @@ from tacsim.tasks.task import Axis, Estimator, Task
 
 OF_YIELD = 0.65  # best pressure of the scripted policy, over the yield stress: softer clay is rolled at less
 THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
+AIMS = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
 GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
 
 
@@ -118,14 +119,15 @@ class ScriptedKnead:
         # The body turns by half of the sensor's way over its own radius.
         self._reach = 0.5 * np.pi * task.goal[2]
         self._start: FloatArray | None = None
-        self._turns = 0  # how often it has turned, or passed the middle
+        self._before, self._strokes = np.zeros(2), 0
 
     @property
     def needs(self) -> Needs:
         return Needs(BOTH, BOTH, height=True)
 
     def reset(self) -> None:
-        self._start, self._turns = None, 0
+        self._start = None
+        self._before, self._strokes = np.zeros(2), 0
 
     def __call__(self, observation: Observation) -> Action:
         lower, upper = observation.arms["lower"], observation.arms["upper"]
@@ -146,14 +148,17 @@ class ScriptedKnead:
 
     def _beside(self, now: FloatArray) -> FloatArray:
         """(2,) step of the upper sensor, `now` so far beside where it began [m]: to one side, to the other, and through
-        the middle again."""
+        the middle again. It goes on as the sensor moves, not by a clock: who learns from it sees that, too."""
         longest = self._task.config.max_step
-        while float(np.linalg.norm(left := self._aim() - now)) < THERE * longest:
-            self._turns += 1
+        moved, self._before = now - self._before, now
+        along = float(moved @ self._side())
+        part = 1 if along < -THERE * longest else 2 if float(now @ self._side()) < 0 else 0
+        while float(np.linalg.norm(left := AIMS[part] * self._reach * self._side() - now)) < THERE * longest:
+            part = (part + 1) % 3
+            self._strokes += part == 0
         return left * min(1.0, 0.9 * longest / float(np.linalg.norm(left)))
 
-    def _aim(self) -> FloatArray:
-        """(2,) where it goes, from where it began [m]."""
-        strokes, part = divmod(self._turns, 3)
-        turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * strokes
-        return self._reach * (1.0, -1.0, 0.0)[part] * np.array([np.cos(turn), np.sin(turn)])
+    def _side(self) -> FloatArray:
+        """(2,) where the first half of this stroke goes, unit vector."""
+        turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * self._strokes
+        return np.array([np.cos(turn), np.sin(turn)])

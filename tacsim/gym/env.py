@@ -96,6 +96,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self.observation_space = space
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(task.axes),), np.float32)
         self.phase: Literal["new", "running", "over"] = "new"  # of the episode; over: terminated or truncated
+        self._teacher: Policy | None = None  # of this episode, once it is asked
         self._sent: Mapping[str, Pose | None] = {}  # by the last begin_step
         self._failure: LimitExceeded | SimulationDiverged | None = None
         self._done: Result | None = None  # a step that is done, but not taken yet
@@ -158,7 +159,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._truth_at_start = self._truth()
         self._effort = Effort(observation.arms)
         self._count, self.phase = 0, "running"
-        self._observation, self._teacher = observation, self.task.teacher()
+        self._observation, self._teacher = observation, None
         self._flat: encode.Flat = self._view.begin(observation, self.task.goal)
 
     def _truth(self) -> Truth:
@@ -263,7 +264,11 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         if self.phase != "running":
             return np.zeros(len(self.task.axes), np.float32)
         best = self.task.expert(self._truth(), self._truth_at_start)
-        return self.ask(self._teacher) if best is None else np.asarray(best, np.float32)
+        if best is not None:
+            return np.asarray(best, np.float32)
+        if self._teacher is None:
+            self._teacher = self.task.teacher()
+        return self.ask(self._teacher)
 
     def ask(self, policy: Policy) -> NDArray[np.float32]:
         """What `policy` does here, as an action of this environment. A policy with a memory must be asked in every step

@@ -17,7 +17,7 @@ from tacsim.interface import IncompatibleRig
 from tacsim.limits import ActionError
 from tacsim.models.rig import RepositionConfig, SqueezeConfig
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.tasks import make_task
+from tacsim.tasks import Task, make_task
 
 STILL = np.zeros(2, np.float32)
 
@@ -234,3 +234,14 @@ def test_the_expert_is_the_tasks_by_the_truth_and_holds_where_nothing_runs(open_
         env.step(env.expert())
     assert env.phase == "over"
     assert env.expert().tolist() == [0.0, 0.0]
+
+
+def test_a_task_without_a_teacher_runs_all_the_same(open_springs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = make_task(SqueezeConfig(kind="squeeze", goal=7e-3, steps=3))
+    for what in ("expert", "scripted"):
+        monkeypatch.setattr(type(task), what, getattr(Task, what))
+    env = TacsimEnv(open_springs("squeeze"), task)
+    env.reset(seed=3)
+    env.step(np.zeros(2, np.float32))
+    with pytest.raises(ValueError, match="task 'squeeze' has no scripted policy"):
+        env.expert()

@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.cases.oracles import FINE, RESOLUTIONS, beside, once
+from benchmarks.cases.oracles import FINE, RESOLUTIONS, beside
 from benchmarks.cases.squeeze import close, normal_forces
-from benchmarks.harness.measure import Measurement
+from benchmarks.harness.measure import Measurement, once
 from benchmarks.harness.runner import Case
 from benchmarks.truth import finite_elements as truth
 from tacsim.physics.failure.diagnosis import particle_volumes

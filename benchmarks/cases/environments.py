@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases.squeeze import PRESETS
-from benchmarks.harness.measure import Measurement, Timing, timed
+from benchmarks.harness.measure import Measurement, Timing, once
 from benchmarks.harness.runner import Case
 from tacsim import pose as se3
 from tacsim.interface import Action, Pose
@@ -19,7 +19,8 @@ from tacsim.rig import Rig
 from tacsim.tasks import Squeeze
 
 NUMBER = 16  # environments of a batch
-STEPS = 10  # of all, that are timed together
+STEPS = 8  # of all, each timed
+WARM = 2  # before those
 ROUNDS = 10  # resets of each environment
 SMALLEST = ("width=16", "height=16", "pixel_pitch=1 mm")  # pictures for who does not look at them
 SMALL = ("width=160", "height=120", "pixel_pitch=0.125 mm")
@@ -40,17 +41,18 @@ CLOSING = 0.2e-3  # of each sensor in a control step [m]
 
 
 def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
-    """Sixteen squeezes in one batch under random actions: heights and forces, and with two pictures of 160 x 120; then
-    their resets, each with a material, a size and a goal that are drawn from eight."""
-    look = "two pictures of 160 x 120"
-    return [
-        _random_actions(preset, [f"motion={motion}", *pictures(SMALLEST)], f"{motion}, heights and forces", repeat)[0],
-        *_random_actions(preset, [f"motion={motion}", *pictures(SMALL)], f"{motion}, {look}", repeat),
-    ]
+    """Sixteen squeezes in one batch under random actions: heights and forces; at learn also with two pictures of
+    160 x 120, and their resets, each with a material, a size and a goal that are drawn from eight."""
+    words = f"{motion}, heights and forces"
+    rows = [_random_actions(preset, [f"motion={motion}", *pictures(SMALLEST)], words, resets=False)[0]]
+    if preset == "learn":
+        look = f"{motion}, two pictures of 160 x 120"
+        rows += _random_actions(preset, [f"motion={motion}", *pictures(SMALL)], look, resets=True)
+    return rows
 
 
-def _random_actions(preset: str, more: list[str], words: str, repeat: int) -> list[Measurement]:
-    """Rows of a step and of a reset."""
+def _random_actions(preset: str, more: list[str], words: str, *, resets: bool) -> list[Measurement]:
+    """Rows of a step and, with `resets`, of a reset."""
     import gymnasium
 
     import tacsim.gym.env  # noqa: F401  registers
@@ -60,38 +62,37 @@ def _random_actions(preset: str, more: list[str], words: str, repeat: int) -> li
     many = gymnasium.make_vec("tacsim/Squeeze-v0", NUMBER, autoreset_mode="Disabled", **options)
     alone = gymnasium.make("tacsim/Squeeze-v0", **options).unwrapped
     rng = np.random.default_rng(0)
-
-    def steps(count: int = STEPS) -> None:
-        for _ in range(count):
-            many.step(rng.uniform(-1.0, 1.0, (NUMBER, 2)).astype(np.float32))
-
+    actions = rng.uniform(-1.0, 1.0, (WARM + STEPS, NUMBER, 2)).astype(np.float32)
     began = time.perf_counter()
     many.reset(seed=1)
     first = time.perf_counter() - began
     alone.reset(seed=1)
     difference = 0.0
-    for _ in range(3):
-        actions = rng.uniform(-1.0, 1.0, (NUMBER, 2)).astype(np.float32)
-        felt, felt_alone = (flats["wrench_upper"] for flats in (many.step(actions)[0], alone.step(actions[0])[0]))
+    for action in actions[:WARM]:
+        felt, felt_alone = (flats["wrench_upper"] for flats in (many.step(action)[0], alone.step(action[0])[0]))
         difference = max(difference, float(np.abs(felt[0] - felt_alone).max()))
-    timing, _ = timed(steps, repeat)
-    share = timing.median / STEPS / NUMBER  # of one environment in a step
-    resets, _ = timed(lambda: [many.reset() for _ in range(ROUNDS - 1)], repeat, warm=lambda: None)
-    many.close()
-    kept = resets.median / (ROUNDS - 1) / NUMBER
-    mean = (first / NUMBER + (ROUNDS - 1) * kept) / ROUNDS
-    of_step = Timing(tuple(each / STEPS for each in timing.samples), timing.processor / STEPS)
-    return [
+    each = [once(partial(many.step, action))[0] for action in actions[WARM:]]
+    timing = Timing(tuple(step.samples[0] for step in each), sum(step.processor for step in each) / STEPS)
+    share = sum(timing.samples) / STEPS / NUMBER  # of one environment in a step: of the mean, for random steps differ
+    rows = [
         Measurement(
-            of_step, difference, "N difference", "the first of them alone", f"{words}: a step of {NUMBER}",
-            figures={"env_steps_per_s": 1 / share, "cpu_ms_per_env_step": of_step.processor / NUMBER * 1e3},
-        ),
-        Measurement(
-            Timing((mean,), resets.processor / (ROUNDS - 1) / NUMBER), mean / share, "control steps",
-            "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds with the first",
-            figures={"kept_ms": kept * 1e3, "first_ms": first / NUMBER * 1e3},
-        ),
+            timing, difference, "N difference", "the first of them alone", f"{words}: a step of {NUMBER}",
+            figures={"env_steps_per_s": 1 / share, "cpu_ms_per_env_step": timing.processor / NUMBER * 1e3},
+        )
     ]  # fmt: skip
+    if resets:
+        again, _ = once(lambda: [many.reset() for _ in range(ROUNDS - 1)])
+        kept = again.median / (ROUNDS - 1) / NUMBER
+        mean = (first / NUMBER + (ROUNDS - 1) * kept) / ROUNDS
+        rows.append(
+            Measurement(
+                Timing((mean,), again.processor / (ROUNDS - 1) / NUMBER), mean / share, "control steps",
+                "one environment's share of a step", f"{words}: a reset, mean of {ROUNDS} rounds with the first",
+                figures={"kept_ms": kept * 1e3, "first_ms": first / NUMBER * 1e3},
+            )
+        )  # fmt: skip
+    many.close()
+    return rows
 
 
 def transfer(preset: str, repeat: int) -> list[Measurement]:

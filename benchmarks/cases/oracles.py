@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-from benchmarks.harness.measure import Measurement, Timing
+from benchmarks.harness.measure import Measurement, Timing, once
 from benchmarks.harness.runner import Case
 from benchmarks.truth import finite_elements as truth
 from tacsim.models.scene import Cylinder, Indenter, Scene, Shape, Sphere
 
 if TYPE_CHECKING:
     from robot.studies.press import PressResult
-
-T = TypeVar("T")
 
 FINE = "h 0.25 mm"  # no preset: half of standard's spacings
 RESOLUTIONS = ("learn", "draft", "standard", FINE)
@@ -72,13 +69,6 @@ def beside(
     return Measurement(timing, abs(found / true - 1) * 100, "%", truth.WORDS, what, figures=both, note=note)
 
 
-def once(run: Callable[[], T]) -> tuple[Timing, T]:
-    """What `run` takes, with kernels that may have to be loaded first: here errors count, not seconds."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    result = run()
-    return Timing((time.perf_counter() - wall,), time.process_time() - cpu), result
-
-
 def _press(
     resolution: str, shape: Shape, friction: float, depth: float, slide: float = 0.0, twist: float = 0.0
 ) -> tuple[Timing, PressResult]:
@@ -86,7 +76,8 @@ def _press(
     from tacsim.config import load_sensor
 
     fineness = {"element_size": 0.25e-3} if resolution == FINE else {"preset": resolution}
-    indenter = Indenter(geometry=shape, friction=friction)
+    sharp = 0.0 if isinstance(shape, Cylinder) else None  # as those of the solver
+    indenter = Indenter(geometry=shape, friction=friction, edge_radius=sharp)
     scene = Scene.model_validate({"body": None, "indenter": indenter, **fineness})
     return once(lambda: press(scene, load_sensor("ideal"), PressMotion(depth, (slide, 0.0), twist)))
 

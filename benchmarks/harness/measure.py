@@ -67,6 +67,13 @@ def timed(run: Callable[[], T], repeat: int, warm: Callable[[], object] | None =
     return Timing(tuple(samples), float(np.median(processor))), result
 
 
+def once(run: Callable[[], T]) -> tuple[Timing, T]:
+    """What a single `run` takes, with kernels that may have to be loaded first."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = run()
+    return Timing((time.perf_counter() - wall,), time.process_time() - cpu), result
+
+
 def _worth_another(samples: Sequence[float]) -> bool:
     return sum(samples) < BUDGET or (len(samples) < MIN_REPETITIONS and max(samples) < LONG_REPETITION)
 

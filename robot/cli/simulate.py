@@ -29,7 +29,7 @@ def press(
     size: Annotated[
         Any, typer.Option(parser=quantities("length", 3), metavar="X,Y,Z", help="Of a box.")
     ] = "5 mm, 5 mm, 5 mm",
-    edge_radius: Annotated[Any, length("Of a box's or cylinder's edges.")] = "0 mm",
+    edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None,
     scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
     set_: Overrides = None,
@@ -44,7 +44,9 @@ def press(
     from tacsim.config import load_scene, load_sensor
 
     folder = new_directory(out, "press")
-    shape = [_geometry(indenter, radius, height, size, scale), f"indenter.edge_radius={edge_radius!r}"]
+    shape = [_geometry(indenter, radius, height, size, scale)]
+    if edge_radius is not None:
+        shape.append(f"indenter.edge_radius={edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
     sensor = load_sensor("ideal")
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
@@ -61,9 +63,9 @@ def press(
     results.print(f"contact radius   {config['contact_radius'] * 1e3:.3f} mm")
     results.print(f"deepest          {config['deepest'] * 1e3:.3f} mm")
     if config["edge_radius"] is not None:
-        results.print(
-            f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{'' if config['edge_radius'] else ' (sharp)'}"
-        )
+        given = config["indenter"]["edge_radius"]
+        words = " (what the mesh carries; --edge-radius '0 mm' for sharp edges)" if given is None else ""
+        results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if given == 0 else words}")
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         do = "raise settling.max_substeps"

@@ -147,29 +147,42 @@ class Indenter(Config):
     """A rigid body pressed on one gel; no particles are needed for it."""
 
     geometry: Shape = Sphere(radius=4e-3)
-    edge_radius: Annotated[Length, Field(ge=0)] = 0.0  # of a box's or cylinder's edges, rounded within its size [m]
+    # of a box's or cylinder's edges, rounded within its size [m]; None: as the mesh carries them (`rounding`); 0: sharp
+    edge_radius: Annotated[Length, Field(ge=0)] | None = None
     friction: Annotated[float, Field(ge=0, le=5)] = 0.6
     yaw: Angle = 0.0
 
     @model_validator(mode="after")
     def _edges_fit(self) -> Self:
-        geometry, radius = self.geometry, self.edge_radius
+        geometry, radius = self.geometry, self.edge_radius or 0.0
         if radius > 0 and not isinstance(geometry, Box | Cylinder):
             has = "a sphere has no edges" if isinstance(geometry, Sphere) else "the edges of an STL file are as drawn"
             raise ValueError(f"edge_radius is {radius:g} m, but {has}; leave it out")
         if isinstance(geometry, Box | Cylinder):
-            sides = geometry.size if isinstance(geometry, Box) else (2 * geometry.radius, geometry.height)
-            if radius > min(sides) / 2:
+            half = _shortest_side(geometry) / 2
+            if radius > half:
                 raise ValueError(
-                    f"edge_radius is {radius:g} m; at most half the shortest side of the {geometry.shape}, "
-                    f"{min(sides) / 2:g} m"
+                    f"edge_radius is {radius:g} m; at most half the shortest side of the {geometry.shape}, {half:g} m"
                 )
         return self
 
     def catches(self, element: float) -> bool:
         """Its edges are sharper than a mesh of such elements [m] follows in a slide: they hang on to its points and
         snap off (docs/decisions/0002)."""
-        return isinstance(self.geometry, Box | Cylinder) and self.edge_radius < CATCHING * element * (1 - 1e-9)
+        return isinstance(self.geometry, Box | Cylinder) and self.rounding(element) < CATCHING * element * (1 - 1e-9)
+
+    def rounding(self, element: float) -> float:
+        """Radius of its edges [m] on a mesh of such elements [m]: where none is given the least that does not catch,
+        but no more than a quarter of its shortest side; 0 of a ball, and of a mesh, whose edges are as drawn."""
+        if not isinstance(self.geometry, Box | Cylinder):
+            return 0.0
+        if self.edge_radius is not None:
+            return self.edge_radius
+        return min(CATCHING * element, _shortest_side(self.geometry) / 4)
+
+
+def _shortest_side(geometry: Box | Cylinder) -> float:
+    return min(geometry.size if isinstance(geometry, Box) else (2 * geometry.radius, geometry.height))
 
 
 class Settling(Config):

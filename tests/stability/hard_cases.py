@@ -80,7 +80,9 @@ def indented(geometry: Any, **more: Any):
 
     def scene(_: str) -> Scene:
         made = geometry() if callable(geometry) else geometry
-        return Scene(**{"gel": GEL, "settling": QUICK, **more}, body=None, indenter=Indenter(geometry=made))
+        sharp = 0.0 if isinstance(made, Box | Cylinder) else None
+        indenter = Indenter(geometry=made, edge_radius=sharp)
+        return Scene(**{"gel": GEL, "settling": QUICK, **more}, body=None, indenter=indenter)
 
     return scene
 

@@ -55,7 +55,7 @@ ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0
 # Of the speed of the gel's shear wave, of an indenter with friction: up to it a slide ends within 2 % of a slow one; at
 # 0.25 it is up to 3 % off, at 0.5 up to 17 %
 HURRIED_BY_SHEAR = 0.155
-# Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 18 % off
+# Element sizes that an edge which catches on the mesh may be slid: further, drag is up to 50 % off
 SLID_BY_EDGES = 0.5
 
 

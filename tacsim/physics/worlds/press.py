@@ -188,7 +188,7 @@ class PressState(FemState):
         _require_resolved(scene.indenter.geometry, self.gel[index])
         kind, size, mesh = _shape_params(scene.indenter.geometry)
         self.counts[index, KIND], self.params[index, SHAPE : SHAPE + 3] = kind, size
-        self.params[index, EDGE_RADIUS] = scene.indenter.edge_radius * MM
+        self.params[index, EDGE_RADIUS] = scene.indenter.rounding(scene.element) * MM
         self.params[index, SHAPE_SPACING] = GRID_SPACING * MM
         if mesh is not None:
             self.params[index, SHAPE_ORIGIN : SHAPE_ORIGIN + 3] = mesh.origin * MM
@@ -352,7 +352,7 @@ class PressWorld(FemWorld):
             assert mesh is not None
             lowest = mesh.vertices[np.argmax(mesh.vertices @ down)]
         else:
-            lowest = farthest(geometry, down, self.scene.indenter.edge_radius)
+            lowest = farthest(geometry, down, self.scene.indenter.rounding(self.scene.element))
         tip = rows[:3] @ (lowest * MM) + rows[3]
         if (np.abs(tip[:2]) > np.array(self._gel.half) - spacing).any():
             return  # beside the gel, or at its rim

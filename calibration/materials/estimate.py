@@ -25,7 +25,7 @@ from tacsim.interface import FloatArray
 DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
 PLACE_DIFFERENCE = 0.02e-3  # the same of places [m]
 LONGEST = 0.7  # a step changes no free number by more: a factor of two
-MOST_STEPS, MOST_FINE = 12, 3
+MOST_STEPS, FEWER_STEPS, MOST_FINE = 12, 2, 4
 SMALL_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 SMALL_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
 SMALL_SPREAD = 0.3  # of their standard deviations, likewise
@@ -35,7 +35,7 @@ HELD = 0.5  # standard deviation of a free number that is held where it was, as 
 HOPELESS = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
 UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
 COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
-SETTLED_ERROR = 0.005  # of any simulation: what its settling leaves
+SETTLED_ERROR = 0.01  # of any simulation: what its settling leaves
 MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
 
 
@@ -288,19 +288,29 @@ def estimate(
     state = _coarse(fitter, levels[0], state, coarse_error, on_step)
     for level in levels[1:-1]:
         on_step("next mesh")
-        state = fitter.stepped(fitter.linearise(level, state.point, state.zeros))
+        state = fitter.linearise(level, state.point, state.zeros)
+        state = fitter.stepped(_coarse(fitter, level, state, coarse_error / 2, on_step, FEWER_STEPS))
     while fitter.hold(state, fitter.reach(state), UNTOLD):
         state = fitter.stepped(state)
     while True:
         fit = _refined(fitter, state, levels[-1] if len(levels) > 1 else None, on_step)
-        if not fitter.hold(state, np.array([fit.half(each.name) for each in parameters]), UNTOLD):
+        plain = fit.with_sigma(fit.sigma)  # signals that scatter more than they should are no lack of them
+        if not fitter.hold(state, np.array([plain.half(each.name) for each in parameters]), UNTOLD):
             return fit
         state = fitter.stepped(state)
 
 
-def _coarse(fitter: _Fitter, predict: Predict, state: _State, error: float, on_step: Callable[[str], None]) -> _State:
+def _coarse(
+    fitter: _Fitter,
+    predict: Predict,
+    state: _State,
+    error: float,
+    on_step: Callable[[str], None],
+    most: int = MOST_STEPS,
+) -> _State:
+    """Damped steps by the simulation `predict`, off by a share of about `error`, `most` of them."""
     damping = 1e-3
-    for count in range(MOST_STEPS):
+    for count in range(most):
         fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
         on_step(f"step {count + 1}")
         after = fitter.linearise(predict, *fitter.moved(state, fitter.step(state, damping)))
@@ -325,7 +335,7 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         if count == 0:
             off = np.abs(exact - coarse)
         noise, settled = fitter.signals.noise, SETTLED_ERROR * np.abs(exact)
-        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT / 2 * off) ** 2)
+        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT * off) ** 2)
         here = _State(state.point, state.zeros, exact, state.system)
         state = fitter.stepped(here)
         spread = np.diag(covariance_of(state.system, fitter.sigma, fitter.priors, fitter.held, 0.0))[:p]

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from calibration.materials.checks import Finding, findings
-from calibration.materials.estimate import Fit, Priors, Signals, estimate
+from calibration.materials.estimate import COARSE_ERROR, Fit, Priors, Signals, estimate
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.recordings import Recordings
@@ -18,6 +18,7 @@ from robot.studies.identify.simulation import Simulation, coarser, scene_with
 from tacsim.models.scene import Scene, lame
 
 Kind = Literal["gel", "body"]
+MOMENTS = 16  # of a press, that are simulated
 FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
 LEAST_FRICTION, MOST_FRICTION = 0.01, 5.0
 MOST_POISSON = 0.499
@@ -77,7 +78,7 @@ def identify(
     priors: Priors,
     *,
     wanted: Sequence[str] = (),
-    most_moments: int = 16,
+    most_moments: int = MOMENTS,
     two_meshes: bool = True,
     gel_error: float = 0.0,
     on_step: Callable[[str], None] = lambda words: None,
@@ -101,13 +102,15 @@ def identify(
     signals = signals_of(taken, noise)
     start = scene_with(scene, {each.name: each.start for each in parameters})
     exact = Simulation(start, parameters, taken, recordings.seen, on_run)
+    error = COARSE_ERROR
     if two_meshes:
         levels = [replace(exact, scene=coarser(start)), exact]
-        if kind == "body":
+        if kind == "body" and 2 * levels[0].scene.element <= scene.gel.size[2] / 2:  # else nothing is left of the gel
             levels.insert(0, replace(exact, scene=coarser(levels[0].scene)))
+            error *= 2
     else:
         levels = [exact]
-    fit = estimate(levels, signals, parameters, priors, on_step=on_step)
+    fit = estimate(levels, signals, parameters, priors, error, on_step)
     if gel_error > 0 and kind == "body":
         fit = _with_gel_error(fit, signals, gel_error)
     found = scene_with(start, {each.name: fit.value(each.name) for each in fit.parameters})

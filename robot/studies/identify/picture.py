@@ -41,7 +41,7 @@ def draw(identified: Identified, table: Sequence[tuple[str, str, str]], path: Pa
         _forces(identified, column, rows[0], depth, ("fz",), "depth [mm]", press.name)
         _forces(identified, column, rows[1], aside, ("fx", "fy"), "sideways [mm]", "")
         _residuals(identified, column, rows[2])
-    figure.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.02 * (len(lines) + 1)))
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.99 - 0.016 * (len(lines) + 1)))
     save(figure, path)
 
 

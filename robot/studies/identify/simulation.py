@@ -58,7 +58,8 @@ class Simulation:
         self.on_run(len(jobs), len(jobs))
         result = []
         for point, each in zip(points, keys, strict=True):
-            scale = self._values(point).get("youngs_modulus", 1.0) / self._stiffness if self._scaled else 1.0
+            stiffness = self._values(point).get("youngs_modulus", self._stiffness)
+            scale = stiffness / self._stiffness if self._scaled else 1.0
             rows = []
             for press, key in zip(self.presses, each, strict=True):
                 for row, (name, values) in enumerate(press.readings.items()):

@@ -19,7 +19,7 @@ from tacsim.rig import Rig
 from tacsim.tasks import Squeeze
 
 NUMBER = 16  # environments of a batch
-STEPS = 8  # of all, each timed
+STEPS = 6  # of all, each timed
 WARM = 2  # before those
 ROUNDS = 10  # resets of each environment
 SMALLEST = ("width=16", "height=16", "pixel_pitch=1 mm")  # pictures for who does not look at them
@@ -42,12 +42,12 @@ CLOSING = 0.2e-3  # of each sensor in a control step [m]
 
 def random_actions(preset: str, motion: str, repeat: int) -> list[Measurement]:
     """Sixteen squeezes in one batch under random actions: heights and forces; at learn also with two pictures of
-    160 x 120, and their resets, each with a material, a size and a goal that are drawn from eight."""
+    160 x 120, and where motion flows their resets, each with a material, a size and a goal drawn from eight."""
     words = f"{motion}, heights and forces"
     rows = [_random_actions(preset, [f"motion={motion}", *pictures(SMALLEST)], words, resets=False)[0]]
     if preset == "learn":
         look = f"{motion}, two pictures of 160 x 120"
-        rows += _random_actions(preset, [f"motion={motion}", *pictures(SMALL)], look, resets=True)
+        rows += _random_actions(preset, [f"motion={motion}", *pictures(SMALL)], look, resets=motion == "flowing")
     return rows
 
 

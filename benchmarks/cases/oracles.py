@@ -35,7 +35,8 @@ def balls(resolution: str, repeat: int) -> list[Measurement]:
 
 
 def punches(resolution: str, repeat: int) -> list[Measurement]:
-    """Flat punches with sharp edges, 0.1 mm deep: force without friction, and the moment of one that sticks and turns by a degree."""
+    """Flat punches with sharp edges, 0.1 mm deep: force without friction, and the moment of one that sticks and turns
+    by a degree."""
     rows, depth, angle = [], 0.1e-3, math.radians(1.0)
     for radius, force in truth.PUNCHES.items():
         shape = Cylinder(radius=radius * 1e-3, height=4e-3)

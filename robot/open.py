@@ -10,7 +10,8 @@ from robot.common.code import CodeNotFound as CodeNotFound
 from robot.common.code import attribute
 from robot.rig import RIG_ATTACHMENT as RIG_ATTACHMENT
 from robot.rig import CannotOpen as CannotOpen
-from tacsim.config import LoadedRig, load, load_rig
+from tacsim.config import ConfigError, LoadedRig, load, load_rig
+from tacsim.config.errors import Place, Problem
 from tacsim.interface import RigSpec
 from tacsim.models.features import Features
 from tacsim.models.hardware import CameraSensorConfig
@@ -204,9 +205,15 @@ def _rigs_of_episodes(
     task: str | TaskConfig, rig: str | Path, overrides: Sequence[str], variants: Sequence[Sequence[str]]
 ) -> list[tuple[RigConfig, str]]:
     """The rig without a variant, then with each, and the variant in words."""
-    found = []
+    found: list[tuple[RigConfig, str]] = []
     for more in ((), *variants):
-        config = load_with_task(rig, task, [*overrides, *more]).config
+        try:
+            config = load_with_task(rig, task, [*overrides, *more]).config
+        except ConfigError as error:
+            if not more:
+                raise
+            of = Problem(Place(f"variant {len(found) - 1}"), "", "; ".join(more))
+            raise ConfigError([*error.problems, of]) from None
         if config.task is None:
             raise CannotOpen(f"rig '{config.name}' has no task; an environment needs one")
         _check_parts(config)

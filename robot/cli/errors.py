@@ -48,11 +48,13 @@ def explain(error: Exception) -> tuple[str, int]:
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
     from tacsim.physics.failure.dump import DumpError
+    from tacsim.tasks.task import GoalOutOfReach
 
     unusable = (
         ConfigError,
         CannotOpen,
         CodeNotFound,
+        GoalOutOfReach,
         PolicyNotFound,
         IncompatibleRig,
         CalibrationError,

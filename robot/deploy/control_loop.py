@@ -18,7 +18,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.report.series import FELT, LOST
 from tacsim.rig import Rig
-from tacsim.tasks import Task, judge
+from tacsim.tasks import GoalOutOfReach, Task, judge
 from tacsim.tasks.task import Estimator
 
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
@@ -88,6 +88,7 @@ def run_episode(
 
     Raises:
         IncompatibleRig: the rig lacks what policy or task needs; nothing has moved.
+        GoalOutOfReach: no policy could bring this body to the task's goal; nothing but the reset was done.
         EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the episode is kept in the exception.
     """
     if steps < 0:
@@ -96,6 +97,8 @@ def run_episode(
     started = time.perf_counter()
     observation = rig.reset(setup.seed)
     start = rig.truth()
+    if task is not None and start is not None:
+        _require_reachable(rig, task, start)
     rig.packages()  # those of before are not of this episode
     meta = _meta(rig, task, setup)
     sink = None if recorder is None else recorder(meta)
@@ -138,6 +141,14 @@ def run_episode(
         if sink is not None:
             sink.flush()
     return episode
+
+
+def _require_reachable(rig: Rig, task: Task, start: Truth) -> None:
+    try:
+        task.require_reachable(start)
+    except GoalOutOfReach:
+        rig.stop()
+        raise
 
 
 def versions() -> dict[str, str]:

@@ -87,6 +87,14 @@ class TaskConfig(Config):
     )
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 40  # length of an episode
 
+    @model_validator(mode="after")
+    def _touch_is_no_failure(self) -> Self:
+        if self.force_limit is not None and not self.touch_force < self.force_limit:
+            raise ValueError(
+                f"force_limit {self.force_limit:g} N: a reset presses by touch_force, {self.touch_force:g} N; give more"
+            )
+        return self
+
 
 class SqueezeConfig(TaskConfig):
     """Squeeze the body to a height: distance = |height - goal|; actions move both sensors along world z."""
@@ -171,6 +179,19 @@ class RigConfig(Config):
                 "this rig has no UR arm, whose packages could be recorded; leave it out",
                 {"at": ("record", "arm_packages")},
             )
+        for name, arm in self.arms.items():
+            limits = None if isinstance(arm, ReplayArmConfig) else arm.limits
+            if self.task is not None and limits is not None and not self.task.touch_force < limits.force:
+                raise PydanticCustomError(
+                    "touch_beyond_limit",
+                    "arm '{arm}' stops at {force} N, and a reset presses by task.touch_force, {touch} N; give more",
+                    {
+                        "arm": name,
+                        "force": f"{limits.force:g}",
+                        "touch": f"{self.task.touch_force:g}",
+                        "at": ("arms", name, arm.driver, "limits", "force"),
+                    },
+                )
         if isinstance(self.task, RepositionConfig):
             for name, load in self.task.loads.items():
                 self._check_load(name, load)

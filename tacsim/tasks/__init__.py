@@ -9,11 +9,12 @@ from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, Task
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
-from tacsim.tasks.task import Axis, Estimator, Outcome, Task, judge, tolerance
+from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Outcome, Task, judge, tolerance
 
 __all__ = [
     "Axis",
     "Estimator",
+    "GoalOutOfReach",
     "Knead",
     "Outcome",
     "Reposition",

@@ -15,7 +15,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.tasks.felt_shape import FeltShape
 from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spread
 from tacsim.tasks.squeeze import BOTH, estimated_height
-from tacsim.tasks.task import Axis, Estimator, Task
+from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
 OF_YIELD = 0.65  # best pressure of the scripted policy, over the yield stress: softer clay is rolled at less
 THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
@@ -28,6 +28,15 @@ class Knead(Task):
     """distance = Chamfer's between the body and the solid, both at one place."""
 
     config: KneadConfig
+
+    def require_reachable(self, start: Truth) -> None:
+        sizes = zip(self.goal[:2], self.config.scene.gel.size[:2], "xy", strict=True)
+        for wanted, there, axis in sizes:
+            if wanted > there:
+                raise GoalOutOfReach(
+                    f"task: the {self.config.shape} would be {1e3 * wanted:.3g} mm long along {axis}, the gels are "
+                    f"{1e3 * there:g} mm; give it less slenderness, or a smaller body"
+                )
 
     @property
     def needs_to_feel(self) -> Needs:

@@ -11,7 +11,7 @@ from tacsim import pose as se3
 from tacsim.interface import Action, ArmState, FloatArray, Needs, Observation, Policy, Pose, Truth
 from tacsim.models.rig import RepositionConfig
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.task import Axis, Estimator, Task
+from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
 REACHED = 0.02e-3  # the scripted policy holds when its estimate is this close to the goal [m]
 LEAST_FORCE = 0.01  # a smaller normal force counts as no contact [N]
@@ -22,6 +22,16 @@ class Reposition(Task):
     """distance = ||position - goal||_2, position = centre of mass minus its value at reset, world x and y."""
 
     config: RepositionConfig
+
+    def require_reachable(self, start: Truth) -> None:
+        there = start.position + [*self.config.goal, 0.0] - start.poses["lower"].position if start.poses else None
+        half = np.array(self.config.scene.gel.size[:2]) / 2
+        if there is not None and (np.abs(there[:2]) > half).any():
+            goal = ", ".join(f"{1e3 * each:g}" for each in self.config.goal)
+            raise GoalOutOfReach(
+                f"task.goal: the body would leave the gel of sensor 'lower' on its way by ({goal}) mm, which reaches "
+                f"{1e3 * half[0]:g} and {1e3 * half[1]:g} mm from its middle; give a nearer goal"
+            )
 
     @property
     def needs_to_feel(self) -> Needs:

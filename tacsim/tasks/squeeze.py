@@ -9,7 +9,7 @@ import numpy as np
 from tacsim.interface import Action, FloatArray, Needs, Observation, Policy, Pose, TactileObservation, Truth
 from tacsim.models.rig import SqueezeConfig
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.tasks.task import Axis, Estimator, Task
+from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
 BOTH = frozenset({"lower", "upper"})
 LEAST_SHARE = 0.1  # of the sensors' way that a body is taken to give
@@ -21,6 +21,14 @@ class Squeeze(Task):
     """distance = |height - goal|, height = z-extent of the body."""
 
     config: SqueezeConfig
+
+    def require_reachable(self, start: Truth) -> None:
+        if self.config.goal > start.height + self.config.success:
+            goal, height = 1e3 * self.config.goal, 1e3 * start.height
+            raise GoalOutOfReach(
+                f"task.goal: {goal:g} mm is above the body, which is {height:.3g} mm high: squeezing makes it lower; "
+                "give a lower goal"
+            )
 
     @property
     def needs_to_feel(self) -> Needs:

@@ -23,6 +23,10 @@ class Axis:
     direction: tuple[float, float, float]  # unit vector, world
 
 
+class GoalOutOfReach(ValueError):
+    """No policy can reach this goal with this body."""
+
+
 class Task(ABC):
     """A goal for the body between the sensors. Immutable: the state of an episode is in the two truths.
 
@@ -44,6 +48,10 @@ class Task(ABC):
     @abstractmethod
     def distance(self, truth: Truth, start: Truth) -> float:
         """Distance of the body from the goal [m]; `start` is the truth just after reset."""
+
+    def require_reachable(self, start: Truth) -> None:
+        """Raises GoalOutOfReach where no policy could bring the body there from `start`."""
+        return
 
     @property
     def needs(self) -> Needs:

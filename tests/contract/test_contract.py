@@ -57,7 +57,7 @@ def open_sim(folder: Path) -> Rig:
 def open_episode(folder: Path) -> Rig:
     """A replay of an episode that the simulation recorded."""
     path = folder / "episode.mcap"
-    loaded = load_rig("sim", overrides=[*SMALL, *PICTURE])
+    loaded = load_rig("sim", overrides=[*SMALL, *PICTURE, "task.goal=3 mm"])
     assert loaded.config.task is not None
     task = make_task(loaded.config.task)
     recorders: list[Recorder] = []

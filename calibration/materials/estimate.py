@@ -43,6 +43,10 @@ class NotIdentified(CalibrationError):
     """These presses do not tell what was asked for."""
 
 
+class CannotSimulate(CalibrationError):
+    """A press has no simulated counterpart with such materials."""
+
+
 @dataclass(frozen=True, slots=True)
 class Point:
     """Where a simulation is run."""
@@ -277,7 +281,7 @@ def estimate(
     the way; the last but one gives the Jacobian; the finest puts it right. on_step: told what is being done.
 
     Parameters whose interval would reach farther than a factor of 1.8 each way are held at their start, the least told
-    first (`Fit.untold`). Raises NotIdentified when nothing is told.
+    first (`Fit.untold`). Raises NotIdentified when nothing is told, CannotSimulate when no smaller step helps.
     """
     fitter = _Fitter(signals, parameters, priors)
     begin = Point(starts(parameters), np.zeros(signals.presses))
@@ -313,7 +317,13 @@ def _coarse(
     for count in range(most):
         fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
         on_step(f"step {count + 1}")
-        after = fitter.linearise(predict, *fitter.moved(state, fitter.step(state, damping)))
+        try:
+            after = fitter.linearise(predict, *fitter.moved(state, fitter.step(state, damping)))
+        except CannotSimulate:
+            if count + 1 == most:
+                raise
+            damping = max(damping, 1e-3) * 100  # the step went too far
+            continue
         gain = fitter.cost(state) - fitter.cost(after)
         if gain > 0:
             state, damping = after, damping / 10

@@ -90,7 +90,7 @@ def identify(
     on coarser meshes, and put right on the scene's own; else the scene's own does all. gel_error: standard
     deviation of the gels' stiffness, as a share of it, carried into the body's intervals.
 
-    Raises NotIdentified, ValueError for a name that is none, SimulationDiverged.
+    Raises NotIdentified, ValueError for a name that is none, CannotSimulate.
     """
     parameters = parameters_of(kind, scene)
     names = [each.name for each in parameters]

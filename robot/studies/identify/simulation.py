@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.materials.estimate import Point
+from calibration.materials.estimate import CannotSimulate, Point
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Press
 from tacsim import pose as se3
@@ -47,7 +47,7 @@ class Simulation:
     on_run: Callable[[int, int], None] = lambda done, total: None
 
     def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
-        """(m,) signals at each point, in the order of `signals_of`. Raises SimulationDiverged."""
+        """(m,) signals at each point, in the order of `signals_of`. Raises CannotSimulate."""
         keys = [[self._key(point, place, index) for index, place in enumerate(point.places)] for point in points]
         jobs = list(dict.fromkeys(key for each in keys for key in each))
         ran: dict[Job, FloatArray] = {}
@@ -107,7 +107,11 @@ class Simulation:
             ]
             for member, ended in enumerate(batch.move(targets)):
                 if isinstance(ended, SimulationDiverged):
-                    raise ended
+                    values, _, index = jobs[member]
+                    told = ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
+                    raise CannotSimulate(
+                        f"{self.presses[index].name}, moment {moment + 1}, with {told}: {ended}"
+                    ) from ended
                 if targets[member] is not None:
                     found[member].append(self._signals(batch, member, self.presses[jobs[member][2]]))
         return [np.array(rows).T for rows in found]

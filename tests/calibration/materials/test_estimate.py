@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.materials.checks import findings
-from calibration.materials.estimate import Fit, NotIdentified, Point, Priors, Signals, estimate
+from calibration.materials.estimate import CannotSimulate, Fit, NotIdentified, Point, Priors, Signals, estimate
 from calibration.materials.parameters import Parameter
 from tacsim.interface import FloatArray
 
@@ -151,3 +151,19 @@ def test_a_coarse_simulation_is_put_right_by_a_finer_one() -> None:
     assert fit.mesh_shift[0] == pytest.approx(np.log(1.15), abs=0.03)
     low, high = fit.interval("youngs_modulus")
     assert np.log(high / low) / 2 > 1.9 * 0.5 * np.log(1.15)
+
+
+def test_a_step_that_cannot_be_simulated_is_made_smaller() -> None:
+    """A little beyond the true stiffness nothing can be simulated; the fit begins softer, and its step overshoots."""
+    soft, signals = Parameter("youngs_modulus", 0.1e6, 1e3, 1e9), recorded(8)
+    right, refused = model(["youngs_modulus"]), []
+
+    def predict(points: Sequence[Point]) -> list[FloatArray]:
+        if any(soft.value(float(point.free[0])) > 1.09 * E for point in points):
+            refused.append(points)
+            raise CannotSimulate("too stiff")
+        return right(points)
+
+    # the linear step from 0.1 MPa asks for 0.1 exp(0.8) MPa, bounded by a factor of two: 0.201 MPa
+    fit = estimate([predict], signals, (soft,), PRIORS, coarse_error=0.0)
+    assert refused and fit.value("youngs_modulus") == pytest.approx(E, rel=0.05)

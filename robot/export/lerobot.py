@@ -57,14 +57,17 @@ def export_lerobot(
         raise ValueError("data sets are written by pyarrow, which is not installed: pip install 'tacsim[export]'")
     episodes = [observe_episode(path) for path in paths]
     fps = _check(episodes, cut)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}")
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    home = next(place for place in folder.absolute().parents if place.is_dir())
+    partial = home / f".{folder.name}.{os.getpid()}"
     partial.mkdir()
     try:
         _write(episodes, partial, fps, task, maps, on_step)
+        folder.parent.mkdir(parents=True, exist_ok=True)
         partial.rename(folder)  # onto an empty folder, or nothing: onto another it fails
-    except BaseException:
+    except BaseException as failure:
         shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(failure, OSError) and failure.filename is None:  # a disk that fills up does not say where
+            failure.filename = str(folder)
         raise
 
 

@@ -64,6 +64,7 @@ def _written(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[],
     """Whole, or not at all. Gives what raises the OSError that has ended the writing."""
     if file.exists():
         raise FileExistsError(EEXIST, "exists already; name a new file, nothing is overwritten", str(file))
+    file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         with partial.open("xb") as target, tempfile.TemporaryDirectory() as folder:

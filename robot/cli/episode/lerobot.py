@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from robot.cli.output import busy, counted, new_directory, notes, say_files, writing
+from robot.cli.output import busy, counted, new_directory, notes, say_files
 
 
 def lerobot(
@@ -32,7 +32,7 @@ def lerobot(
     with busy("loading"):
         from robot.export.lerobot import export_lerobot
 
-    with counted("exporting") as on_step, writing(folder.parent):
+    with counted("exporting") as on_step:
         export_lerobot(episodes, folder, task=task, maps=maps, cut=cut, on_step=on_step)
     notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")', markup=False)
     say_files(folder)

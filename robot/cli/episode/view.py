@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from robot.cli.output import busy, counted, say_files, writing
+from robot.cli.output import busy, counted, say_files
 
 
 def view(
@@ -27,7 +26,7 @@ def view(
         raise typer.BadParameter(f"{save} must end in .rrd, as the viewer's files do", param_hint="--save")
     with busy("loading"):
         from robot.export.rerun_view import view_episode
-    with counted("reading") as on_step, nullcontext() if save is None else writing(save.parent):
+    with counted("reading") as on_step:
         view_episode(episode, save, on_step)
     if save is not None:
         say_files(save)

@@ -192,7 +192,7 @@ def test_what_makes_no_data_set_is_refused_and_nothing_left(
 ) -> None:
     given = make()
     before = sorted(tmp_path.iterdir())
-    done = tacsim("export", "lerobot", *given, "--out", "set")
+    done = tacsim("export", "lerobot", *given, "--out", "data/set")
     assert done.exit_code in (1, 2) and words in done.stderr.replace("\n", " "), done.stderr
     assert sorted(tmp_path.iterdir()) == before
 
@@ -224,5 +224,5 @@ def test_a_full_disk_leaves_nothing_half(tmp_path: Path) -> None:
         text=True,
         timeout=120,
     )
-    assert process.returncode == 1 and "File too large" in process.stderr, process.stderr
+    assert process.returncode == 1 and "set: " in process.stderr and "File too large" in process.stderr
     assert sorted(tmp_path.iterdir()) == [tmp_path / "a.mcap"]

@@ -103,7 +103,7 @@ def test_the_file_is_whole_and_never_written_over(tmp_path: Path) -> None:
     assert again.exit_code == 1 and "a.rrd: exists already" in again.stderr
     assert Path("a.rrd").read_bytes() == before
     assert tacsim("view", str(path), "--save", "a.txt").exit_code == 2
-    assert "none.mcap: no such file" in tacsim("view", "none.mcap", "--save", "b.rrd").stderr
+    assert "none.mcap: no such file" in tacsim("view", "none.mcap", "--save", "none/b.rrd").stderr
     assert "a.mcap" in tacsim("view", str(path), "--save", "a.mcap/b.rrd").stderr
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.mcap", "a.rrd"]
 

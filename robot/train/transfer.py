@@ -141,6 +141,8 @@ def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str,
         episode: Episode = run_episode(rig, acts, task, steps, setup=EpisodeSetup(policy, number, canonical=canonical))
     except EpisodeFailed as failed:
         episode, error = failed.episode, str(failed)
+    if not error and len(episode.steps) <= steps:
+        raise KeyboardInterrupt  # which a run takes for its end: that is no result
     distances = [step.distance for step in episode.steps if step.distance is not None]
     forces = [abs(float(arm.wrench[2])) for step in episode.steps for arm in step.arms.values()]
     last = distances[-1] if distances else None

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robot.deploy.python_policy import FunctionPolicy
 from robot.mock.cell.cell import MockCell, _true_frames
 from robot.mock.cell.sim_server import SceneFrame
 from robot.mock.fixtures import rig_addresses
@@ -17,11 +18,12 @@ from robot.open import open_rig
 from robot.train import transfer
 from robot.train.transfer import Played, Side, Study, _loaded, picture, play, summary
 from tacsim.config import load, load_rig
-from tacsim.interface import Action, Pose
+from tacsim.interface import Action, Observation, Pose
 from tacsim.models.hardware import UrArmConfig
 from tacsim.models.randomisation import Randomisation
 from tests.robot.cli.invoked import tacsim
 from tests.robot.rig.test_hardware_rig_simulated import SMALL, TINY
+from tests.tacsim.gym.small import SMALL as TINY_GELS
 
 TWIN = {
     "task.goal": {"uniform": ["3.3 mm", "3.6 mm"]},
@@ -121,6 +123,17 @@ def test_a_study_that_is_killed_goes_on_where_it_was(tmp_path: Path, monkeypatch
     assert len(asked) == 13  # what was mended is whole now
     with pytest.raises(ValueError, match="has a study of other settings; name another folder"):
         play(study(steps=3), tmp_path, lambda *_: None)
+
+
+def test_an_episode_that_is_interrupted_is_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(observation: Observation) -> Action:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(transfer, "load_policy", lambda *_: FunctionPolicy(interrupted))
+    monkeypatch.setattr(transfer, "_loaded", lambda *_: load_rig("sim", overrides=TINY_GELS))
+    with pytest.raises(KeyboardInterrupt):
+        play(study(policies=("mine",)), tmp_path, lambda *_: None)
+    assert (tmp_path / transfer.ROWS).read_text() == ""
 
 
 def test_the_table_says_success_distance_and_how_well_it_is_felt(tmp_path: Path) -> None:

@@ -7,9 +7,6 @@ is refused with a word on what to do.
 from __future__ import annotations
 
 import hashlib
-import json
-import re
-import stat
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -21,18 +18,27 @@ from pydantic import Field, model_validator
 from calibration.errors import CalibrationError
 from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
-from tacsim.config import ConfigError, load
+from tacsim.config import ConfigError, load, load_sensor
+from tacsim.config.bundle import (
+    AGAIN,
+    FILE,
+    FORMATS,
+    REFERENCE,
+    NoBundle,
+    digest,
+    find_bundle,
+    read_files,
+    require_unchanged,
+)
 from tacsim.models.hardware import Placement
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.quantity import Config, Length, Time
-from tacsim.models.sensor import CameraNoise, Lighting, Markers, SensorGeometry, SensorModel
+from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry, SensorModel
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
-FORMAT = 3
-NOT_YET = {1: {"view", "noise"}, 2: {"noise"}, 3: set[str]()}  # by format: the fields it lacks
-FILE, REFERENCE = "calibration.yaml", "reference.png"
-MAX_FILE_SIZE, MAX_PICTURE_SIZE = 1 << 20, 1 << 26  # [bytes] of the YAML, and of the picture
+FORMAT = FORMATS[-1]
+NOT_YET = {1: {"view", "noise"}, 2: {"noise"}}  # by format: the fields it lacks
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -67,7 +73,7 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3]
+    format: Literal[1, 2, 3, 4]
     serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
@@ -99,15 +105,14 @@ class Calibration(Config):
             raise ValueError(f"gel_size is {self.gel_size} m, the picture of its geometry shows {shown} m")
         if self.view is not None and self.view.geometry != self.geometry:
             raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
-        for name in sorted(NOT_YET[self.format]):
+        for name in sorted(NOT_YET.get(self.format, ())):
             if getattr(self, name) is not None:
                 raise ValueError(f"format {self.format} has no {name}")
         return self
 
     def digest(self) -> str:
         """What `checksum` must be."""
-        content = self.model_dump(mode="json", exclude={"checksum"} | NOT_YET[self.format])
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return digest(self.model_dump(mode="json", exclude=NOT_YET.get(self.format)))
 
 
 def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.uint8]) -> Path:
@@ -124,40 +129,17 @@ def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.u
 
 
 def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDArray[np.uint8]]:
-    """The calibration at `path` (its folder or YAML file) and its picture without contact; `serial` is the sensor that
-    it must belong to. Raises BadBundle."""
-    again = "make it again with `tacsim calibrate sensor`"
-    file = path
+    """The calibration at `path` (its folder or YAML file, or its name if it lies in `sensors/`) and its picture without
+    contact; `serial` is the sensor that it must belong to. Raises BadBundle."""
     try:
-        file = path / FILE if path.is_dir() else path
-        for part, most in ((file, MAX_FILE_SIZE), (file.with_name(REFERENCE), MAX_PICTURE_SIZE)):
-            about = part.stat()
-            if not stat.S_ISREG(about.st_mode):  # a pipe would be waited for
-                raise BadBundle(f"{part} is no file: a calibration is a folder with {FILE} and {REFERENCE}")
-            if about.st_size > most:
-                raise BadBundle(f"{part}: {about.st_size} bytes is too much for a calibration; {again}")
-        text = file.read_text(encoding="utf-8")
-        png = file.with_name(REFERENCE).read_bytes()
-    except FileNotFoundError as missing:
-        raise BadBundle(
-            f"{missing.filename} is not there: a calibration is a folder with {FILE} and {REFERENCE}"
-        ) from None
-    except (OSError, UnicodeDecodeError) as failure:
-        raise BadBundle(f"{file}: cannot be read: {failure}") from failure
-    version = re.search(r"^format:\s*(\S+)", text, re.MULTILINE)
-    if version is None:
-        raise BadBundle(f"{file} is no calibration: it names no format")
-    if version[1] not in map(str, NOT_YET):
-        known = ", ".join(map(str, NOT_YET))
-        raise BadBundle(f"{file} has format {version[1]}, this version of tacsim reads {known}; {again}")
-    try:
-        calibration = load(Calibration, file)
-    except ConfigError as error:
-        raise BadBundle(f"{file} is damaged; {again}.\n{error}") from None
-    if calibration.checksum != calibration.digest():
-        raise BadBundle(f"{file} was changed since it was written (its checksum differs); {again}")
-    if hashlib.sha256(png).hexdigest() != calibration.reference:
-        raise BadBundle(f"{file.with_name(REFERENCE)} is not the picture of this calibration (its checksum differs)")
+        file, content, png = read_files(find_bundle(path))
+        try:
+            calibration = load(Calibration, file)
+        except ConfigError as error:
+            raise BadBundle(f"{file} is damaged; {AGAIN}.\n{error}") from None
+        require_unchanged(file, content, png)
+    except NoBundle as why:
+        raise BadBundle(str(why)) from None
     if serial is not None and serial != calibration.serial:
         raise BadBundle(f"{file} belongs to sensor '{calibration.serial}', not to '{serial}'")
     try:
@@ -171,19 +153,9 @@ def read_bundle(path: Path, serial: str | None = None) -> tuple[Calibration, NDA
 
 
 def read_sensor_model(path: Path) -> SensorModel:
-    """The simulated twin of a calibrated sensor, as its rectified picture shows it: geometry, untouched picture, light,
-    and the camera's noise if it was measured.
-
-    Raises BadBundle.
-    """
-    calibration, _ = read_bundle(path)
-    folder = path if path.is_dir() else path.parent
-    return SensorModel(
-        name=calibration.serial,
-        geometry=calibration.geometry,
-        lighting=Lighting(background=str(folder / REFERENCE)),
-        photometric=calibration.forward,
-        texture=0.0,  # the picture has the gel's own
-        noise=calibration.noise,
-        source=f"calibration of {calibration.serial}, {calibration.provenance.made}",
-    )
+    """The simulated twin of a calibrated sensor: geometry, view, untouched picture, light, dots, gel size, and the
+    camera's noise if it was measured. Raises BadBundle."""
+    try:
+        return load_sensor(find_bundle(path))
+    except ConfigError as error:
+        raise BadBundle(str(error)) from None

@@ -18,7 +18,8 @@ from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
 from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view, seen_box
 from calibration.lens.view import GelView
-from calibration.markers.flow import MarkerFlow, marker_grid, require_no_markers
+from calibration.markers.flow import MarkerFlow, NoMarkers, find_markers, marker_grid, require_no_markers
+from calibration.markers.lattice import NoLattice
 from calibration.reference import (
     LOST_COLOUR,
     LOST_SLOPE,
@@ -35,7 +36,7 @@ from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry, SensorModel
-from tacsim.optics.grid import canonical_cells, canonical_image
+from tacsim.optics.grid import PixelGrid, canonical_cells, canonical_image
 
 
 class NoReference(RuntimeError):
@@ -225,16 +226,26 @@ def normaliser_for_simulation(
     model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid
 ) -> FrameNormaliser:
     """The normaliser of a simulated sensor; `gel_size`: x, y [m]."""
-    return FrameNormaliser(from_geometry(model.geometry, gel_size, canonical_image(grid)), grid)
+    return FrameNormaliser(_of_model(model, gel_size, canonical_image(grid)), grid)
 
 
 def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
     gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
-    without inverse, or markers too small for the image."""
-    rectify = from_geometry(model.geometry, gel_size, extended_view(grid, gel_size))
+    without inverse, a calibrated one (its inverse is in its bundle), or markers too small for the image."""
+    if model.photometric is not None:
+        raise ValueError(
+            f"the light of model '{model.name}' is a calibrated one, whose inverse stands in its bundle: give the "
+            "camera `calibration: BUNDLE` in place of `model`"
+        )
+    rectify = _of_model(model, gel_size, extended_view(grid, gel_size))
     find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None)
-    return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size))
+    return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size, model.view))
+
+
+def _of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
+    """From the pictures that a sensor of this model delivers."""
+    return from_geometry(model.geometry, gel_size, grid) if model.view is None else from_view(model.view, grid)
 
 
 def normaliser_for_calibration(
@@ -261,17 +272,37 @@ def normaliser_for_calibration(
 
 
 def normaliser_for_recording(
-    config: ReplaySensorConfig, image_shape: tuple[int, int], grid: CanonicalGrid
+    config: ReplaySensorConfig,
+    image_shape: tuple[int, int],
+    grid: CanonicalGrid,
+    untouched: NDArray[np.uint8] | None = None,
 ) -> FrameNormaliser:
-    """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, or through the
-    four corners of the gel.
+    """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, by the dots that
+    are seen in its picture without contact (`untouched`) and their distance, or through the four corners of the gel.
 
-    Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle.
+    Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle, calibration.markers.flow.NoMarkers.
     """
+    if config.marker_pitch is not None and untouched is not None:
+        return normaliser_for_dots(config.marker_pitch, untouched, grid)
     if config.calibration is not None:
         return _of_bundle(config.calibration, image_shape, grid)
     seen = from_corners(config.corners, config.size, image_shape, canonical_image(grid))
     return FrameNormaliser(seen, grid, drifts=True)
+
+
+def normaliser_for_dots(pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid) -> FrameNormaliser:
+    """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
+    picture without contact: flow, no height. The camera looks straight on. Raises NoMarkers."""
+    try:
+        lattice, radius = find_markers(untouched)
+    except NoLattice as nothing:
+        raise NoMarkers(f"{nothing}: marker_pitch needs the dots of the picture without contact") from None
+    scale = pitch / lattice.pitch
+    (rows, columns), (high, wide) = lattice.present.shape, untouched.shape[:2]
+    geometry, size = SensorGeometry(width=wide, height=high, pixel_pitch=scale), (wide * scale, high * scale)
+    markers = Markers(rows=rows, columns=columns, pitch=pitch, radius=radius * scale)
+    rectify = from_geometry(geometry, size, canonical_image(grid))
+    return FrameNormaliser(rectify, grid, markers=_marker_flow(markers, geometry, size), drifts=True)
 
 
 def normaliser_for_camera(

@@ -248,11 +248,11 @@ def _check_parts(config: RigConfig) -> None:
             )
     for name, sensor in config.sensors.items():
         if isinstance(sensor, CameraSensorConfig) and sensor.model is not None:
-            shown = sensor.model.geometry
-            if (shown.width, shown.height) != (sensor.width, sensor.height):
+            rows, columns = sensor.model.image_shape
+            if (columns, rows) != (sensor.width, sensor.height):
                 raise CannotOpen(
                     f"rig '{config.name}': sensors.{name} delivers {sensor.width} x {sensor.height} px "
-                    f"(width, height), its model '{sensor.model.name}' shows {shown.width} x {shown.height}; "
+                    f"(width, height), its model '{sensor.model.name}' shows {columns} x {rows}; "
                     "make them alike"
                 )
         if isinstance(sensor, ReplaySensorConfig) and sensor.source is None:

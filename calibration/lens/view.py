@@ -8,17 +8,17 @@ as predicts left-out dots better.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from calibration.errors import CalibrationError
 from calibration.lens.board import Points
 from tacsim import pose as se3
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.quantity import Config, Length
-from tacsim.models.sensor import SensorGeometry
+from tacsim.models.geometry import GelView as GelView
+from tacsim.models.geometry import Lens as Lens
+from tacsim.models.geometry import Pair, seen_along
 
 MIN_PICTURES = 6  # for a lens
 MAX_RESIDUAL = 1.5  # of a lens, root mean square [px]
@@ -27,9 +27,6 @@ MIN_TILT = np.radians(8.0)  # of the board between pictures, root mean square [r
 MAX_MISFIT = 0.06  # of a plane: root mean square over the distance of neighbouring points
 MIN_POINTS = 6  # of a plane
 
-PixelCount = Annotated[int, Field(ge=16, le=8192)]
-Positive = Annotated[Length, Field(gt=0)]
-Pair = tuple[float, float]
 Corners = tuple[Pair, Pair, Pair, Pair]
 
 
@@ -39,78 +36,6 @@ class BadView(CalibrationError):
 
 class BadCorners(CalibrationError):
     """The four corners are not those of a rectangle in a picture."""
-
-
-class Lens(Config):
-    """A pinhole with distortion (Brown's model, as OpenCV has it)."""
-
-    width: PixelCount  # of the picture [px]
-    height: PixelCount
-    focal: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]  # fx, fy [px]
-    centre: Pair  # cx, cy [px]
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
-    residual: Annotated[float, Field(ge=0)] = 0.0  # root mean square of the calibration [px]
-
-    @property
-    def matrix(self) -> FloatArray:
-        """(3, 3) [px]"""
-        return np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1.0]])
-
-    def project(self, directions: FloatArray) -> FloatArray:
-        """(n, 2) pixels of lines of sight (n, 2), each as x/z, y/z."""
-        import cv2
-
-        ahead = np.concatenate([directions, np.ones((len(directions), 1))], axis=1)
-        pixels, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
-        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-
-    def directions(self, pixels: FloatArray) -> FloatArray:
-        """(n, 2) lines of sight x/z, y/z of pixels (n, 2)."""
-        import cv2
-
-        there = cv2.undistortPointsIter(
-            np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2), self.matrix, np.array(self.distortion),
-            np.eye(3), np.eye(3), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
-        )  # fmt: skip
-        return np.asarray(there, dtype=np.float64).reshape(-1, 2)
-
-
-class GelView(Config):
-    """Where the gel lies in the native picture. The sensor's x runs along image columns, where its axis is.
-
-    A point (x, y) of the gel [m] is seen along (a, b, c) = perspective (x, y, 1), at the pixel that `lens` gives a / c,
-    b / c.
-    """
-
-    lens: Lens
-    perspective: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-    size: tuple[Positive, Positive]  # x, y of the gel that counts, round the sensor's axis [m]
-    pixel_pitch: Positive  # of the rectified picture [m]
-    residual: Annotated[float, Field(ge=0)] = 0.0  # root mean square of the points [px]
-    residual_length: Annotated[Length, Field(ge=0)] = 0.0  # the same on the gel [m]
-    board: str = ""  # by what it was found
-
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """Rows, columns of the native picture."""
-        return (self.lens.height, self.lens.width)
-
-    @property
-    def geometry(self) -> SensorGeometry:
-        """Of the rectified picture."""
-        width, height = (round(length / self.pixel_pitch) for length in self.size)
-        return SensorGeometry(width=width, height=height, pixel_pitch=self.pixel_pitch)
-
-    def project(self, points: FloatArray) -> FloatArray:
-        """(..., 2) pixels of points (..., 2) of the gel [m]."""
-        seen = _seen(np.array(self.perspective), points.reshape(-1, 2))
-        return self.lens.project(seen).reshape(points.shape)
-
-
-def _seen(perspective: FloatArray, points: FloatArray) -> FloatArray:
-    lines = points @ perspective[:, :2].T + perspective[:, 2]
-    seen: FloatArray = lines[:, :2] / lines[:, 2:]
-    return seen
 
 
 def pinhole(image_shape: tuple[int, int], distortion: Sequence[float] = ()) -> Lens:
@@ -229,7 +154,7 @@ def fit_view(
         perspective = _plane(lens, local, points.image)
     else:
         lens, perspective = _distorted(local, points.image, image_shape)
-    missed = lens.project(_seen(perspective, local)) - points.image
+    missed = lens.project(seen_along(perspective, local)) - points.image
     residual = float(np.sqrt((missed**2).sum(axis=1).mean()))
     if not residual <= MAX_MISFIT * points.spacing:
         raise BadView(
@@ -240,14 +165,14 @@ def fit_view(
     back: FloatArray = np.asarray(np.linalg.inv(perspective), dtype=np.float64)
     axis = ((columns - 1) / 2, (rows - 1) / 2) if centre is None else centre
     near = lens.directions(np.array([axis, (axis[0] + 1.0, axis[1]), (axis[0], axis[1] + 1.0)]))
-    origin, right, below = _seen(back, near)
+    origin, right, below = seen_along(back, near)
     along = right - origin
     pitch = float(np.sqrt(np.hypot(*along) * np.hypot(*(below - origin))))
     turn = np.arctan2(along[1], along[0])
     board_from_gel = np.array(
         [[np.cos(turn), -np.sin(turn), origin[0]], [np.sin(turn), np.cos(turn), origin[1]], [0, 0, 1.0]]
     )
-    on_gel = _seen(np.linalg.inv(board_from_gel), local)
+    on_gel = seen_along(np.linalg.inv(board_from_gel), local)
     if size is None:
         step = 0.5 * points.spacing * pitch
         reach = np.minimum(on_gel.max(axis=0), -on_gel.min(axis=0)) + step
@@ -292,7 +217,7 @@ def view_of_corners(corners: Sequence[Pair], size: Pair, image_shape: tuple[int,
     x, y = size[0] / 2, size[1] / 2
     perspective = _plane(lens, np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.array(corners, dtype=np.float64))
     perspective /= perspective[2, 2]
-    middle = lens.project(_seen(perspective, 1e-6 * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
+    middle = lens.project(seen_along(perspective, 1e-6 * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])))
     along = np.linalg.norm(middle[1:] - middle[0], axis=1)  # [px / um]
     return GelView(
         lens=lens,
@@ -332,7 +257,7 @@ def _distorted(on_board: FloatArray, pixels: FloatArray, image_shape: tuple[int,
 
         def missed(p: FloatArray) -> FloatArray:
             lens, plane = lens_and_plane(p)
-            off: FloatArray = (lens.project(_seen(plane, on_board)) - pixels).ravel()
+            off: FloatArray = (lens.project(seen_along(plane, on_board)) - pixels).ravel()
             return off
 
         from scipy.optimize import least_squares

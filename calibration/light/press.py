@@ -20,7 +20,8 @@ NEAR = 2.3  # contact and skirt reach this far [contact radii]
 FAR = 3.0  # beyond, the gel is untouched [contact radii]
 MIN_UNTOUCHED_SHARE = 0.15  # of the picture, for a drift that varies over it
 MAX_SATURATED_SHARE = 0.4  # of the contact
-SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too
+SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too ...
+SECOND_AREA = 0.15  # ... if so large at half that strength [areas of the contact]: specks of dirt or glare are smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +80,19 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
     change = (raw - drift) / mean
     strength = np.abs(smooth(change, 3.0)).max(axis=2)
     inside = strength[distance < 1.5 * circle.radius].max()
-    if strength[distance > FAR * circle.radius].max(initial=0.0) > SECOND_CONTACT * inside:
+    far = np.where(distance > FAR * circle.radius, strength, 0.0)
+    if _second_area(far, SECOND_CONTACT * inside) > SECOND_AREA * np.pi * circle.radius**2:
         raise BadFrames("there is a second contact in the picture; press one ball at a time")
     return BallPress(name, circle, change, drift, lit)
+
+
+def _second_area(strength: Float64, strong: float) -> int:
+    """Pixels of the largest patch that is as strong as `strong` somewhere, and half as strong everywhere."""
+    import cv2
+
+    count, patches = cv2.connectedComponents((strength > strong / 2).astype(np.uint8))
+    peaks = np.unique(patches[strength > strong])
+    return int(np.bincount(patches.ravel(), minlength=count)[peaks].max(initial=0))
 
 
 def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.optics.ink import MIN_RADIUS as MIN_RADIUS
+from tacsim.optics.ink import DotEraser as DotEraser
+from tacsim.optics.ink import darkness, dot_filters
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 # A dot is darker than its surroundings by at least this share of their light; the higher levels part it from others
 MIN_DARKNESS = (0.2, 0.35, 0.5)
-EDGE_DARKNESS = 0.15  # the same of the blurred edge of a dot
 MIN_FILLED = 0.4  # share of its bounding box that a dot fills
-MAX_RADIUS = 2.5  # [radii]
 MIN_AREA, MAX_AREA = 0.2, 7.0  # of a dot, half hidden or painted over [areas of a disc]
 MAX_ELONGATION = 2.0  # length over breadth
-BLUR = 0.35  # of the picture [radii]
-MIN_RADIUS = 1.2  # of a dot that can be found [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class DotFinder:
 
     def __init__(self, radius: float) -> None:
         """Raises ValueError for dots too small to be found."""
-        self._side, self._blur = _filters(radius)
+        self._side, self._blur = dot_filters(radius)
         self._area = np.pi * radius**2
 
     def __call__(self, image: Image) -> Dots:
@@ -85,40 +85,3 @@ class DotFinder:
         dots = Dots(centres[good], area[good].astype(np.float64))
         clumps = large & ~compact
         return dots, np.where(clumps[labels], dark, np.float32(0.0)) if clumps.any() else None
-
-
-def _filters(radius: float) -> tuple[int, float]:
-    """Side of the closing and deviation of the blur for dots of a radius [px]. Raises ValueError."""
-    if not radius >= MIN_RADIUS:
-        raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
-    return 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
-
-
-def darkness(image: Image, side: int, blur: float) -> Float32:
-    """(H, W) share of the light that is missing against the frame of `side` x `side` px round each place."""
-    import cv2
-
-    if image.ndim == 3:
-        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    calm = np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur), dtype=np.float32)
-    levels = cv2.convertScaleAbs(calm)  # many times faster to close than float, and fine enough for what is smooth
-    bright = cv2.morphologyEx(levels, cv2.MORPH_CLOSE, np.ones((side, side), dtype=np.uint8))
-    share = calm / np.maximum(bright, 1).astype(np.float32)
-    return np.asarray(np.float32(1.0) - share, dtype=np.float32)
-
-
-class DotEraser:
-    """Paints dots of about one radius [px] over with what surrounds them (Telea 2004): light is calibrated without
-    them, since under a press they move."""
-
-    def __init__(self, radius: float) -> None:
-        """Raises ValueError for dots too small to be found."""
-        self._side, self._blur = _filters(radius)
-
-    def __call__(self, image: Image) -> Image:
-        """The picture (H, W, 3) without its dots."""
-        import cv2
-
-        inked = (darkness(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
-        wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
-        return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)

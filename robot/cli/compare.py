@@ -132,7 +132,8 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
     from robot.studies.matched_press import match_presses
 
     with counted("pressing") as on_press:
-        made, warnings = match_presses(truth, scene, read_sensor_model(bundle), CanonicalGrid(), on_press)
+        metric = read_sensor_model(bundle).model_copy(update={"view": None})
+        made, warnings = match_presses(truth, scene, metric, CanonicalGrid(), on_press)
     for words in warnings:
         warn(words)
     return made

@@ -69,6 +69,8 @@ def run(
 
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     loaded = load_with_task(rig, task, set_ or [])
+    for words in loaded.notes:
+        notes.print(words, markup=False)
     own_task = loaded.config.task
     if not dry_run:
         require_person(loaded.config)
@@ -188,10 +190,14 @@ def _report(episode: Episode, folder: Path, files: Sequence[Path]) -> None:
     """Writes the report and ends with the table."""
     import json
 
+    from robot.rig.recorded import RecordedSurfaces
     from tacsim.report.report import end_table, write_report
 
     with busy("writing the report"), writing(folder):
-        paths = write_report(episode, folder)
+        surfaces = RecordedSurfaces(episode.meta)
+        paths = write_report(episode, folder, surfaces)
         stats = json.loads(paths["summary.json"].read_text(encoding="utf-8"))
+    for words in surfaces.notes:
+        notes.print(words, markup=False)
     listed = [paths["report.html"], paths["report.png"], *files, paths["summary.json"]]
     results.print(end_table(stats, listed))

@@ -32,6 +32,9 @@ def press(
     edge_radius: Annotated[Any, length("Of a box's or cylinder's edges; half an element if left out.")] = None,
     scale: Annotated[float, typer.Option(help="Metres per unit of the .stl file.")] = 1e-3,
     preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution.")] = "standard",
+    model: Annotated[
+        str, typer.Option(help="The sensor: its name, the path of a YAML file, or of a calibrated bundle.")
+    ] = "ideal",
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -39,16 +42,23 @@ def press(
 
     --set changes the scene, for example --set indenter.friction=0.3 (see tacsim schema scene).
 
+    A calibrated sensor brings its own gel size, picture and light; rgb.png is its metric picture.
+
     Example: tacsim press sphere --radius '3 mm' --depth '0.4 mm' --slide '1 mm, 0'
     """
     from tacsim.config import load_scene, load_sensor
+    from tacsim.config.gel import fit_gel, says_gel_size
 
     folder = new_directory(out, "press")
     shape = [_geometry(indenter, radius, height, size, scale)]
     if edge_radius is not None:
         shape.append(f"indenter.edge_radius={edge_radius!r}")
     scene = load_scene("press", [f"preset={preset}", *shape, *(set_ or [])])
-    sensor = load_sensor("ideal")
+    sensor = load_sensor(model).model_copy(update={"view": None})
+    given = any(says_gel_size(text.partition("=")[0].split(".")) for text in set_ or [])
+    scene, said = fit_gel(scene, {"lower": sensor}, given=given)
+    for words in said:
+        notes.print(words, markup=False)
     with busy("pressing (the first run compiles the kernels, up to half a minute)"):
         from robot.studies import press as presses
         from tacsim.physics.failure.dump import dumps_in

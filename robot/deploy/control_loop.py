@@ -11,12 +11,14 @@ from datetime import datetime
 from importlib import metadata
 from typing import Protocol
 
+import numpy as np
+
 from robot.deploy.policy import require_fit
 from tacsim.control.contact_signal import contact_signal
 from tacsim.interface import Action, EndOfEpisode, Observation, Policy, Pose, Truth
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.record.episode import Episode, EpisodeMeta, Step
-from tacsim.report.series import FELT, LOST
+from tacsim.report.series import DEEPEST, FELT, LONGEST, LOST, STEEPEST
 from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, judge
 from tacsim.tasks.task import Estimator
@@ -177,6 +179,19 @@ def _meta(rig: Rig, task: Task | None, setup: EpisodeSetup) -> EpisodeMeta:
     )
 
 
+def _surfaces(observation: Observation) -> dict[str, float]:
+    """What is known of the gels, each in three numbers."""
+    found = {}
+    for name, touch in observation.tactile.items():
+        if touch.height is not None:
+            found[f"{DEEPEST}{name}"] = float(touch.height.max())
+        if touch.gradient is not None:
+            found[f"{STEEPEST}{name}"] = float(np.linalg.norm(touch.gradient, axis=2).max())
+        if touch.flow is not None:
+            found[f"{LONGEST}{name}"] = float(np.linalg.norm(touch.flow, axis=2).max())
+    return found
+
+
 def _step(
     index: int,
     rig: Rig,
@@ -190,6 +205,7 @@ def _step(
 ) -> Step:
     """The record of what the rig delivered, with what the task says of it."""
     info = {f"contact_signal_{name}": contact_signal(touch) for name, touch in observation.tactile.items()}
+    info |= _surfaces(observation)
     info |= rig.diagnostics()
     packages = rig.packages()
     info |= {f"{LOST}{name}": float(each.lost) for name, each in packages.items()}

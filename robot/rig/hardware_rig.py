@@ -164,8 +164,8 @@ def _spec(config: RigConfig, normalisers: Mapping[str, FrameNormaliser]) -> RigS
 
 
 def _sensor_spec(config: SimSensorConfig) -> SensorSpec:
-    geometry, markers = config.model.geometry, config.model.markers
-    return SensorSpec((geometry.height, geometry.width), height=True, flow=markers is not None, arm=config.arm)
+    model = config.model
+    return SensorSpec(model.image_shape, height=True, flow=model.markers is not None, arm=config.arm)
 
 
 def _start_poses(config: RigConfig, cell: MockCell) -> dict[str, Pose]:

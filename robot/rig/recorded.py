@@ -6,13 +6,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.errors import error_context
-from calibration.normaliser import FrameNormaliser
-from robot.rig.replay_rig import recorded_normaliser, recorded_rig
-from tacsim.interface import Observation, TactileFrame
-from tacsim.models.rig import ReplaySensorConfig, RigConfig
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError, error_context
+from calibration.markers.flow import MarkersLost, find_markers
+from calibration.markers.lattice import NoLattice
+from calibration.normaliser import FrameNormaliser, normaliser_for_camera
+from calibration.reference import StaleReference
+from robot.rig.replay_rig import recorded_normaliser, recorded_rig, rig_of
+from tacsim.interface import Observation, SurfaceMap, TactileFrame, TactileObservation
+from tacsim.models.hardware import CameraSensorConfig
+from tacsim.models.rig import ReplaySensorConfig, RigConfig, SensorConfig
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.record.episode import Episode, EpisodeError, Step
+from tacsim.record.episode import Episode, EpisodeError, EpisodeMeta, Step
 from tacsim.record.images import reference_image
 from tacsim.record.reader import read_episode
 
@@ -50,12 +57,76 @@ class ObservedEpisode:
     def _normaliser(self, name: str, first: TactileFrame) -> FrameNormaliser:
         """With the episode's picture without contact as its reference; without one, the first frame."""
         config = ReplaySensorConfig(driver="replay", source=str(self.path))
-        rows, columns, _ = first.image.shape
         with error_context(f"{self.path}: sensor '{name}'"):
-            found = recorded_normaliser(config, name, (rows, columns), self.canonical)
             reference = reference_image(self.episode.meta.attachments, name)
-            found.take_reference(first if reference is None else TactileFrame(reference, first.time, first.index))
+            untouched = first if reference is None else TactileFrame(reference, first.time, first.index)
+            found = recorded_normaliser(config, name, untouched.image, self.canonical)
+            found.take_reference(untouched)
         return found
+
+
+class RecordedSurfaces:
+    """The surfaces of an episode's gels, called with sensor and frame: as the frame says, or found in its picture by
+    what the rig of the episode knows of the sensor; None where nothing finds them.
+
+    Frames of a sensor may be left out, not go back. `notes`: in words, what a sensor lacks.
+    """
+
+    def __init__(self, meta: EpisodeMeta) -> None:
+        """Raises ConfigError for a rig that cannot be read, EpisodeError for a reference that cannot."""
+        self._normalisers: dict[str, FrameNormaliser] = {}
+        self.notes: list[str] = []
+        rig = rig_of(meta)
+        if rig is None:
+            return
+        for name, sensor in rig.sensors.items():
+            untouched = reference_image(meta.attachments, name)
+            if untouched is None or name not in meta.spec.sensors:
+                continue
+            try:
+                found = _normaliser_of(sensor, name, untouched, rig)
+                if found is not None and (found.finds_height or found.finds_flow):
+                    found.take_reference(TactileFrame(untouched, 0.0, 0))
+                    self._normalisers[name] = found
+                elif found is not None and not meta.spec.sensors[name].height:
+                    self.notes += _dots_in(untouched, name)
+            except (CalibrationError, ValueError) as why:
+                self.notes.append(f"sensor {name}: no height is shown: {why}")
+
+    def __call__(self, sensor: str, frame: TactileFrame) -> SurfaceMap | TactileObservation | None:
+        normalise = self._normalisers.get(sensor)
+        if frame.surface is not None or normalise is None:
+            return frame.surface
+        try:
+            return normalise(frame, frame.time)
+        except (StaleReference, MarkersLost, ValueError):  # the steps say so
+            return None
+
+
+def _normaliser_of(
+    sensor: SensorConfig, name: str, untouched: NDArray[np.uint8], rig: RigConfig
+) -> FrameNormaliser | None:
+    if isinstance(sensor, ReplaySensorConfig):
+        return recorded_normaliser(sensor, name, untouched, rig.canonical)
+    if isinstance(sensor, CameraSensorConfig):
+        return normaliser_for_camera(
+            sensor, sensor.size if rig.scene is None else rig.scene.gel.size[:2], rig.canonical
+        )
+    return None
+
+
+def _dots_in(untouched: NDArray[np.uint8], sensor: str) -> list[str]:
+    """A word on printed dots that nobody has told of."""
+    try:
+        lattice, _ = find_markers(untouched)
+    except NoLattice:
+        return []
+    rows, columns = lattice.present.shape
+    return [
+        f"sensor {sensor} shows {rows} x {columns} dark dots: say how far they are apart, "
+        f"--set 'sensors.{sensor}.marker_pitch=1.5 mm', and the gel's flow is found by them; for height calibrate the "
+        "sensor, with --markers"
+    ]
 
 
 def observe_episode(path: Path) -> ObservedEpisode:

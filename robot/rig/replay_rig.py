@@ -8,6 +8,9 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calibration.errors import error_context
 from calibration.normaliser import (
     FrameNormaliser,
@@ -21,6 +24,7 @@ from tacsim.interface import Arm, Normaliser, TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplayArmConfig, ReplaySensorConfig, RigConfig, SimSensorConfig
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.record.episode import EpisodeMeta
 from tacsim.record.replay import ReplayArm, ReplayClock, ReplaySensor, recorded_period
 from tacsim.record.sources import EPISODES, episode_meta
 from tacsim.rig import Rig
@@ -58,7 +62,7 @@ def open_replay(config: RigConfig) -> Rig:
             sensors[name] = source = ReplaySensor(sensor, name, clock)
             stack.callback(source.close)
             with error_context(f"sensors.{name}"):
-                normaliser = recorded_normaliser(sensor, name, source.spec.image_shape, config.canonical)
+                normaliser = recorded_normaliser(sensor, name, source.reference().image, config.canonical)
             if not source.spec.height:  # what the frames don't carry, and the normaliser finds in them
                 source.spec = replace(source.spec, height=normaliser.finds_height, flow=normaliser.finds_flow)
             normalisers[name] = normaliser
@@ -90,10 +94,11 @@ def _common_period(rig: str, sensors: Mapping[str, ReplaySensorConfig]) -> float
 
 
 def recorded_normaliser(
-    config: ReplaySensorConfig, name: str, image_shape: tuple[int, int], grid: CanonicalGrid
+    config: ReplaySensorConfig, name: str, untouched: NDArray[np.uint8], grid: CanonicalGrid
 ) -> FrameNormaliser:
-    """By the corners or the calibration of the rig file; without them by what an episode says of its own sensor."""
-    own = config.corners is None and config.calibration is None
+    """By what the rig file says of the picture; without by what an episode says of its own sensor. `untouched`: the
+    native picture (rows, columns, 3) without contact."""
+    own = config.corners is None and config.calibration is None and config.marker_pitch is None
     original = recorded_rig(Path(config.source or "")) if own else None
     sensor = None if original is None else original.sensors.get(name)
     if original is not None and original.scene is not None and isinstance(sensor, SimSensorConfig):
@@ -101,14 +106,20 @@ def recorded_normaliser(
     if original is not None and isinstance(sensor, CameraSensorConfig):
         gel = sensor.size if original.scene is None else original.scene.gel.size[:2]
         return normaliser_for_camera(sensor, gel, grid)
-    return normaliser_for_recording(sensor if isinstance(sensor, ReplaySensorConfig) else config, image_shape, grid)
+    replayed = sensor if isinstance(sensor, ReplaySensorConfig) else config
+    return normaliser_for_recording(replayed, untouched.shape[:2], grid, untouched)
 
 
 def recorded_rig(source: Path) -> RigConfig | None:
     """The rig that an episode was recorded with; None where it is not known."""
     if source.suffix.lower() not in EPISODES:
         return None
-    text = episode_meta(source).attachments.get(RIG_ATTACHMENT)
+    return rig_of(episode_meta(source))
+
+
+def rig_of(meta: EpisodeMeta) -> RigConfig | None:
+    """The rig that an episode with this description was recorded with; None where it is not known."""
+    text = meta.attachments.get(RIG_ATTACHMENT)
     if text is None:
         return None
     with tempfile.TemporaryDirectory() as folder:  # an empty folder: the text can refer to nothing beside it

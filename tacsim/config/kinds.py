@@ -13,6 +13,7 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
+from tacsim.config.bundle import FILE, OWN, is_bundle, own_names
 from tacsim.config.errors import did_you_mean
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.rig import TASKS, RigConfig, any_task
@@ -94,8 +95,13 @@ def resolve(kind: Kind, reference: str, folder: Path) -> Path:
     """The file that `reference`, written in a file of `folder`, refers to. Raises NotFound.
 
     A name refers to a shipped file of that kind. A path ends in .yaml and must be, symbolic links followed, below
-    `folder` or below the shipped configuration.
+    `folder` or below the shipped configuration. A sensor may also be a calibrated bundle, by its path or, with those
+    in `sensors/` of `folder`, by name; then the file is the calibration in it.
     """
+    if kind.name == "sensor" and "\0" not in reference and not reference.endswith((".yml", ".yaml")):
+        return _sensor_file(kind, reference, folder)
+    if kind.name == "sensor" and is_bundle(folder / reference):
+        return folder / reference
     if is_name(reference):
         return shipped_file(kind, reference)
     if not reference.endswith((".yaml", ".yml")) or "\0" in reference:
@@ -108,6 +114,38 @@ def resolve(kind: Kind, reference: str, folder: Path) -> Path:
     if not any(path.is_relative_to(home.resolve()) for home in (folder, config_root())):
         raise NotFound(f"{reference!r} leads outside; allowed: files below the referring file's own folder or configs/")
     return path
+
+
+def _sensor_file(kind: Kind, reference: str, folder: Path) -> Path:
+    """Of a name or a bundle's path: the one sensor that it can mean. Raises NotFound for none, and for two."""
+    places = [folder / reference / FILE]
+    if is_name(reference):
+        own = folder / OWN
+        places += [config_root() / kind.folder / f"{reference}.yaml", own / reference / FILE, own / f"{reference}.yaml"]
+    try:
+        found = list({path.resolve(): path for path in places if path.is_file()}.values())
+    except (OSError, RuntimeError) as error:  # a loop of symbolic links
+        raise NotFound(f"cannot follow {reference!r}: {error}") from None
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise NotFound(f"'{reference}' may be {' or '.join(map(str, found))}; write the path of the one that is meant")
+    if (folder / reference).is_dir():
+        raise NotFound(f"'{reference}' is a folder without {FILE}, so it is no calibrated sensor")
+    known = [*names(kind.name), *own_names(folder)]
+    raise NotFound(
+        f"no sensor '{reference}'; allowed: {', '.join(known)}, a path ending in .yaml, or that of a calibrated sensor "
+        f"(a folder with {FILE}){did_you_mean(reference, [*known, *_bundles(folder, reference)])}"
+    )
+
+
+def _bundles(folder: Path, reference: str) -> list[str]:
+    """Paths of the bundles beside the one that is missing, as they would be written."""
+    parent = Path(reference).parent
+    try:
+        return [str(parent / path.name) for path in (folder / parent).iterdir() if is_bundle(path)]
+    except OSError:
+        return []
 
 
 def json_schema(kind: str = "rig") -> dict[str, Any]:
@@ -135,10 +173,13 @@ class _Generator(GenerateJsonSchema):
         kind = kind_of([schema["cls"]])
         if kind is None:
             return mapping
-        reference = {
+        reference: dict[str, Any] = {
             "description": f"name of a {kind.name}, or path of a .yaml file below this folder",
             "anyOf": [{"enum": names(kind.name)}, {"type": "string", "pattern": r"\.ya?ml$"}],
         }
+        if kind.name == "sensor":
+            reference["description"] += f", or of a calibrated sensor (a folder with {FILE}; by name from {OWN}/)"
+            reference["anyOf"] = [{"enum": names(kind.name)}, {"type": "string", "minLength": 1}]
         mapping["properties"]["extends"] = {
             **reference,
             "description": f"{reference['description']}, to change a few keys of",

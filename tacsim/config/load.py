@@ -10,9 +10,11 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from tacsim.config.annotation import default, models
+from tacsim.config.bundle import find_bundle
 from tacsim.config.document import LoadState, Node, as_json, dump, from_plain
 from tacsim.config.errors import ConfigError, Place, Problem
-from tacsim.config.kinds import NotFound, is_name, kind_of, shipped_file
+from tacsim.config.gel import says_gel_size, with_gels_of_sensors
+from tacsim.config.kinds import NotFound, is_name, kind_of, resolve, shipped_file
 from tacsim.config.messages import report_errors
 from tacsim.config.references import Override, apply, parse_override, read_file
 from tacsim.models.hardware import UrArmConfig, weakened_limits
@@ -29,6 +31,7 @@ class LoadedRig:
 
     config: RigConfig
     sources: tuple[Path, ...]  # the files it was read from
+    notes: tuple[str, ...] = ()  # what a person should know of it, in words
 
     @property
     def text(self) -> str:
@@ -63,10 +66,13 @@ def load_rig(rig: str | Path, *, task: str | TaskConfig | None = None, overrides
     for override in of_rest:
         root = apply(root, RigConfig, override, state)
     root = _absolute_calibrations(_check_scene(root, own_scene, state))
-    config = _with_one_scene(_validate(RigConfig, root, state))
+    config, notes = with_gels_of_sensors(
+        _validate(RigConfig, root, state), load_sensor, given=any(says_gel_size(each.path) for each in given)
+    )
+    config = _with_one_scene(config)
     if overrides and any(isinstance(arm, UrArmConfig) and arm.mock is None for arm in config.arms.values()):
         _require_limits(config, load_rig(rig, task=task).config)
-    return LoadedRig(config, tuple(dict.fromkeys(state.sources)))
+    return LoadedRig(config, tuple(dict.fromkeys(state.sources)), tuple(notes))
 
 
 def _task(task: str | TaskConfig) -> Node:
@@ -102,7 +108,7 @@ def _require_limits(config: RigConfig, file: RigConfig) -> None:
 
 def _absolute_calibrations(root: Node) -> Node:
     """Makes the paths of calibrations absolute: like references, they start from the folder of their file, those of
-    options from the current folder."""
+    options from the current folder. One in `sensors/` there goes by its name."""
     sensors = root.items.get("sensors")
     if sensors is None or not sensors.items:
         return root
@@ -110,7 +116,7 @@ def _absolute_calibrations(root: Node) -> Node:
     for name, sensor in sensors.items.items():
         path = sensor.items.get("calibration")
         if path is not None and isinstance(path.value, str) and path.value:
-            there = replace(path, value=str((path.folder / path.value).resolve()))
+            there = replace(path, value=str(find_bundle(path.value, path.folder).resolve()))
             sensor = replace(sensor, value={**sensor.items, "calibration": there})
         anchored[name] = sensor
     return replace(root, value={**root.items, "sensors": replace(sensors, value=anchored)})
@@ -192,15 +198,16 @@ def _load(annotation: Any, source: str | Path, overrides: Sequence[str]) -> Any:
 
 
 def _open(annotation: Any, source: str | Path, state: LoadState) -> Node:
-    """The expanded tree of a file that was named by any path, or by the name of a shipped file."""
+    """The expanded tree of a file that was named by any path, or by the name of a shipped file or of a sensor of one's
+    own."""
     place = Place(str(source) or "(no name)")
     kind = kind_of(models(annotation))
     try:
-        path = (
-            shipped_file(kind, source)
-            if kind is not None and isinstance(source, str) and is_name(source)
-            else Path(source)
-        )
+        path = Path(source)
+        if kind is not None and kind.name == "sensor" and path.suffix not in (".yaml", ".yml"):
+            path = resolve(kind, str(source), Path.cwd())
+        elif kind is not None and isinstance(source, str) and is_name(source):
+            path = shipped_file(kind, source)
     except NotFound as error:
         raise ConfigError([Problem(place, "", str(error))]) from None
     return read_file(path, annotation, state, lambda what: state.report(place, "", what))

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tacsim.config import bundle
 from tacsim.config.annotation import allowed, child, default, keys, models, variant
 from tacsim.config.document import FORMER_KEYS, MAX_NODES, LoadState, Node, from_plain, parse_text, read_text, shown
 from tacsim.config.errors import Place, did_you_mean, join
@@ -70,6 +71,14 @@ def read_file(
     """The expanded content of a file. `refuse` reports that it cannot be read, at the place that refers to it."""
     broken = Node(None, Place(shown(path), 1), path.parent, broken=True)
     path = path.absolute()  # not resolved: messages name the file as the person did
+    kind = kind_of(models(annotation))
+    if kind is not None and kind.name == "sensor" and path.name == bundle.FILE:
+        state.sources.append(path)
+        try:
+            return bundle.sensor_node(path)
+        except bundle.NoBundle as why:
+            refuse(str(why))
+            return broken
     try:
         resolved = path.resolve()
     except (OSError, ValueError, RuntimeError) as error:  # a name with a null byte, a loop of symbolic links

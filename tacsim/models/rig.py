@@ -65,6 +65,15 @@ class ReplaySensorConfig(Config):
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
     reference: str | None = None  # picture without contact; None: the first frame
     calibration: str | None = None  # bundle of `tacsim calibrate sensor`, instead of corners: height is found by it
+    # Distance of the dots printed on the gel [m], instead of corners or calibration: they are found in the reference,
+    # say how large the picture is, and are followed. Flow, but no height.
+    marker_pitch: Annotated[Length, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _one_geometry(self) -> Self:
+        if sum(each is not None for each in (self.corners, self.calibration, self.marker_pitch)) > 1:
+            raise ValueError("give one of corners, calibration, marker_pitch: each says where the gel lies")
+        return self
 
 
 ArmConfig = Annotated[SimArmConfig | UrArmConfig | ReplayArmConfig, Field(discriminator="driver")]

@@ -295,6 +295,11 @@ class Scene(Config):
         """Edge of a gel element h_g [m]."""
         return PRESETS[self.preset][1] if self.element_size is None else self.element_size
 
+    @property
+    def gel_element(self) -> float:
+        """The same as the gel's thickness allows: whole layers, two at least [m]."""
+        return self.gel.size[2] / max(2, round(self.gel.size[2] / self.element))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GelSurface:

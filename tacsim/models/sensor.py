@@ -1,4 +1,4 @@
-"""Configuration of one tactile sensor: the geometry of its image, its light, markers, texture and noise."""
+"""Configuration of one tactile sensor: its image on the gel, its light, markers, texture and noise."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from tacsim.models.geometry import GelView
+from tacsim.models.geometry import SensorGeometry as SensorGeometry
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.quantity import Config, Length
 
+Side = Annotated[Length, Field(gt=0)]
 Channel = Annotated[float, Field(ge=0, le=4)]
 Rgb = tuple[Channel, Channel, Channel]
 Deviation = Annotated[float, Field(ge=0, le=32)]
@@ -25,28 +28,6 @@ def _colour_or_picture(value: Any) -> str:
 Background = Annotated[
     Annotated[Rgb, Tag("colour")] | Annotated[str, Tag("picture")], Discriminator(_colour_or_picture)
 ]
-
-
-class SensorGeometry(Config):
-    """Where the pixels of the (rectified) image lie on the gel: ``x = (u - u0) * pixel_pitch``, likewise y.
-
-    Pixel centres are integers; (u0, v0) defaults to the image centre, so the sensor axis is in the middle.
-
-    A `camera_distance` H makes the camera a pinhole on the sensor axis, that far behind the untouched gel: a dot on a
-    surface pressed in by h appears at ``x H / (H - h)``. Without one it looks along parallel rays, x stays x. Only
-    dots are drawn so; the colour of the gel is always that of parallel rays.
-    """
-
-    width: Annotated[int, Field(ge=16, le=4096)] = 320
-    height: Annotated[int, Field(ge=16, le=4096)] = 240
-    pixel_pitch: Annotated[Length, Field(ge=1e-6, le=1e-2)] = 0.0625e-3  # [m]
-    centre: tuple[float, float] | None = None  # (u0, v0) [px]
-    camera_distance: Annotated[Length, Field(ge=2e-3, le=10.0)] | None = None  # [m]; None: parallel rays
-
-    @property
-    def principal(self) -> tuple[float, float]:
-        """(u0, v0): the pixel on the sensor axis."""
-        return ((self.width - 1) / 2.0, (self.height - 1) / 2.0) if self.centre is None else self.centre
 
 
 class Light(Config):
@@ -94,12 +75,22 @@ class Lighting(Config):
 
 
 class Markers(Config):
-    """A lattice of dots printed on the gel surface."""
+    """A lattice of dots printed on the gel surface. They move with it."""
 
     rows: Annotated[int, Field(ge=1, le=100)] = 9
     columns: Annotated[int, Field(ge=1, le=100)] = 11
     pitch: Annotated[Length, Field(gt=0)] = 1.5e-3  # [m]
     radius: Annotated[Length, Field(gt=0)] = 0.25e-3  # [m]
+    # x, y of each dot on the untouched gel, row by row [m]; None: an even lattice round the sensor's axis
+    places: tuple[tuple[tuple[Length, Length], ...], ...] | None = None
+    # The background picture shows them as they really are: they are lifted off it. Otherwise they are drawn as discs.
+    in_background: bool = False
+
+    @model_validator(mode="after")
+    def _one_place_a_dot(self) -> Self:
+        if self.places is not None and [len(row) for row in self.places] != [self.columns] * self.rows:
+            raise ValueError(f"places must be {self.rows} rows of {self.columns} dots each, x and y of every dot")
+        return self
 
 
 class CameraNoise(Config):
@@ -127,10 +118,13 @@ class SensorModel(Config):
 
     name: str = "ideal"
     geometry: SensorGeometry = SensorGeometry()
+    gel_size: tuple[Side, Side] | None = None  # x, y of its gel; a rig's scene takes it [m]; None: the scene's
     lighting: Lighting = Lighting()
     # Calibrated on a real sensor: takes the place of the lights; the background stays that of `lighting`.
     photometric: PhotometricModel | None = None
     markers: Markers | None = None
+    # Where the picture of `geometry` lies in the camera's own, which is delivered then; None: it is the camera's own.
+    view: GelView | None = None
     texture: Annotated[Length, Field(ge=0)] = 2e-6  # standard deviation of the gel's surface texture [m]
     texture_seed: Annotated[int, Field(ge=0)] = 0
     noise: CameraNoise | None = None  # of each picture that a sensor delivers; None: a camera without noise
@@ -141,6 +135,22 @@ class SensorModel(Config):
         if self.photometric is not None and self.lighting.background is None:
             raise ValueError("photometric tells changes of colour, so it needs lighting.background: the untouched gel")
         return self
+
+    @model_validator(mode="after")
+    def _parts_agree(self) -> Self:
+        if self.view is not None and self.view.geometry != self.geometry:
+            raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
+        if self.markers is not None and self.markers.in_background:
+            if not isinstance(self.lighting.background, str):
+                raise ValueError("markers.in_background: lighting.background is no picture that could show them")
+            if self.geometry.camera_distance is not None:
+                raise ValueError("markers.in_background: dots of a picture are seen along parallel rays only")
+        return self
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows, columns of the pictures that are delivered."""
+        return (self.geometry.height, self.geometry.width) if self.view is None else self.view.image_shape
 
 
 class CanonicalGrid(Config):

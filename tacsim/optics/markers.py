@@ -13,7 +13,9 @@ INK = 0.06  # fraction of the light that a dot lets through [-]
 
 
 def rest_positions(markers: Markers) -> NDArray[np.float64]:
-    """(rows, columns, 2) x, y of the dots on the untouched gel, centred on the sensor axis [m]."""
+    """(rows, columns, 2) x, y of the dots on the untouched gel [m]: an even lattice is centred on the sensor axis."""
+    if markers.places is not None:
+        return np.array(markers.places, dtype=np.float64)
     x = (np.arange(markers.columns) - (markers.columns - 1) / 2) * markers.pitch
     y = (np.arange(markers.rows) - (markers.rows - 1) / 2) * markers.pitch
     return np.stack(np.meshgrid(x, y), axis=-1)
@@ -21,7 +23,7 @@ def rest_positions(markers: Markers) -> NDArray[np.float64]:
 
 def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
     """Raises ValueError when a dot lies off the gel."""
-    reach = np.abs(rest_positions(markers)[-1, -1]) + markers.radius
+    reach = np.abs(rest_positions(markers)).reshape(-1, 2).max(axis=0) + markers.radius
     if reach[0] > gel_size[0] / 2 or reach[1] > gel_size[1] / 2:
         raise ValueError(
             f"markers: {markers.rows} x {markers.columns} dots at {markers.pitch * 1e3:g} mm need a gel of "

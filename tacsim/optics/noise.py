@@ -59,8 +59,7 @@ class NoiseSource:
 
 def noise_source(model: SensorModel, sensor: str) -> NoiseSource | None:
     """Of the sensor of this name; None for a camera without noise."""
-    shape = (model.geometry.height, model.geometry.width)
-    return None if model.noise is None else NoiseSource(model.noise, shape, sensor)
+    return None if model.noise is None else NoiseSource(model.noise, model.image_shape, sensor)
 
 
 def _field(noise: CameraNoise, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.int8]:

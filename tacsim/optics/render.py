@@ -21,15 +21,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tacsim.models.geometry import GelView
 from tacsim.models.photometric import PhotometricLight, places_in_image
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, SensorModel
 from tacsim.optics.grid import PixelGrid, image_grid, strips
+from tacsim.optics.ink import lifted_ink
 from tacsim.optics.markers import check_fits, marker_transmission
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, look_up
 
 Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 # Lattice of the gel's texture [m]. At this pitch its slopes have the spread (0.023 for 2 um) of Gomes' white noise on
 # 54 um pixels, but they belong to the gel: an image of another size shows the same texture.
@@ -37,14 +40,16 @@ TEXTURE_PITCH = 0.12e-3
 WHITE = np.float32(255.0)
 STEEPEST = 2.0  # largest slope in the table of light
 TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
+ASTRAY = 0.5  # [px] that a pixel put on the gel and back may be off
 TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
 
 
 class Renderer:
     """Renders the images of one simulated sensor. Everything that is the same in all frames is computed once.
 
-    The texture is fixed in the image: reference and contact frames share it, also under sideways motion. The noise of
-    the camera is added by the sensor (tacsim.optics.noise).
+    The texture is fixed in the image: reference and contact frames share it, also under sideways motion. Dots that the
+    background shows are lifted off it and move with the gel. Of a model with a `view` it is the camera's own picture,
+    black beside the gel. The noise of the camera is added by the sensor (tacsim.optics.noise).
     Raises ValueError when markers do not fit on the gel or the background picture does not fit the image.
     """
 
@@ -52,21 +57,27 @@ class Renderer:
         """`gel_size`: x, y [m]."""
         self.model = model
         self._grid = image_grid(model.geometry)
-        self._markers = model.markers
-        if model.markers is not None:
-            check_fits(model.markers, gel_size)
+        self._view = None if model.view is None else _look_ups(model.view)
+        self._markers, self._ink = model.markers, None
         self._texture = texture_gradient(self._grid, gel_size, model.texture, model.texture_seed)
         self._beyond = 0.0
         self._light: PhotometricLight | None = None
-        if model.photometric is None:
-            self._unlit = WHITE * unlit_image(model.lighting, self._grid.shape)  # of the image without the lights
-        else:
-            self._unlit = WHITE * untouched_image(model.lighting, self._grid.shape)
-            red, green, blue = self._unlit.mean(axis=(0, 1)).tolist()
+        untouched = WHITE * untouched_image(model.lighting, self._grid.shape)
+        # Of the image without the lights
+        self._unlit = untouched if model.photometric else WHITE * unlit_image(model.lighting, self._grid.shape)
+        if model.markers is not None and model.markers.in_background:
+            radius = model.markers.radius / model.geometry.pixel_pitch
+            clean, self._ink = lifted_ink(np.rint(untouched).astype(np.uint8), radius)
+            self._unlit = self._unlit + (clean - untouched)
+            untouched, self._markers = clean.astype(np.float32), None
+        elif model.markers is not None:
+            check_fits(model.markers, gel_size)
+        if model.photometric is not None:
+            red, green, blue = untouched.mean(axis=(0, 1)).tolist()
             self._light = PhotometricLight(model.photometric, (red, green, blue))
             if model.texture > 0:
                 places = places_in_image(self._grid.columns, self._grid.rows)
-                self._unlit += self._light.change(self._texture, *places)[0]
+                self._unlit = self._unlit + self._light.change(self._texture, *places)[0]
 
     @property
     def beyond(self) -> float:
@@ -77,33 +88,50 @@ class Renderer:
         """(H, W, 3) RGB image of the surface. Raises what :func:`tacsim.optics.surface.sample_surface` raises."""
         import cv2
 
-        light = self._shaded(surface) if self._light is None else self._calibrated(self._light, surface).__getitem__
-        dots = None if self._markers is None else marker_transmission(surface, self._markers, self.model.geometry)
+        table = SurfaceTable(surface)
+        seen = table.points(self._grid, fine=False)
+        light = self._shaded(table, *seen) if self._light is None else self._calibrated(self._light, table, *seen)
+        inked = self._inked(surface, table, seen[0])
+        del seen  # memory that is freed early is used again while it is warm
         image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
 
         for strip in strips(*self._grid.shape):
             lit, unlit = light(strip), self._unlit[strip]
-            if dots is not None:
-                lit, unlit = lit * dots[strip, :, None], unlit * dots[strip, :, None]
+            if inked is not None:
+                share = inked(strip)
+                lit, unlit = lit * share, unlit * share
             # Rounds, and saturates at black and white. cv2.add is the same to the bit, but goes to IPP in blocks of
             # 1 kB, each of which asks the processor for its name: 15 ms a picture of 640 x 480 in a virtual machine.
             cv2.addWeighted(lit, 1.0, unlit, 1.0, 0.0, image[strip], dtype=cv2.CV_8U)
-        return image
+        return image if self._view is None else np.asarray(cv2.remap(image, *self._view, cv2.INTER_LINEAR), np.uint8)
 
-    def _shaded(self, surface: GelSurface) -> Callable[[slice], Float32]:
+    def _inked(self, surface: GelSurface, table: SurfaceTable, points: Float32) -> Callable[[slice], Float32] | None:
+        """Rows of an image -> (rows, W, 1 or 3) share of its light that each pixel keeps under the dots."""
+        if self._markers is not None:
+            dots = marker_transmission(surface, self._markers, self.model.geometry)
+            return lambda rows: dots[rows, :, None]
+        if self._ink is not None:
+            ink = self._ink
+            return lambda rows: look_up(ink, table.at_rest(points[rows], self._grid))
+        return None
+
+    def _shaded(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) light of the lamps, by the slopes of surface and texture; 255 is white."""
         import cv2
 
-        table, lighting = SurfaceTable(surface), self.model.lighting
-        slopes, _ = table.seen(table.fields[..., 1:], self._grid, fine=False)
+        lighting = self.model.lighting
+        slopes = table.at(table.fields[..., 1:], points, inside)
         cv2.add(slopes, self._texture, dst=slopes)
         lights = light_table(lighting)
         if lights is None or not max(-float(slopes.min()), float(slopes.max())) <= STEEPEST:
             return lambda rows: shade(slopes[rows], lighting, white=255.0)
         return lambda rows: light_at(lights, slopes[rows])
 
-    def _calibrated(self, calibrated: PhotometricLight, surface: GelSurface) -> Float32:
-        """(H, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is white.
+    def _calibrated(
+        self, calibrated: PhotometricLight, table: SurfaceTable, points: Float32, inside: Mask
+    ) -> Callable[[slice], Float32]:
+        """Rows of an image -> (rows, W, 3) change of colour by the calibrated model, as its camera blurs it; 255 is
+        white.
 
         Evaluated at the points of the surface's table, of which there are fewer than pixels, and linear between them:
         at most half a grey level off, at the rim of a region of clipped slopes two and a half.
@@ -111,13 +139,28 @@ class Renderer:
         import cv2
 
         assert self.model.photometric is not None
-        table = SurfaceTable(surface)
         colours, beyond = calibrated.change(table.fields[..., 1:], *self._grid.in_image(*table.place()))
         self._beyond = beyond / (colours.size // 3)
-        change, _ = table.seen(colours, self._grid, fine=False)
+        change = table.at(colours, points, inside)
         if self.model.photometric.blur > 0:
             cv2.GaussianBlur(change, (0, 0), self.model.photometric.blur, dst=change)
-        return change
+        return change.__getitem__
+
+
+def _look_ups(view: GelView) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Where each pixel of the camera's picture lies in the metric one, in OpenCV's fixed point; far off beside it."""
+    import cv2
+
+    geometry, (rows, columns) = view.geometry, view.image_shape
+    pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64)
+    on_gel = view.on_gel(pixels)
+    # a lens is known as far as the gel reaches: beyond, its inverse may lead back into the picture
+    astray = ~(np.linalg.norm(view.project(on_gel) - pixels, axis=-1) < ASTRAY)
+    metric = on_gel / geometry.pixel_pitch + geometry.principal
+    metric[astray] = -10.0
+    metric = np.clip(metric, -10.0, max(geometry.width, geometry.height) + 10.0)
+    whole, fraction = cv2.convertMaps(metric.astype(np.float32), np.empty(0, dtype=np.float32), cv2.CV_16SC2)
+    return np.asarray(whole, dtype=np.int16), np.asarray(fraction, dtype=np.uint16)
 
 
 def shade(gradient: Float32, lighting: Lighting, white: float = 1.0) -> Float32:

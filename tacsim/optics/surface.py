@@ -92,6 +92,19 @@ class SurfaceTable:
         """`values` (rows, columns, n <= 4) of the table's points, linear between them, as seen at the points of `grid`:
         (H, W, n), 0 outside the gel; and (H, W) False there. Not `fine` will do for colours. Raises SurfaceFolded.
         """
+        points, inside = self.points(grid, fine=fine)
+        return self.at(values, points, inside), inside
+
+    @staticmethod
+    def at(values: Float32, points: Float32, inside: NDArray[np.bool_]) -> Float32:
+        """The same where `points` and `inside` are known already."""
+        seen = look_up(values, points)
+        if not inside.all():
+            seen[~inside] = 0.0
+        return seen
+
+    def points(self, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
+        """(H, W, 2) column, row in the table of what is seen at the points of `grid`; (H, W) False outside the gel."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
@@ -101,10 +114,13 @@ class SurfaceTable:
         if block > 1:
             points = _fine(points, block, grid.shape)
             inside = np.ones(grid.shape, dtype=np.bool_) if inside.all() else self._on_gel(points)
-        seen = look_up(values, points)
-        if not inside.all():
-            seen[~inside] = 0.0
-        return seen, inside
+        return points, inside
+
+    def at_rest(self, points: Float32, grid: PixelGrid) -> Float32:
+        """(H, W, 2) column, row in `grid` of where `points` of :meth:`points` lie on the untouched gel."""
+        scale = np.float32(self._pitch / grid.pitch)
+        start = (np.array(self._surface.origin) - (grid.x0, grid.y0)) / grid.pitch
+        return points * scale + start.astype(np.float32)
 
     def _material_points(self, grid: PixelGrid) -> Float32:
         """(rows, columns, 2) material points [table points] under the image points of `grid`: X <- x - u(X)."""

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tacsim.interface import FloatArray
-from tacsim.record.episode import Episode
 from tacsim.report.series import Series, upper_first
 
 INK, QUIET, GRID = "#22262b", "#6b737c", "#e3e6e9"
@@ -64,13 +63,6 @@ class Picture:
 
     index: int  # of the step
     image: NDArray[np.uint8]
-
-
-def pictures(episode: Episode, series: Series, sensor: str, wanted: int) -> list[Picture]:
-    """At most `wanted` pictures of a sensor spread over the episode, THUMBNAIL wide; one is decoded at a time."""
-    seen = series.seen(sensor)
-    steps = (episode.steps[seen[k]] for k in moments(len(seen), wanted))
-    return [Picture(step.index, shrunk(step.frames[sensor].image, THUMBNAIL)) for step in steps]
 
 
 def shrunk(image: NDArray[np.uint8], max_width: int) -> NDArray[np.uint8]:
@@ -185,6 +177,20 @@ def _draw_signal(axes: Axes, series: Series) -> None:
     _legend(axes)
 
 
+def _draw_depth(axes: Axes, series: Series) -> None:
+    plain(axes, "deepest point of each gel", "step", "mm")
+    for name, colour in _colours(series.deepest):
+        _line(axes, series, series.deepest[name] * 1e3, colour, name)
+    _legend(axes)
+
+
+def _draw_flow(axes: Axes, series: Series) -> None:
+    plain(axes, "longest flow of each gel's markers", "step", "mm")
+    for name, colour in _colours(series.flow):
+        _line(axes, series, series.flow[name] * 1e3, colour, name)
+    _legend(axes)
+
+
 def _draw_signal_against_force(axes: Axes, series: Series) -> None:
     pairs = signal_against_force(series)
     said = {name: "undefined" if pair[2] is None else f"{pair[2]:.3f}" for name, pair in pairs.items()}
@@ -215,6 +221,8 @@ def _panels(series: Series) -> list[Callable[[Axes, Series], None]]:
         (bool(series.force), _draw_force),
         (bool(series.signals), _draw_signal),
         (bool(np.isfinite([series.distance, series.felt]).any()), _draw_distance),
+        (bool(series.deepest), _draw_depth),
+        (bool(series.flow), _draw_flow),
         (bool(np.isfinite(series.after_reset().seconds).any()), _draw_timing),
         (bool(signal_against_force(series)), _draw_signal_against_force),
     ]
@@ -239,9 +247,9 @@ def plots(series: Series) -> Figure:
     return figure
 
 
-def overview(strips: Mapping[str, Sequence[Picture]], series: Series, title: str, subtitle: str) -> Figure:
-    """The whole episode on one page: the pictures of each sensor in a row, at most COLUMNS, and the plots below."""
-    shapes = [pictures[0].image.shape for pictures in strips.values()]
+def overview(strips: Sequence[tuple[str, Sequence[Picture]]], series: Series, title: str, subtitle: str) -> Figure:
+    """The whole episode on one page: named rows of pictures, at most COLUMNS each, and the plots below."""
+    shapes = [pictures[0].image.shape for _, pictures in strips]
     tall = [min(rows / columns, TALLEST) * WIDTH * 0.93 / COLUMNS + 0.22 for rows, columns, _ in shapes]
     below, head = 3.1 * _rows(series), 0.95
     height = head + sum(tall) + below
@@ -249,7 +257,7 @@ def overview(strips: Mapping[str, Sequence[Picture]], series: Series, title: str
     figure.text(0.02, 1 - 0.33 / height, _literal(title), fontsize=15, color=INK, weight="bold", va="center")
     figure.text(0.02, 1 - 0.66 / height, _literal(subtitle), fontsize=9.5, color=QUIET, va="center")
     top = head
-    for (name, pictures), tallness in zip(strips.items(), tall, strict=True):
+    for (name, pictures), tallness in zip(strips, tall, strict=True):
         _draw_strip(figure, _band(figure, top, tallness - 0.22), name, pictures)
         top += tallness
     _draw_plots(figure, _band(figure, top + 0.25, below - 0.75), series)

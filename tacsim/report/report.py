@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacsim.interface import FloatArray
+from tacsim.interface import FloatArray, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.record.episode import Episode
 from tacsim.report.diagnostics import timing, timing_rows, trust, trust_rows
 from tacsim.report.series import SETTLED, Series
@@ -19,16 +19,23 @@ from tacsim.report.series import SETTLED, Series
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tacsim.report.figure import Picture
+    from tacsim.report.strips import Strip
 
 FILMSTRIP = 12  # frames a sensor in report.html
+# Of the gels: key in the summary, words, and unit of a person
+SURFACE = (
+    ("deepest", "deepest", 1e3, " mm"),
+    ("steepest", "steepest slope", 1.0, ""),
+    ("flow", "longest flow", 1e3, " mm"),
+)
 
 
 def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[str, Any]:
     """An episode in numbers, as JSON; lists have one entry for each control step (none for the state after reset).
 
     `reward` [-], `distance` [m], `felt_distance` (the same by touch alone [m]), `force` (arm -> |Fz| [N]), `seconds`
-    [s], `contact_signal` (sensor -> list), `correlation` (sensor -> r between contact signal and force), `timing`
+    [s], `contact_signal` (sensor -> list), `deepest` point and longest `flow` of a gel (sensor -> list [m]), its
+    `steepest` slope (sensor -> list), `correlation` (sensor -> r between contact signal and force), `timing`
     (tacsim.report.diagnostics; null unless the rig is live), `trust` (the same; null if sensors know their surface),
     `started` (ISO date and time with its zone).
     Unknown and infinite values are null.
@@ -53,6 +60,9 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
         "felt_distance": _numbers(done.felt),
         "force": [{name: force[name][at] for name in force if present[name][at]} for at in range(len(done))],
         "contact_signal": {name: _numbers(values) for name, values in done.signals.items()},
+        "deepest": {name: _numbers(values) for name, values in done.deepest.items()},
+        "steepest": {name: _numbers(values) for name, values in done.steepest.items()},
+        "flow": {name: _numbers(values) for name, values in done.flow.items()},
         "correlation": {name: pair[2] for name, pair in signal_against_force(series).items()},
         "seconds_per_step": _number(np.median(done.seconds)) if len(done) else None,
         "seconds": _numbers(done.seconds),
@@ -65,27 +75,34 @@ def summary(series: Series, *, complete: bool = True, dropped: int = 0) -> dict[
     }
 
 
-def write_report(episode: Episode, directory: Path) -> dict[str, Path]:
+def write_report(
+    episode: Episode,
+    directory: Path,
+    find: Callable[[str, TactileFrame], SurfaceMap | TactileObservation | None] = lambda sensor, frame: frame.surface,
+) -> dict[str, Path]:
     """Writes `summary.json`, `report.png` and `report.html` into `directory`; returns their paths by name. The steps of
     a recording are read one by one, so that an episode of any length takes little memory.
+
+    find: the surface of a sensor's gel in a frame, where it is known; by default only what the frame itself says.
 
     Raises OSError when the directory can't be written, ValueError for an episode without steps, EpisodeError for a
     recording that cannot be read.
     """
     from tacsim.report import figure
+    from tacsim.report.strips import strips
 
     if not len(episode.steps):
         raise ValueError("the episode has no steps, there is nothing to report; record at least the state after reset")
     series = Series.of(episode)
     stats = summary(series, complete=episode.complete, dropped=episode.dropped)
-    strips = {name: figure.pictures(episode, series, name, FILMSTRIP) for name in series.sensors}
+    rows = strips(episode, series, FILMSTRIP, find)
     paths = {name: directory / name for name in ("summary.json", "report.png", "report.html")}
     directory.mkdir(parents=True, exist_ok=True)
     paths["summary.json"].write_text(json.dumps(stats, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     subtitle = " · ".join(f"{key}: {value}" for key, value in _headline(stats, series))
-    few = {name: [each[k] for k in figure.moments(len(each), figure.COLUMNS)] for name, each in strips.items()}
+    few = [(row.label, [row.pictures[k] for k in figure.moments(len(row.pictures), figure.COLUMNS)]) for row in rows]
     figure.save(figure.overview(few, series, _title(stats), subtitle), paths["report.png"])
-    paths["report.html"].write_text(_html(series, stats, strips), encoding="utf-8")
+    paths["report.html"].write_text(_html(series, stats, rows), encoding="utf-8")
     return paths
 
 
@@ -112,10 +129,16 @@ def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     peak = max(forces, key=lambda row: row[0], default=None)  # of equal ones the first
     rows = [
         ("steps", f"{stats['steps']}" + ("" if stats["complete"] else " (recording incomplete)")),
-        ("best distance", best),
-        ("best distance, felt", felt),
-        ("final reward", f"{rewards[-1]:.3f}" if rewards else "–"),
-        ("peak force |Fz|", f"{peak[0]:.2f} N ({peak[1]}, step {peak[2]})" if peak else "–"),
+        *_of_task(
+            stats,
+            [
+                ("best distance", best),
+                ("best distance, felt", felt),
+                ("final reward", f"{rewards[-1]:.3f}" if rewards else "–"),
+            ],
+        ),
+        *([("peak force |Fz|", f"{peak[0]:.2f} N ({peak[1]}, step {peak[2]})")] if peak else []),
+        *_surface_rows(stats),
         ("contact signal", _signal_text(stats)),
         ("step time, median", f"{stats['seconds_per_step']:.3f} s" if stats["seconds_per_step"] is not None else "–"),
     ]
@@ -128,6 +151,25 @@ def _results(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
     if stats["dropped"]:
         rows.append(("dropped", f"{stats['dropped']} steps were not recorded"))
     return rows
+
+
+def _of_task(stats: Mapping[str, Any], rows: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Rows that only an episode with a task has."""
+    return [] if stats["task"] is None else rows
+
+
+def _surface_rows(stats: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The greatest height, slope and flow of each gel that are known."""
+    found = []
+    for key, words, scale, unit in SURFACE:
+        parts = [
+            f"{name} {scale * max(known)[0]:.3g}{unit} (step {max(known)[1]})"
+            for name, values in stats[key].items()
+            if (known := [(value, -k) for k, value in zip(stats["step"], values, strict=True) if value is not None])
+        ]
+        if parts:
+            found.append((words, "; ".join(parts).replace("step -", "step ")))
+    return found
 
 
 def _least(stats: Mapping[str, Any], key: str) -> str:
@@ -157,7 +199,7 @@ def _headline(stats: Mapping[str, Any], series: Series) -> list[tuple[str, str]]
         ("policy", str(stats["policy"])),
         ("seed", str(stats["seed"])),
         ("steps", str(stats["steps"])),
-        ("goal", goal_text(series.meta.goal)),
+        *_of_task(stats, [("goal", goal_text(series.meta.goal))]),
     ]
     started = stats["started"]
     return lines if started is None else [*lines, ("started", f"{started[:10]} {started[11:19]} {started[23:]}")]
@@ -175,7 +217,7 @@ def _inline(content: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
 
 
-def _html(series: Series, stats: Mapping[str, Any], strips: Mapping[str, Sequence[Picture]]) -> str:
+def _html(series: Series, stats: Mapping[str, Any], strips: Sequence[Strip]) -> str:
     from jinja2 import Environment, StrictUndefined
 
     from tacsim.report import figure
@@ -185,16 +227,16 @@ def _html(series: Series, stats: Mapping[str, Any], strips: Mapping[str, Sequenc
     ).from_string(Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8"))
     return template.render(
         title=_title(stats),
-        about=[("rig", stats["rig"]), ("task", stats["task"] or "–"), *_headline(stats, series)],
+        about=[("rig", stats["rig"]), *_of_task(stats, [("task", stats["task"])]), *_headline(stats, series)],
         results=_results(stats),
         versions=sorted(stats["versions"].items()),
         strips=[
             {
-                "name": name,
-                "frames": [(picture.index, _inline(figure.png(picture.image))) for picture in pictures],
-                "total": len(series.seen(name)),
+                "title": strip.title,
+                "note": strip.note,
+                "frames": [(picture.index, _inline(figure.png(picture.image))) for picture in strip.pictures],
             }
-            for name, pictures in strips.items()
+            for strip in strips
         ],
         plots=_inline(figure.png_of(figure.plots(series))),
     )

@@ -26,10 +26,25 @@ DRIFT = "drift_"  # change of the untouched gel's colour since the reference [-]
 BACKGROUND = "background_"  # mean slope that a drift of the light would look like [degrees]
 BEYOND = "beyond_"  # share of the picture whose colours lie beyond the calibrated slopes
 KEPT = "kept_"  # share of the markers that were seen
+DEEPEST = "deepest_"  # of the height of its gel [m]
+STEEPEST = "steepest_"  # slope of its gel [-]
+LONGEST = "flow_"  # of its markers' displacements [m]
 SETTLED = "settled"
 FELT = "felt_distance"  # from the goal, by touch alone [m]
 _OF_ARMS = (ALIGNMENT, LIMITS, LOST)
-_OF_SENSORS = (SIGNAL, STALE, DRIFT, BACKGROUND, BEYOND, KEPT, PICTURES_LOST, PICTURES_DAMAGED, PICTURES_REPEATED)
+_SURFACE = (DEEPEST, STEEPEST, LONGEST)
+_OF_SENSORS = (
+    SIGNAL,
+    *_SURFACE,
+    STALE,
+    DRIFT,
+    BACKGROUND,
+    BEYOND,
+    KEPT,
+    PICTURES_LOST,
+    PICTURES_DAMAGED,
+    PICTURES_REPEATED,
+)
 LARGEST = 1e15  # what a recording says beyond that, infinite or not a number, counts as unknown
 _OWN = ("time", "seconds", "reward", "distance")
 
@@ -103,8 +118,26 @@ class Series:
     @property
     def signals(self) -> dict[str, FloatArray]:
         """The contact signal of every sensor that has one."""
-        keys = sorted(key for key in self.info if key.startswith(SIGNAL))
-        return {key.removeprefix(SIGNAL): self.info[key] for key in keys}
+        return self._named(SIGNAL)
+
+    @property
+    def deepest(self) -> dict[str, FloatArray]:
+        """The deepest point of every gel whose height is known [m]."""
+        return self._named(DEEPEST)
+
+    @property
+    def steepest(self) -> dict[str, FloatArray]:
+        """The steepest slope of every gel whose height is known [-]."""
+        return self._named(STEEPEST)
+
+    @property
+    def flow(self) -> dict[str, FloatArray]:
+        """The longest displacement of a marker, of every gel whose flow is known [m]."""
+        return self._named(LONGEST)
+
+    def _named(self, prefix: str) -> dict[str, FloatArray]:
+        keys = sorted(key for key in self.info if key.startswith(prefix))
+        return {key.removeprefix(prefix): self.info[key] for key in keys}
 
     def seen(self, sensor: str) -> list[int]:
         """The positions of the steps that have a picture of this sensor."""

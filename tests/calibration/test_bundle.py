@@ -75,8 +75,8 @@ def test_a_bundle_comes_back_bit_by_bit(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3"),
-        ("format: 3", "format: 4", "has format 4, this version of tacsim reads 1, 2, 3"),
+        ("format: 3", "format: 0", "has format 0, this version of tacsim reads 1, 2, 3, 4"),
+        ("format: 3", "format: 5", "has format 5, this version of tacsim reads 1, 2, 3, 4"),
         ("format: 3", "format: 2", "was changed since it was written"),
         ("format: 3", "form: 3", "names no format"),
         ("noise: null", "noise: {deviation: [1, 1, 1]}", "was changed since it was written"),

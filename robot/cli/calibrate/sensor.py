@@ -184,7 +184,8 @@ def _markers(read: FrameSet, pitch: float) -> Markers:
             f"{nothing}; leave --markers out if none are printed", param_hint="--markers"
         ) from None
     rows, columns = lattice.present.shape
-    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch)
+    places = tuple(tuple((float(x), float(y)) for x, y in row) for row in lattice.positions * pitch)
+    return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch, places=places)
 
 
 def _noise(read: FrameSet) -> CameraNoise | None:

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -26,6 +27,7 @@ from robot.mock.ur.fault_client import FaultClient
 from robot.mock.ur.handle import MockArms
 from robot.mock.ur.machine.version import VERSION, Version, parse_version
 from tacsim import pose as se3
+from tacsim.config import load_sensor
 from tacsim.interface import FloatArray, Pose, Truth
 from tacsim.models.hardware import CameraSensorConfig, UrArmConfig
 from tacsim.models.rig import RigConfig, SimSensorConfig
@@ -256,8 +258,8 @@ def _models(config: RigConfig) -> dict[str, SensorModel]:
         if isinstance(sensor, SimSensorConfig):
             found[name] = sensor.model
         elif isinstance(sensor, CameraSensorConfig) and sensor.mock is not None:
-            assert sensor.model is not None  # the loader refuses a mock camera without one
-            found[name] = sensor.model
+            # the loader refuses a mock camera with neither
+            found[name] = sensor.model or load_sensor(Path(sensor.calibration or ""))
     return found
 
 

@@ -186,6 +186,18 @@ def test_a_ball_smaller_than_its_contact_is_doubted(sensor: HiddenSensor) -> Non
     assert any("is the ball's radius (or the pixel pitch) right" in warning for warning in fit.warnings)
 
 
+def test_a_speck_of_glare_is_no_second_contact(sensor: HiddenSensor) -> None:
+    """16 white pixels in a corner, where the smoothing that noise asks for reflects them: as strong as the contact."""
+    presses = sensor.presses(5)
+    frames = named(presses)
+    frames[0][1][-4:, -4:] = 255
+    fit = calibrate_light(sensor.empty(), frames, BALL_PX)
+    assert fit.left_out == ()
+    x, y, radius = presses[0].circle
+    found = fit.presses[0].circle
+    assert np.hypot(found.x - x, found.y - y) < 0.5 and found.radius == pytest.approx(radius, rel=0.05)
+
+
 def test_a_picture_without_contact_of_another_light_is_doubted(sensor: HiddenSensor) -> None:
     stale = np.clip(sensor.empty() + np.array([15, 0, 3]), 0, 255).astype(np.uint8)
     fit = calibrate_light(stale, named(sensor.presses(5)), BALL_PX)

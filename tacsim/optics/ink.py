@@ -1,0 +1,60 @@
+"""Ink on the gel: dark dots in a picture, painted over or lifted off it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+EDGE_DARKNESS = 0.15  # of the blurred edge of a dot: the share of its light that is missing
+MAX_RADIUS = 2.5  # of what may be a dot [radii]
+BLUR = 0.35  # of the picture [radii]
+MIN_RADIUS = 1.2  # of a dot that can be found [px]
+
+
+def dot_filters(radius: float) -> tuple[int, float]:
+    """Side of the closing and deviation of the blur for dots of a radius [px]. Raises ValueError."""
+    if not radius >= MIN_RADIUS:
+        raise ValueError(f"dots of radius {radius:.2g} px cannot be found, at least {MIN_RADIUS:g} px are needed")
+    return 2 * int(np.ceil(MAX_RADIUS * radius)) + 1, BLUR * radius
+
+
+def darkness(image: Image, side: int, blur: float) -> Float32:
+    """(H, W) share of the light that is missing against the frame of `side` x `side` px round each place."""
+    import cv2
+
+    if image.ndim == 3:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    calm = np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur), dtype=np.float32)
+    levels = cv2.convertScaleAbs(calm)  # many times faster to close than float, and fine enough for what is smooth
+    bright = cv2.morphologyEx(levels, cv2.MORPH_CLOSE, np.ones((side, side), dtype=np.uint8))
+    share = calm / np.maximum(bright, 1).astype(np.float32)
+    return np.asarray(np.float32(1.0) - share, dtype=np.float32)
+
+
+class DotEraser:
+    """Paints dots of about one radius [px] over with what surrounds them (Telea 2004): light is calibrated without
+    them, since under a press they move."""
+
+    def __init__(self, radius: float) -> None:
+        """Raises ValueError for dots too small to be found."""
+        self._side, self._blur = dot_filters(radius)
+
+    def __call__(self, image: Image) -> Image:
+        """The picture (H, W, 3) without its dots."""
+        import cv2
+
+        inked = (darkness(image, self._side, self._blur) > EDGE_DARKNESS).astype(np.uint8)
+        wider = cv2.dilate(inked, np.ones((3, 3), dtype=np.uint8))
+        return np.asarray(cv2.inpaint(image, wider, 3.0, cv2.INPAINT_TELEA), dtype=np.uint8)
+
+
+def lifted_ink(picture: Image, radius: float) -> tuple[Image, Float32]:
+    """The picture (H, W, 3) of an untouched gel without its dots of about `radius` [px], and (H, W, 3) the share of
+    their light that they let through, 1 beside them: the product is the picture. Raises ValueError for dots too small
+    to be found."""
+    clean = DotEraser(radius)(picture)
+    share = picture.astype(np.float32) / np.maximum(clean, 1).astype(np.float32)
+    return clean, np.asarray(share, dtype=np.float32)

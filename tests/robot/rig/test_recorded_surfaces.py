@@ -1,0 +1,77 @@
+"""A replay's report shows what the gel did: found by a bundle, or by nothing but the distance of its printed dots."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tacsim.models.sensor import Markers, SensorGeometry, SensorModel
+from tacsim.optics.markers import marker_flow
+from tacsim.optics.render import Renderer
+from tests.robot.cli.invoked import tacsim
+from tests.tacsim.optics.surfaces import dent, flat
+
+GEL, PITCH = (20e-3, 20e-3), 1.9e-3
+MARKERS = Markers(rows=5, columns=7, pitch=PITCH, radius=0.22e-3)
+BUNDLE = Path(__file__).parents[2] / "fixtures" / "bundle_0_1_0"
+SLIDES = [(0.0, 0.0), (0.2e-3, -0.1e-3), (0.4e-3, -0.2e-3)]
+
+
+def record(folder: Path, markers: Markers | None) -> Path:
+    """Rendered pictures of a dent that slides; the first is untouched."""
+    model = SensorModel(geometry=SensorGeometry(width=240, height=190, pixel_pitch=0.065e-3), markers=markers)
+    render = Renderer(model, GEL)
+    folder.mkdir()
+    for number, surface in enumerate([flat(), *(dent((0.5e-3, 0.4e-3), 0.4e-3, slide) for slide in SLIDES)]):
+        Image.fromarray(render(surface)).save(folder / f"{number}.png")
+    return folder
+
+
+def report(tmp_path: Path, frames: Path, *more: str) -> tuple[str, dict, str]:
+    """Output of the run, summary.json, and the page."""
+    settings = [word for each in (f"source={frames}", *more) for word in ("--set", f"sensors.finger.{each}")]
+    done = tacsim("run", "replay", *settings, "--out", str(tmp_path / "out"))
+    assert done.exit_code == 0, done.output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    return done.output, summary, (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_flow_is_found_by_the_distance_of_the_dots_alone(tmp_path: Path) -> None:
+    output, summary, page = report(tmp_path, record(tmp_path / "frames", MARKERS), "marker_pitch=1.9 mm")
+    true = [np.linalg.norm(marker_flow(dent((0.5e-3, 0.4e-3), 0.4e-3, s), MARKERS), axis=2).max() for s in SLIDES]
+    assert summary["flow"]["finger"] == pytest.approx(true, abs=0.2 * 0.065e-3)  # a fifth of a pixel
+    assert "finger: flow" in page and "finger: height" not in page and "dark dots" not in output
+
+
+def test_a_replay_says_that_it_sees_dots(tmp_path: Path) -> None:
+    output, summary, _ = report(tmp_path, record(tmp_path / "frames", MARKERS))
+    assert "sensor finger shows 5 x 7 dark dots" in output and "sensors.finger.marker_pitch=" in output
+    assert summary["flow"] == {}
+
+
+def test_without_dots_a_pitch_is_refused(tmp_path: Path) -> None:
+    frames = record(tmp_path / "frames", None)
+    done = tacsim(
+        "run", "replay", "--set", f"sensors.finger.source={frames}", "--set", "sensors.finger.marker_pitch=2 mm"
+    )
+    assert done.exit_code == 2 and "sensors.finger" in done.output and "no lattice of dark dots" in done.output
+
+
+def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) -> None:
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for name, source in (("0.png", "reference.png"), ("1.png", "press.png")):
+        (frames / name).write_bytes((BUNDLE / source).read_bytes())
+    output, summary, page = report(tmp_path, frames, f"calibration={BUNDLE}")
+    assert summary["deepest"]["finger"] == pytest.approx([0.5e-3], rel=0.15)  # pressed 0.5 mm
+    for there in ("finger: height", "finger: slope", "deepest", "steepest slope"):
+        assert there in page
+    assert "finger: flow" not in page
+    for task in ("best distance", "final reward", "goal", "–"):
+        assert task not in output and f">{task}" not in page
+    again = tacsim("replay", str(tmp_path / "out" / "episode.mcap"), "--out", str(tmp_path / "again"))
+    assert again.exit_code == 0 and "finger: height" in (tmp_path / "again" / "report.html").read_text(encoding="utf-8")

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.drift import DriftFinder, size_of
+from calibration.errors import BadFrames
 from calibration.height.colour_table import from_model
 from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
 from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view, seen_box
 from calibration.lens.view import GelView
-from calibration.markers.flow import MarkerFlow, NoMarkers, find_markers, marker_grid, require_no_markers
+from calibration.markers.flow import MarkerFlow, find_markers, marker_grid, require_no_markers
 from calibration.markers.lattice import NoLattice
 from calibration.reference import (
     LOST_COLOUR,
@@ -280,7 +281,7 @@ def normaliser_for_recording(
     """The normaliser of recorded frames of `image_shape` (rows, columns): by the sensor's calibration, by the dots that
     are seen in its picture without contact (`untouched`) and their distance, or through the four corners of the gel.
 
-    Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle, calibration.markers.flow.NoMarkers.
+    Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle, calibration.errors.BadFrames.
     """
     if config.marker_pitch is not None and untouched is not None:
         return normaliser_for_dots(config.marker_pitch, untouched, grid)
@@ -292,11 +293,11 @@ def normaliser_for_recording(
 
 def normaliser_for_dots(pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
-    picture without contact: flow, no height. The camera looks straight on. Raises NoMarkers."""
+    picture without contact: flow, no height. The camera looks straight on. Raises BadFrames for a picture without dots."""
     try:
         lattice, radius = find_markers(untouched)
     except NoLattice as nothing:
-        raise NoMarkers(f"{nothing}: marker_pitch needs the dots of the picture without contact") from None
+        raise BadFrames(f"{nothing}: marker_pitch needs the dots of the picture without contact") from None
     scale = pitch / lattice.pitch
     (rows, columns), (high, wide) = lattice.present.shape, untouched.shape[:2]
     geometry, size = SensorGeometry(width=wide, height=high, pixel_pitch=scale), (wide * scale, high * scale)

@@ -293,7 +293,7 @@ def normaliser_for_recording(
 
 def normaliser_for_dots(pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid) -> FrameNormaliser:
     """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
-    picture without contact: flow, no height. The camera looks straight on. Raises BadFrames for a picture without dots."""
+    picture without contact: flow, no height. The camera looks straight on. Raises BadFrames where no dots are seen."""
     try:
         lattice, radius = find_markers(untouched)
     except NoLattice as nothing:

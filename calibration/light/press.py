@@ -21,7 +21,7 @@ FAR = 3.0  # beyond, the gel is untouched [contact radii]
 MIN_UNTOUCHED_SHARE = 0.15  # of the picture, for a drift that varies over it
 MAX_SATURATED_SHARE = 0.4  # of the contact
 SECOND_CONTACT = 0.7  # strength of a second patch, over that of the contact, that makes it a contact too ...
-SECOND_AREA = 0.15  # ... if so large at half that strength [areas of the contact]: specks of dirt or glare are smaller
+SECOND_AREA = 0.3  # ... if it also is so large, over the contact's patch: specks of dirt or glare are smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,14 +79,16 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
         raise BadFrames(f"{saturated:.0%} of the contact is saturated: shorten the exposure or press less")
     change = (raw - drift) / mean
     strength = np.abs(smooth(change, 3.0)).max(axis=2)
-    inside = strength[distance < 1.5 * circle.radius].max()
-    far = np.where(distance > FAR * circle.radius, strength, 0.0)
-    if _second_area(far, SECOND_CONTACT * inside) > SECOND_AREA * np.pi * circle.radius**2:
+    near, far = (
+        np.where(part, strength, 0.0) for part in (distance < 1.5 * circle.radius, distance > FAR * circle.radius)
+    )
+    strong = SECOND_CONTACT * float(near.max())
+    if _patch_area(far, strong) > SECOND_AREA * _patch_area(near, strong):
         raise BadFrames("there is a second contact in the picture; press one ball at a time")
     return BallPress(name, circle, change, drift, lit)
 
 
-def _second_area(strength: Float64, strong: float) -> int:
+def _patch_area(strength: Float64, strong: float) -> int:
     """Pixels of the largest patch that is as strong as `strong` somewhere, and half as strong everywhere."""
     import cv2
 

@@ -67,7 +67,8 @@ def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) ->
     for name, source in (("0.png", "reference.png"), ("1.png", "press.png")):
         (frames / name).write_bytes((BUNDLE / source).read_bytes())
     output, summary, page = report(tmp_path, frames, f"calibration={BUNDLE}")
-    assert summary["deepest"]["finger"] == pytest.approx([0.413e-3], rel=0.02)  # as 0.1.0 found it, see heights.json
+    (deepest,) = summary["deepest"]["finger"]
+    assert 0.4e-3 < deepest < 0.52e-3  # pressed 0.5 mm
     for there in ("finger: height", "finger: slope", "deepest", "steepest slope"):
         assert there in page
     assert "finger: flow" not in page

@@ -70,7 +70,7 @@ def test_it_tells_what_the_environments_tell(envs: SharedVecEnv) -> None:
 
 
 def test_an_end_by_a_limit_is_no_time_limit() -> None:
-    envs = SharedVecEnv(make_native(2, "SameStep", features=FEATURES, variants=[["task.force_limit=1 mN"]]))
+    envs = SharedVecEnv(make_native(2, "SameStep", features=FEATURES, variants=[["task.force_limit=51 mN"]]))
     envs.reset()
     _, rewards, done, infos = envs.step(np.tile(np.float32([1.0, -1.0]), (2, 1)))
     assert done.all()

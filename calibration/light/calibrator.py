@@ -21,7 +21,7 @@ from calibration.errors import BadFrames
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.lens.view import GelView
 from calibration.light.circle import NoCircle
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, rim_slope
+from calibration.light.dent import ContactCircle, dent_gradient, rim_slope
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
 from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, untouched_mean
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
@@ -42,9 +42,7 @@ GOOD_FIT = 0.05  # share of the change: a press that is explained so well always
 RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
-# Errors of a press's normals that deserve a warning
-BAD_NORMALS_RATIO = 3.0  # over the median press
-BAD_NORMALS = 8.0  # [degrees]
+BAD_NORMALS = 8.0  # errors of a press's normals that deserve a warning [degrees]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +69,7 @@ class LightFit:
     size: ModelSize
     thickness: float  # of the gel, as the skirts of the dents tell it [px]
     radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
+    unexplained: tuple[float, ...]  # share of each press's change of colour that no dent explains
     predictions: tuple[PressPrediction, ...]
     left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
     warnings: tuple[str, ...]
@@ -179,9 +178,10 @@ def calibrate_light(
         size=size,
         thickness=refined.thickness,
         radius_uncertainty=refined.radius_uncertainty,
+        unexplained=refined.unexplained,
         predictions=predictions,
         left_out=tuple(left_out),
-        warnings=(*_warnings(presses, ball, mean, len(left_out)), *_badly_predicted(predictions)),
+        warnings=(*_warnings(presses, mean, len(left_out)), *_badly_predicted(predictions)),
         reference=shown,
         presses=tuple(presses),
         frames=tuple(name for name, _ in frames),
@@ -228,15 +228,9 @@ def _refined(
     raise BadFrames("no frame can be used. " + "; ".join(f"{name}: {why}" for name, why in left_out))
 
 
-def _warnings(presses: Sequence[BallPress], ball: float, mean: Float64, left_out: int) -> list[str]:
-    """What a person should look at. A wrong radius of the ball scales every slope, which another light explains just as
-    well; only a contact as wide as the ball gives it away."""
+def _warnings(presses: Sequence[BallPress], mean: Float64, left_out: int) -> list[str]:
+    """What a person should look at in the frames; calibration.light.verdict judges the figures."""
     found = []
-    steep = [press.name for press in presses if press.circle.radius > 0.97 * MAX_RIM_RATIO * ball]
-    if steep:
-        found.append(
-            f"contact as wide as the ball in {', '.join(steep)}: is the ball's radius (or the pixel pitch) right?"
-        )
     drift = float(np.abs(np.median([(p.drift / mean).mean(axis=(0, 1)) for p in presses], axis=0)).max())
     if drift > STALE_COLOUR:
         found.append(
@@ -246,7 +240,7 @@ def _warnings(presses: Sequence[BallPress], ball: float, mean: Float64, left_out
     if left_out > len(presses):
         found.append("most frames were left out: does the picture without contact really show none?")
     if len(presses) == 1:
-        return [*found, "only one press: the fit cannot be checked; press at least five"]
+        return found
     height, width = presses[0].shape
     if max(np.ptp([p.circle.x for p in presses]) / width, np.ptp([p.circle.y for p in presses]) / height) < MIN_SPREAD:
         found.append("all presses are in one place: nothing is known of light elsewhere on the gel; spread them")
@@ -254,13 +248,14 @@ def _warnings(presses: Sequence[BallPress], ball: float, mean: Float64, left_out
 
 
 def _badly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
-    if len(predictions) < 3:
+    """Only with three or more: of two presses either may be the bad one."""
+    bad = [prediction for prediction in predictions if prediction.angle > BAD_NORMALS]
+    if len(predictions) < 3 or not bad:
         return []
-    limit = max(BAD_NORMALS, BAD_NORMALS_RATIO * float(np.median([prediction.angle for prediction in predictions])))
+    worst = max(prediction.angle for prediction in bad)
+    names = ", ".join(prediction.name for prediction in bad)
     return [
-        f"{s.name} is predicted badly by the others, normals off by {s.angle:.0f} degrees: another ball, a bad frame?"
-        for s in predictions
-        if s.angle > limit
+        f"{names} predicted badly by the others, normals off by up to {worst:.0f} degrees: another ball, a bad frame?"
     ]
 
 

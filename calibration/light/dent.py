@@ -111,6 +111,20 @@ def dent_gradient(
     return np.stack([-steepness * dx, -steepness * dy], axis=-1)
 
 
+def contact_depth(contact: float, ball: float, thickness: float) -> float:
+    """How deep a ball is in a layer when its contact is as wide as that: Hertz's a^2 / R, less on a thin layer; all in
+    one unit."""
+    from scipy.special import j1
+
+    waves, weights = _missing_waves()
+    waves = waves * (contact / thickness)
+    less = 4 / np.pi * weights * (np.sin(waves) - waves * np.cos(waves)) / waves**2 * (contact / thickness)
+    inside = np.linspace(0.05, 1.0, 20)
+    slope = inside - j1(np.outer(inside, waves)) @ less  # the ball's is `inside`: the pressure is that much larger
+    pressure = float((inside**3).sum() / (slope * inside**2).sum())
+    return contact**2 / ball * pressure * (1 - float((less / waves).sum()))
+
+
 def rim_slope(circle: ContactCircle, ball: float) -> float:
     """The steepest slope of the dent [-]."""
     return circle.radius / float(np.sqrt(ball**2 - circle.radius**2))

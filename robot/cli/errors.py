@@ -14,6 +14,7 @@ from tacsim.models.text import printable
 
 OURS = {"tacsim", "calibration", "robot"}
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
+UNTRUSTED = 3  # all was done, but the result is not to be trusted
 
 
 class Guarded(TyperGroup):

@@ -20,7 +20,8 @@ Overrides = Annotated[
 
 
 def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
-    """Parser of an option that is a length, an angle ... with or without unit, `low` to `high` in SI units."""
+    """Parser of an option that is a length, an angle ..., `low` to `high` in SI units. A length but 0 needs its unit: a
+    person who leaves it out means millimetres as often as metres."""
 
     def parse(text: str) -> float:
         from tacsim.models.quantity import parse as parse_quantity
@@ -29,11 +30,22 @@ def quantity(kind: str, low: float = -math.inf, high: float = math.inf) -> Calla
             value = parse_quantity(text, kind)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
+        if kind == "length" and value != 0 and is_number(text):
+            raise typer.BadParameter(f"'{text}' has no unit; say '{text.strip()} mm', or m, cm, um")
         if not low <= value <= high:
             raise typer.BadParameter(f"{value:g}; allowed: {low:g} to {high:g} (SI units)")
         return value
 
     return parse
+
+
+def is_number(text: str) -> bool:
+    """A number without a unit."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:

@@ -9,14 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from tacsim.config import bundle
 from tacsim.config.annotation import allowed, child, default, keys, models, variant
 from tacsim.config.document import FORMER_KEYS, MAX_NODES, LoadState, Node, from_plain, parse_text, read_text, shown
 from tacsim.config.errors import Place, did_you_mean, join
 from tacsim.config.kinds import Kind, NotFound, kind_of, resolve
+from tacsim.models.quantity import Quantity
 
+FAR = ("arms", "keep_out", "start")  # parts of a rig where metres can be meant
+TOO_LONG = 0.1  # for anything else that `--set` gives as a bare number [m]
 _MAX_CHAIN = 16  # files that refer to each other in a row
 
 
@@ -165,6 +168,7 @@ def apply(root: Node, annotation: Any, override: Override, state: LoadState) -> 
 
 def _put(node: Node, annotation: Any, override: Override, depth: int, state: LoadState) -> Node:
     if depth == len(override.path):
+        _require_unit(annotation, override, state)
         return expand(override.value, annotation, state, ".".join(override.path))
     if node.broken:
         return node
@@ -190,6 +194,23 @@ def _put(node: Node, annotation: Any, override: Override, depth: int, state: Loa
     entry = entry or Node(None, override.value.place, override.value.folder)
     changed = replace(node, value={**node.items, step: _put(entry, inner, override, depth + 1, state)})
     return drop_foreign_keys(node, changed, annotation, keep={step})
+
+
+def _require_unit(annotation: Any, override: Override, state: LoadState) -> None:
+    """Reports lengths without a unit that cannot be metres: of gels, bodies and sensors; an arm reaches so far."""
+    if override.path[0] in FAR or not _is_length(annotation):
+        return
+    values = override.value.value if isinstance(override.value.value, list) else [override.value]
+    for node in values:
+        number = node.value
+        if isinstance(number, int | float) and not isinstance(number, bool) and abs(number) >= TOO_LONG:
+            what = f"{number} without a unit would be {number:g} m; say '{number:g} mm' or the like"
+            state.report(override.value.place, ".".join(override.path), what)
+
+
+def _is_length(annotation: Any) -> bool:
+    parts = (*getattr(annotation, "__metadata__", ()), *get_args(annotation))
+    return any(part.kind == "length" if isinstance(part, Quantity) else _is_length(part) for part in parts)
 
 
 def _put_in_list(node: Node, annotation: Any, override: Override, depth: int, state: LoadState) -> Node:

@@ -112,6 +112,47 @@ def test_the_command_writes_a_bundle_and_a_picture(folder: Path, tmp_path: Path)
     assert "Traceback" not in nothing.output
 
 
+def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
+    """Two presses are not enough: the exit code is 3, the bundle and the page say why."""
+    from typer.testing import CliRunner
+
+    from calibration.bundle import read_bundle
+    from robot.cli import app
+
+    for number in (2, 3, 4):
+        (folder / f"press_{number}.png").unlink()
+    lengths = ["--ball-diameter", f"{2e3 * BALL} mm", "--kind", "digit", "--pixel-pitch", f"{PITCH * 1e3} mm"]
+    ran = CliRunner().invoke(app, ["calibrate", "sensor", str(folder), *lengths, "--out", str(tmp_path / "out")])
+    assert ran.exit_code == 3, ran.output
+    assert "verdict: do not trust" in ran.output and "press five at least" in ran.output
+    assert "11.4 x 15.2 mm of the gel" in ran.output  # a DIGIT's picture shows less
+    calibration, _ = read_bundle(tmp_path / "out")
+    assert calibration.provenance.ball_radius == pytest.approx(BALL)
+    assert calibration.provenance.warnings[0].startswith("verdict: do not trust")
+    assert "do not trust" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--ball-radius", "2.92", "--pixel-pitch", "0.06 mm"), "'2.92' has no unit; say '2.92 mm'"),
+        (("--ball-radius", "2.92 mm", "--pixel-pitch", "6e-5"), "has no unit"),
+        (("--ball-radius", "2.92 m", "--pixel-pitch", "0.06 mm"), "allowed"),
+        (("--ball-radius", "3 mm", "--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm"), "not both"),
+        (("--ball-diameter", "6 mm", "--kind", "minni"), "known: mini,"),
+        (("--ball-diameter", "6 mm", "--kind", "other"), "--pixel-pitch or --view"),
+    ],
+)
+def test_the_command_refuses_lengths_that_may_be_wrong(folder: Path, words: tuple[str, ...], said: str) -> None:
+    from typer.testing import CliRunner
+
+    from robot.cli import app
+
+    ran = CliRunner().invoke(app, ["calibrate", "sensor", str(folder), *words], env={"COLUMNS": "300"})
+    assert ran.exit_code == 2
+    assert said in ran.output
+
+
 def test_the_command_measures_the_cameras_noise(folder: Path, tmp_path: Path) -> None:
     from typer.testing import CliRunner
 

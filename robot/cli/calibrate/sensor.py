@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
-from robot.cli.options import Out, Overrides, length
+from robot.cli.errors import UNTRUSTED
+from robot.cli.options import Out, Overrides, length, quantity
 from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
     from calibration.light.calibrator import LightFit
+    from calibration.light.verdict import KnownScale
+    from calibration.profiles import SensorProfile
+    from tacsim.models.hardware import CameraSensorConfig
     from tacsim.models.sensor import CameraNoise, Markers
 
 MAX_PRESSES = 200  # 5 to 8 are enough
@@ -29,21 +33,36 @@ def _group() -> None:
 
 
 @calibrate.command(
-    epilog='Example: [bold]tacsim calibrate sensor frames --ball-radius "2.92 mm" --pixel-pitch "0.0593 mm"[/]'
+    epilog='Example: [bold]tacsim calibrate sensor frames --ball-diameter "5.84 mm" --pixel-pitch "0.0593 mm"[/]'
 )
 def sensor(
     frames: Annotated[
         Path | None, typer.Argument(help="Folder of pictures of a ball's presses, 5 to 8 or more; or give --camera.")
     ] = None,
-    ball_radius: Annotated[Any, length('Of the ball, for example "2.92 mm".')] = None,
+    ball_diameter: Annotated[
+        Any, length('Of the ball, as a calliper shows it, for example "5.84 mm".', 1e-4, 0.1)
+    ] = None,
+    ball_radius: Annotated[Any, length("Half of that, in its place.", 5e-5, 0.05)] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            "--kind",
+            metavar="KIND",
+            help="mini, mini-markers, r1.5, digit, 9dtact or other: what is known of it beforehand, such as which part "
+            "of the picture shows the gel, a first pixel pitch, dots.",
+        ),
+    ] = None,
     camera: Annotated[
         str | None,
-        typer.Option(metavar="RIG/SENSOR", help="Press now, before this camera of a rig; no arm is connected."),
+        typer.Option(
+            metavar="RIG/SENSOR",
+            help="Press now, before this camera of a rig, or one at /dev/... or http://...; no arm is connected.",
+        ),
     ] = None,
     presses: Annotated[int, typer.Option(min=1, max=100, help="How many; with --camera.")] = 8,
     pixel_pitch: Annotated[
         Any,
-        length("Distance of two pixels on the gel; or give --view."),
+        length("Distance of two pixels on the gel; or give --view, or --kind.", 1e-7, 1e-2),
     ] = None,
     view: Annotated[
         Path | None,
@@ -58,43 +77,66 @@ def sensor(
         ),
     ] = None,
     serial: Annotated[
-        str, typer.Option(help="Serial number of the sensor that the calibration belongs to.")
+        str, typer.Option(help="Serial number or name of the sensor; without --out, its folder is sensors/ and this.")
     ] = "unknown",
+    known_depth: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--depth",
+            metavar="FRAME=LENGTH",
+            help="A press of known depth, which checks pitch and ball; may be repeated.",
+        ),
+    ] = None,
     markers: Annotated[bool, typer.Option("--markers", help="Dots are printed on the gel.")] = False,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
     """Calibrate a sensor's light from presses of a ball: colour of every slope, and slope of every colour.
 
-    Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, and prints how
-    well each press is predicted by the others.
+    Contact circles are found by themselves. Writes calibration.yaml, reference.png and residuals.png, prints how well
+    each press is predicted by the others, and ends in a verdict, verdict.html: good, usable or do not trust (then the
+    exit code is 3), with the reasons and what to do next.
 
     With --camera it leads you through it: the gel without contact, then press after press, each judged at once. The
     pictures are kept in frames/ beside the bundle, to calibrate from them again; Ctrl-C keeps what was taken.
     """
+    from calibration.profiles import PROFILES
+
     if (frames is None) == (camera is None):
         raise typer.BadParameter("give either a folder of frames, or --camera to press now")
-    if ball_radius is None:
-        raise typer.BadParameter("give the ball's radius: without it no slope is known", param_hint="--ball-radius")
-    if (pixel_pitch is None) == (view is None):
+    if (ball_radius is None) == (ball_diameter is None):
+        what = "give the ball's diameter (or its radius, not both): without it no slope is known"
+        raise typer.BadParameter(what, param_hint="--ball-diameter")
+    if kind is not None and kind not in PROFILES:
+        raise typer.BadParameter(f"'{kind}'; known: {', '.join(PROFILES)}", param_hint="--kind")
+    profile = PROFILES["other" if kind is None else kind]
+    if pixel_pitch is not None and view is not None:
         raise typer.BadParameter("give either --pixel-pitch or --view")
+    if pixel_pitch is None and view is None and profile.gel_size is None:
+        raise typer.BadParameter("give --pixel-pitch or --view: nothing is known beforehand of this sensor's")
     from calibration.lens.view import GelView
     from tacsim.config import load
 
+    depths = tuple(_known_depth(text) for text in known_depth or ())
     seen = None if view is None else load(GelView, view)
-    ball, pitch = ball_radius, pixel_pitch if seen is None else seen.pixel_pitch
-    if not (ball > 0 and pitch > 0):
-        raise typer.BadParameter("the ball's radius and the pixel pitch must be positive")
-    folder = new_directory(out, "calibration")
+    ball = ball_radius if ball_diameter is None else ball_diameter / 2
+    folder = new_directory(Path("sensors") / serial if out is None and serial != "unknown" else out, "calibration")
     with busy("loading"):
         from calibration.frame_set import read_folder, rectified_by_view
         from calibration.light.calibrator import calibrate_light
+        from calibration.light.verdict import KnownScale
         from calibration.markers.dots import DotEraser
+    markers = markers or profile.markers
     if camera is not None:
-        read = _take_presses(camera, set_ or [], folder, ball / pitch, presses, seen, serial, markers=markers)
+        config, sensor_name = named_camera(camera, set_ or [], profile.native)
+        seen = _view_of(profile, seen, pixel_pitch, (config.height, config.width))
+        pitch = _pitch(profile, seen, pixel_pitch, config.width)
+        read = _take_presses(camera, config, sensor_name, folder, ball / pitch, presses, seen, serial, markers=markers)
     else:
         assert frames is not None
         read = read_folder(frames, reference, MAX_PRESSES)
+        seen = _view_of(profile, seen, pixel_pitch, read.shape)
+        pitch = _pitch(profile, seen, pixel_pitch, read.shape[1])
     if seen is not None:
         read = rectified_by_view(read, seen)
     if read.estimated:
@@ -104,12 +146,49 @@ def sensor(
     with busy(f"calibrating from {len(read.frames)} presses"):
         named = [(frame.name, frame.image) for frame in read.frames]
         fit = calibrate_light(read.reference, named, ball / pitch, erase)
-    _write(folder, fit, read, serial, ball, pitch, found, view=seen)
+    scale = KnownScale(pitch, ball, profile.gel_size, profile.gel_thickness, depths)
+    _write(folder, fit, read, serial, scale, found, profile, view=seen)
+
+
+def _known_depth(text: str) -> tuple[str, float]:
+    name, equals, depth = text.rpartition("=")
+    if not equals:
+        raise typer.BadParameter(f"'{text}'; give FRAME=LENGTH, such as 'press_3.png=0.5 mm'", param_hint="--depth")
+    value = quantity("length", 1e-6, 1e-2)(depth)
+    return name, value
+
+
+def _view_of(
+    profile: SensorProfile, view: GelView | None, pitch: float | None, shape: tuple[int, int]
+) -> GelView | None:
+    """The view that was given, or the profile's crop of its sensor's native pictures of `shape` (rows, columns)."""
+    from calibration.lens.view import view_of_corners
+
+    corners = profile.corners(shape)
+    if view is not None or pitch is not None or corners is None or profile.gel_size is None:
+        return view
+    return view_of_corners(corners, profile.gel_size, shape)
+
+
+def _pitch(profile: SensorProfile, view: GelView | None, pitch: float | None, columns: int) -> float:
+    """Distance of two pixels on the gel [m]; that of the profile is only a first one, and said to be."""
+    if pitch is not None:
+        return pitch
+    if view is not None and view.board != "four corners":
+        return view.pixel_pitch
+    if view is not None:
+        found = view.pixel_pitch
+    else:
+        assert profile.gel_size is not None
+        found = profile.gel_size[0] / columns
+    warn(f"{found * 1e3:.4g} mm a pixel, as published of a {profile.title} ({profile.source}); measure yours")
+    return found
 
 
 def _take_presses(
     camera: str,
-    overrides: list[str],
+    config: CameraSensorConfig,
+    sensor: str,
     folder: Path,
     ball: float,
     presses: int,
@@ -118,7 +197,7 @@ def _take_presses(
     *,
     markers: bool,
 ) -> FrameSet:
-    """Frames taken now, native, and kept in `folder`/frames. camera: RIG/SENSOR; ball: its radius [px].
+    """Frames taken now, native, and kept in `folder`/frames. camera: its name; ball: its radius [px].
 
     A signal ends the command; what was taken is kept then, too. Raises CannotCalibrate, BadFrames, DeviceError.
     """
@@ -127,7 +206,6 @@ def _take_presses(
     from robot.camera.camera import Camera
     from robot.procedures.presses import BallPressPlan, record_presses
 
-    config, sensor = named_camera(camera, overrides)
     if view is not None:
         require_view_size((config.height, config.width), view)
     plan = BallPressPlan(ball, presses, rectify=None if view is None else metric_picture(view), markers=markers)
@@ -151,24 +229,41 @@ def _write(
     fit: LightFit,
     read: FrameSet,
     serial: str,
-    ball: float,
-    pitch: float,
+    scale: KnownScale,
     found: Markers | None,
+    profile: SensorProfile,
     *,
     view: GelView | None,
 ) -> None:
-    """Shows the calibration and writes its bundle."""
+    """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED where it must."""
     from calibration.bundle import write_bundle
+    from calibration.light import page
     from calibration.light.residual_picture import draw
+    from calibration.light.verdict import judge
 
-    _show(fit, pitch, found)
-    bundle = fit.to_calibration(serial, ball, pitch, view=view, markers=found, noise=_noise(read))
+    verdict = judge(fit, scale)
+    _show(fit, scale.pixel_pitch, found)
+    noise = _noise(read)
+    bundle = fit.to_calibration(serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise)
+    warnings = (f"verdict: {verdict}", *bundle.provenance.warnings)
+    bundle = bundle.model_copy(update={"provenance": bundle.provenance.model_copy(update={"warnings": warnings})})
+    facts = [f"{profile.title}: {profile.source}; {profile.light}"]
+    if noise is not None:
+        facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
     with writing(folder):
         written = [write_bundle(folder, bundle, fit.reference)]
-        if fit.predictions:
-            written.append(folder / "residuals.png")
-            draw(fit, written[-1])
+        residuals = folder / "residuals.png" if fit.predictions else None
+        if residuals is not None:
+            draw(fit, residuals)
+            written.append(residuals)
+        written.append(folder / page.FILE)
+        page.write_page(written[-1], serial, fit, scale, verdict, residuals, facts)
+    for finding in verdict.findings:
+        notes.print(f"{finding.word}: {finding.what}. {finding.todo}", markup=False)
+    results.print(f"verdict: {verdict.word}")
     say_files(*written)
+    if verdict.word == "do not trust":
+        raise typer.Exit(UNTRUSTED)
 
 
 def _markers(read: FrameSet, pitch: float) -> Markers:
@@ -239,8 +334,6 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
         )
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)
-    for warning in fit.warnings:
-        warn(warning)
     if found is None:
         _look_for_dots(fit)
     else:

@@ -61,8 +61,15 @@ def confirm_free_gel() -> None:
             notes.print("Take everything off the gel first.")
 
 
-def named_camera(camera: str, overrides: list[str]) -> tuple[CameraSensorConfig, str]:
-    """The sensor RIG/SENSOR, and its name. Raises CannotCalibrate where nobody can be before its camera."""
+def named_camera(
+    camera: str, overrides: list[str], size: tuple[int, int] = (640, 480)
+) -> tuple[CameraSensorConfig, str]:
+    """The sensor RIG/SENSOR, or the camera at a device or address, whose pictures are of `size` (width, height [px]);
+    and its name. Raises CannotCalibrate where nobody can be before its camera."""
+    if camera.startswith(("/dev/", "http://", "https://")):
+        from tacsim.models.hardware import CameraSensorConfig
+
+        return CameraSensorConfig(driver="camera", source=camera, width=size[0], height=size[1]), "sensor"
     from robot.procedures.session import handheld_camera
     from tacsim.config import load_rig
 

@@ -183,7 +183,7 @@ def test_overrides_replace_references() -> None:
         ("task.steps=12", 12),
         ("task.steps=1e2", 100),
         ("scene=squeeze", "squeeze"),
-        ("scene.body.geometry.size=[1 mm, 2e-3, 3]", (1e-3, 2e-3, 3.0)),
+        ("scene.body.geometry.size=[1 mm, 2e-3, 3e-2]", (1e-3, 2e-3, 3e-2)),
         ("scene.body.geometry.size.1=4 mm", (10e-3, 4e-3, 10e-3)),
         ("scene.gel.housing=null", None),
         ("scene.gel.housing=", None),
@@ -207,6 +207,20 @@ def test_values_are_yaml(override: str, value: object) -> None:
         "scene.name": rig.scene.name,
     }
     assert found[where] == value
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("scene.body.geometry.size=[1 mm, 2e-3, 3]", "'3 mm' or the like"),
+        ("scene.body.geometry.size.1=4", "would be 4 m"),
+        ("scene.gel.housing=0.5", "would be 0.5 m"),
+        ("sensors.upper.model.geometry.pixel_pitch=0.2", "would be 0.2 m"),
+    ],
+)
+def test_a_length_without_unit_that_cannot_be_metres_is_refused(override: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        load_rig("sim", overrides=[override])
 
 
 def test_the_tasks_scene_is_the_rigs_unless_it_has_its_own(folder: Path) -> None:

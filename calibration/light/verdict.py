@@ -1,0 +1,205 @@
+"""Whether a calibrated light can be trusted: limits that hold for every sensor, and what to do where one is passed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from calibration.light.calibrator import LightFit
+from calibration.light.dent import contact_depth
+from tacsim.models.photometric import PhotometricLight, PhotometricModel
+
+Word = Literal["good", "usable", "do not trust"]
+
+MIN_PRESSES, ENOUGH_PRESSES = 3, 5
+# Means over all presses, each predicted by the others: up to the first good, beyond the second not to be trusted
+NORMALS = (5.0, 8.0)  # errors of the normals in contact [degrees]
+CORRELATION = (0.97, 0.95)  # of predicted and real change of colour
+UNEXPLAINED = (0.15, 0.35)  # share of the change of colour that no dent explains
+RADIUS = (0.03, 0.08)  # uncertainty of the contact radii [-]
+SCALE = (0.05, 0.12)  # of lengths, by a press of known depth or by the size of the gel [-]
+DIRECTED = 0.1  # least share of the power of flanks' change of colour that differs from flank to flank
+MISFIT = 0.5  # error of one press over the error of predicting nothing: its circle does not fit
+WIDEST = 0.95  # contact radius over the ball's: no gel is pressed so far
+NARROWEST = 0.35  # the same of the widest contact, below which the slopes are few or the radius is a diameter
+DEEPEST = (0.5, 0.9)  # depth over the thickness of the gel
+THIN = 1.5  # thickness of a gel over the ball's radius, up to which the slopes tell it
+THICKNESS = 2.5  # factor between the gel's thickness by its slopes and as it is told
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that lowers the verdict."""
+
+    word: Word
+    what: str
+    todo: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The judgement of a calibration."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def word(self) -> Word:
+        words = [finding.word for finding in self.findings]
+        return "do not trust" if "do not trust" in words else "usable" if words else "good"
+
+    def __str__(self) -> str:
+        return "; ".join([self.word, *(f"{finding.what}: {finding.todo}" for finding in self.findings)])
+
+
+@dataclass(frozen=True, slots=True)
+class KnownScale:
+    """What is known of lengths beside ball and pixel pitch; None: not known."""
+
+    pixel_pitch: float  # [m]
+    ball_radius: float  # [m]
+    gel_size: tuple[float, float] | None = None  # that the picture should show [m]
+    gel_thickness: float | None = None  # [m]
+    depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
+
+
+def judge(fit: LightFit, scale: KnownScale) -> Verdict:
+    """All findings, the worst first."""
+    found = [*_of_presses(fit), *_of_pictures(fit), *_of_scale(fit, scale)]
+    found += [Finding("usable", *_split(warning)) for warning in fit.warnings]
+    return Verdict(tuple(sorted(found, key=lambda finding: finding.word != "do not trust")))
+
+
+def _of_presses(fit: LightFit) -> Iterable[Finding]:
+    count = len(fit.presses)
+    if count < ENOUGH_PRESSES:
+        word: Word = "do not trust" if count < MIN_PRESSES else "usable"
+        yield Finding(word, f"{count} press{'es' * (count > 1)} could be used", "press five at least, eight are good")
+    yield from _beyond(
+        RADIUS, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
+        "press more often and deeper; is each picture of one ball, held still?",
+    )  # fmt: skip
+    misfit = [press.name for press in fit.predictions if press.error > MISFIT * press.null_error]
+    if misfit:
+        yield Finding("usable", f"the circle of {_names(misfit)} does not fit", "look at it, and leave it out")
+
+
+def _of_pictures(fit: LightFit) -> Iterable[Finding]:
+    unexplained = float(np.mean(fit.unexplained))
+    if undirected(fit.forward):
+        yield Finding(
+            "do not trust", "this light tells no direction: all flanks of a dent change alike",
+            "slopes cannot be found in such pictures; only how dark it is tells of depth",
+        )  # fmt: skip
+    yield from _beyond(
+        UNEXPLAINED, unexplained, "{:.0%} of what the presses change is no smooth function of the slope",
+        "shadows, or a light that tells no direction; is the ball a ball, and exposure fixed?",
+    )  # fmt: skip
+    if not fit.predictions:
+        return
+    yield from _beyond(
+        NORMALS, float(np.mean([press.angle for press in fit.predictions])),
+        "normals of presses that took no part are off by {:.1f} degrees",
+        "look at residuals.png: what do the worst show?",
+    )  # fmt: skip
+    correlation = float(np.mean([press.correlation for press in fit.predictions]))
+    yield from _beyond(
+        (-CORRELATION[0], -CORRELATION[1]), -correlation,
+        f"pictures of presses that took no part are predicted with a correlation of {correlation:.3f}",
+        "exposure and white balance fixed? a picture without contact of the same session?",
+    )  # fmt: skip
+
+
+def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
+    ball = scale.ball_radius / scale.pixel_pitch
+    ratios = [press.circle.radius / ball for press in fit.presses]
+    wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > WIDEST]
+    if len(wide) > len(ratios) / 3:
+        yield Finding(
+            "do not trust", f"pitch or radius is wrong: contact radius over ball radius a/R = {np.median(ratios):.2f}",
+            "measure the ball by a calliper (its radius is half of that) and the pitch by a board or a ruler",
+        )  # fmt: skip
+    elif wide:
+        yield Finding("usable", f"the contact of {_names(wide)} is as wide as the ball", "look at it, and leave it out")
+    elif max(ratios) < NARROWEST:
+        yield Finding(
+            "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, or a diameter given for "
+            "the radius", "measure the ball; press as deep as the work will",
+        )  # fmt: skip
+    if scale.gel_size is not None:
+        rows, columns, _ = fit.reference.shape
+        shown = columns * scale.pixel_pitch, rows * scale.pixel_pitch
+        off = max(abs(math.log(one / other)) for one, other in zip(shown, scale.gel_size, strict=True))
+        yield from _beyond(
+            SCALE, off,
+            f"at this pitch the picture shows {_size(shown)}, and {_size(scale.gel_size)} of the gel are to be seen",
+            "measure the pitch by a board or a ruler",
+        )  # fmt: skip
+    if scale.gel_thickness is not None:
+        yield from _of_thickness(fit, scale, max(ratios))
+    known = dict(scale.depths)
+    # What slopes say of a thick gel is too uncertain for this: the far end of its skirts is taken for drift
+    layer = fit.thickness if fit.thickness < THIN * ball else 1e4 * ball
+    if scale.gel_thickness is not None:
+        layer = scale.gel_thickness / scale.pixel_pitch
+    factors = [
+        math.sqrt(known[press.name] / contact_depth(press.circle.radius, ball, layer) / scale.pixel_pitch)
+        for press in fit.presses
+        if press.name in known
+    ]
+    if factors:
+        factor = float(np.median(factors))
+        yield from _beyond(
+            SCALE, abs(math.log(factor)),
+            f"pitch or radius is wrong: by the depth that is known contacts are {factor:.2f} times as wide as found "
+            f"(a/R = {np.median(ratios):.2f})", "measure pitch and ball; is the depth counted from the first touch?",
+        )  # fmt: skip
+
+
+def _of_thickness(fit: LightFit, scale: KnownScale, widest: float) -> Iterable[Finding]:
+    told = scale.gel_thickness
+    assert told is not None
+    depth = widest**2 * scale.ball_radius
+    yield from _beyond(
+        DEEPEST, depth / told, f"the deepest press is {depth * 1e3:.1f} mm deep in a gel of {told * 1e3:.1f} mm",
+        "measure ball and pitch; press less deep",
+    )  # fmt: skip
+    by_slopes = fit.thickness * scale.pixel_pitch
+    if by_slopes < told / THICKNESS:
+        yield Finding(
+            "usable", f"round the contacts the gel moves like one of {by_slopes * 1e3:.1f} mm, it is told to have "
+            f"{told * 1e3:.1f} mm", "is the pixel pitch right?",
+        )  # fmt: skip
+
+
+def _beyond(limits: tuple[float, float], value: float, what: str, todo: str) -> Iterable[Finding]:
+    """A finding where `value` passes the first limit; NaN is nothing."""
+    if value > limits[0]:
+        yield Finding("do not trust" if value > limits[1] else "usable", what.format(value), todo)
+
+
+def undirected(model: PhotometricModel) -> bool:
+    """True where flanks to all sides have nearly one change of colour."""
+    turn = np.arange(8) * np.pi / 4
+    slopes = 0.6 * model.steepest * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    middle = np.zeros(8, dtype=np.float32)
+    change, _ = PhotometricLight(model).change(slopes.astype(np.float32), middle, middle)
+    away = change - change.mean(axis=0)
+    return float((away**2).sum()) < DIRECTED * float((change**2).sum())
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def _size(size: tuple[float, float]) -> str:
+    return f"{size[0] * 1e3:.1f} x {size[1] * 1e3:.1f} mm"
+
+
+def _split(warning: str) -> tuple[str, str]:
+    """A warning "what: what to do" in two."""
+    what, _, todo = warning.partition(": ")
+    return what, todo

@@ -1,0 +1,112 @@
+"""Absolute limits: what is wrong is told, whatever the other presses are like."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.light.calibrator import LightFit, calibrate_light
+from calibration.light.dent import contact_depth
+from calibration.light.page import write_page
+from calibration.light.verdict import KnownScale, judge
+from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
+
+SCALE = KnownScale(PITCH, BALL)
+
+
+def calibrated(count: int, ball: float = BALL_PX) -> LightFit:
+    sensor = HiddenSensor(3)
+    frames = [(f"press {i}", press.image) for i, press in enumerate(sensor.presses(count))]
+    return calibrate_light(sensor.empty(), frames, ball)
+
+
+@pytest.fixture(scope="module")
+def fit() -> LightFit:
+    return calibrated(5)
+
+
+def said(fit: LightFit, scale: KnownScale, word: str) -> str:
+    """What is found, of a verdict that must be `word`."""
+    verdict = judge(fit, scale)
+    assert verdict.word == word, verdict
+    return str(verdict)
+
+
+def test_good_presses_are_good(fit: LightFit) -> None:
+    told = KnownScale(PITCH, BALL, (COLUMNS * PITCH, ROWS * PITCH), 8e-3)
+    assert said(fit, told, "good") == "good"
+
+
+@pytest.mark.parametrize(("count", "word"), [(1, "do not trust"), (2, "do not trust"), (4, "usable")])
+def test_few_presses(fit: LightFit, count: int, word: str) -> None:
+    few = replace(fit, presses=fit.presses[:count], predictions=fit.predictions[:count] if count > 1 else ())
+    assert "press five at least" in said(few, SCALE, word)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words", "word"),
+    [
+        ({"angle": 6.0}, "off by 6.0 degrees", "usable"),
+        ({"angle": 9.0}, "off by 9.0 degrees", "do not trust"),
+        ({"correlation": 0.93}, "correlation of 0.930", "do not trust"),
+        ({"error": 50.0, "null_error": 60.0}, "does not fit", "usable"),
+    ],
+)
+def test_all_presses_alike_are_no_excuse(fit: LightFit, wrong: dict[str, float], words: str, word: str) -> None:
+    bad = replace(fit, predictions=tuple(replace(press, **wrong) for press in fit.predictions))
+    assert words in said(bad, SCALE, word)
+
+
+def test_two_solutions_for_the_radii_are_told(fit: LightFit) -> None:
+    assert "uncertain by 15%" in said(replace(fit, radius_uncertainty=0.15), SCALE, "do not trust")
+
+
+@pytest.mark.parametrize(
+    ("ball", "pitch", "words", "word"),
+    [
+        (0.4, 1.0, "pitch or radius is wrong: contact radius over ball radius a/R = 0.9", "do not trust"),
+        (2.0, 1.0, "or a diameter given for the radius", "usable"),
+        (1.0, 1.6, "of the gel are to be seen", "do not trust"),
+        (1.0, 1 / 1.6, "of the gel are to be seen", "do not trust"),
+    ],
+    ids=["ball too small", "diameter for radius", "pitch too large", "pitch too small"],
+)
+def test_wrong_lengths_are_told(ball: float, pitch: float, words: str, word: str) -> None:
+    told = KnownScale(PITCH * pitch, BALL * ball, (COLUMNS * PITCH, ROWS * PITCH) if pitch != 1.0 else None)
+    assert words in said(calibrated(5, BALL_PX * ball / pitch), told, word)
+
+
+def test_a_press_of_known_depth_tells_a_wrong_pitch(fit: LightFit) -> None:
+    """Hertz's depth of a half-space, of which the presses are made, is 0.65 mm for the third."""
+    depth = (("press 2", 0.65e-3),)
+    assert judge(fit, replace(SCALE, depths=depth)).word == "good"
+    wrong = calibrated(5, BALL_PX / 1.6)
+    told = said(wrong, KnownScale(1.6 * PITCH, BALL, depths=depth), "do not trust")
+    assert "by the depth that is known" in told
+
+
+def test_depth_of_a_layer() -> None:
+    """A half-space gives Hertz's a^2 / R. On a layer four contact radii thick it is 0.8305 of that: pressures
+    (1 - r^2)^(m + 1/2), m = 0 to 4, by Hankel transforms, whose surface has the ball's slope to 1e-4 (Poisson's ratio
+    0.48)."""
+    assert contact_depth(1.0, 3.0, 1e4) == pytest.approx(1 / 3, rel=1e-3)
+    assert contact_depth(1.0, 3.0, 4.0) * 3 == pytest.approx(0.8305, rel=0.01)
+
+
+def test_a_light_without_direction_is_told(fit: LightFit) -> None:
+    dark = tuple((0.0, 0.0, 0.0) if i != 2 else (-1.0, -1.0, -1.0) for i in range(len(fit.forward.weights)))
+    blind = replace(fit, forward=fit.forward.model_copy(update={"weights": dark}))
+    assert "tells no direction" in said(blind, SCALE, "do not trust")
+
+
+def test_the_page_says_it_first_and_harms_nobody(fit: LightFit, tmp_path: Path) -> None:
+    bad = replace(fit, left_out=(("<script>.png", "no contact"),), radius_uncertainty=float("nan"))
+    verdict = judge(replace(fit, radius_uncertainty=0.15), SCALE)
+    write_page(tmp_path / "page.html", "finger", bad, SCALE, verdict, None, ["a fact"])
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<title>finger: do not trust</title>" in page and "Next:" in page and "a fact" in page
+    assert "<script>" not in page and "http://" not in page
+    assert np.all([press.name in page for press in fit.predictions])

@@ -12,6 +12,7 @@ INSTALL := $(BIN)/python -m pip install -qq --no-input --disable-pip-version-che
 # One stamp a Python version: another PYTHON, or a changed pyproject or constraints file, installs anew.
 CORE := .venv/installed-core-$(VERSION)
 DEV := .venv/installed-dev-$(VERSION)
+EXTRAS := .venv-extras/installed-$(VERSION)
 
 .DEFAULT_GOAL := help
 .PHONY: help run test check test-deep test-all test-gpu test-extras reliability lock clean python
@@ -25,7 +26,7 @@ help:
 	@echo "make test-all     make test, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
 	@echo "make reliability  what is promised of arms and cameras, measured by its tests, for docs/reliability.md"
-	@echo "make test-extras  tests that need heavy extras"
+	@echo "make test-extras  tests that need heavy extras (torch, rerun), in an environment of their own"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
 	@echo "Choose a Python with PYTHON=python3.12 (3.11, 3.12 or 3.13; default: python3)."
@@ -63,8 +64,10 @@ test-gpu: $(DEV)
 reliability: $(DEV)
 	@$(BIN)/tacsim bench robot --long --json benchmarks/reliability.json --docs docs
 
-test-extras:
-	@echo "No heavy extras yet: nothing to test."
+# What needs torch or rerun, in an environment of its own: make test shows that all else works without them.
+WITH_EXTRAS := tests/robot/train tests/robot/cli/learn tests/robot/export tests/tacsim/record/test_viewers.py
+test-extras: $(EXTRAS)
+	@.venv-extras/bin/python -m pytest -q $(PARALLEL) $(WITH_EXTRAS) $(ARGS)
 
 lock:
 	@for each in $(PYTHONS); do \
@@ -73,7 +76,7 @@ lock:
 	done
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist
+	rm -rf .venv .venv-extras .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist
 
 # Stands before each installation: a clear word about the Python, and an environment made by that Python.
 python:
@@ -93,3 +96,10 @@ $(DEV): pyproject.toml $(CONSTRAINTS) | python
 	@echo "Installing tacsim and its development tools into .venv (a few minutes the first time)"
 	@$(INSTALL) -e '.[dev]'
 	@touch $@ $(CORE)
+
+$(EXTRAS): pyproject.toml $(CONSTRAINTS) constraints/extras.txt | python
+	@echo "Installing tacsim with torch, stable-baselines3 and rerun into .venv-extras (a few minutes the first time)"
+	@rm -rf .venv-extras && $(PYTHON) -m venv .venv-extras
+	@.venv-extras/bin/python -m pip install -qq --no-input --disable-pip-version-check \
+	  -c $(CONSTRAINTS) -c constraints/extras.txt -e '.[dev,train,viz]'
+	@touch $@

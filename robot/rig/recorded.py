@@ -15,6 +15,7 @@ from calibration.markers.lattice import NoLattice
 from calibration.normaliser import FrameNormaliser, normaliser_for_camera
 from calibration.reference import StaleReference
 from robot.rig.replay_rig import recorded_normaliser, recorded_rig, rig_of
+from tacsim.config.errors import ConfigError
 from tacsim.interface import Observation, SurfaceMap, TactileFrame, TactileObservation
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig, RigConfig, SensorConfig
@@ -73,10 +74,16 @@ class RecordedSurfaces:
     """
 
     def __init__(self, meta: EpisodeMeta) -> None:
-        """Raises ConfigError for a rig that cannot be read, EpisodeError for a reference that cannot."""
+        """Raises EpisodeError for a reference that cannot be read. A rig file that cannot is noted."""
         self._normalisers: dict[str, FrameNormaliser] = {}
         self.notes: list[str] = []
-        rig = rig_of(meta)
+        try:
+            rig = rig_of(meta)
+        except ConfigError as why:
+            first = why.problems[0]
+            text = f"{first.key}: {first.text}" if first.key else first.text
+            self.notes.append(f"its rig file does not fit this tacsim ({text}), so only what was recorded is shown")
+            return
         if rig is None:
             return
         for name, sensor in rig.sensors.items():

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.deploy.policy import load_policy, require_fit
-from robot.open import make_vector_env
-from tacsim.config import load_rig
+from robot.open import load_with_task, make_vector_env
 from tacsim.gym.env import TacsimEnv
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.interface import Policy
@@ -88,7 +87,7 @@ def evaluate(
     policies: "teacher" (acts by the truth), "random", and what `load_policy` knows: "scripted", "FILE.onnx" ...
     Raises PolicyNotFound, IncompatibleRig, and as `make_vector_env`.
     """
-    config = load_rig(training.rig, task=training.task, overrides=training.overrides).config
+    config = load_with_task(training.rig, training.task, training.overrides).config
     drawn = training.randomise
     if drawn is not None:
         drawn = drawn.model_copy(update={"draws": episodes, "seed": UNSEEN + seed})

@@ -16,12 +16,11 @@ from typing import Any, Protocol
 import torch
 from gymnasium.vector import AutoresetMode
 
-from robot.open import make_vector_env
+from robot.open import load_with_task, make_vector_env
 from robot.train.dagger import Dagger
 from robot.train.export import export
 from robot.train.network import PolicyNetwork
 from robot.train.run_folder import RunError, RunFolder, Tell, save, version
-from tacsim.config import load_rig
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import TacsimVectorEnv
@@ -67,7 +66,7 @@ def environments(training: Training) -> TacsimVectorEnv:
 def begin(training: Training, folder: Path) -> RunFolder:
     """Makes the folder of a new run. Raises as `environments`, and FileExistsError."""
     environments(training).close()  # what cannot be made is told before there is a folder
-    config = load_rig(training.rig, task=training.task, overrides=training.overrides).config
+    config = load_with_task(training.rig, training.task, training.overrides).config
     assert config.task is not None
     task, encoder = make_task(config.task), FeatureEncoder(training.features, config.canonical)
     spec = PolicySpec(

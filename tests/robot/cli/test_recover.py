@@ -48,6 +48,7 @@ def test_a_cut_recording_is_recovered_and_said(cut: Path, tmp_path: Path) -> Non
     assert "nothing to recover" in tacsim("recover", "cut.recovered.mcap").stdout
     shown = tacsim("replay", "cut.recovered.mcap", "--out", "r")
     assert shown.exit_code == 0 and f"The recording was cut off; {STEPS} steps could be read." in shown.stderr
+    assert "its rig file does not fit this tacsim (clock: is missing" in " ".join(shown.stderr.split())
 
 
 def test_what_is_no_recording_says_so(tmp_path: Path) -> None:

@@ -359,8 +359,8 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
     for words, code, said in (
         ([*ball, *pitch], 2, "either a folder of frames, or --camera"),
         ([str(tmp_path / "frames"), "--camera", f"{rig}/finger", *ball, *pitch], 2, "either a folder of frames, or"),
-        (["--camera", f"{rig}/finger", *pitch], 2, "give the ball's radius"),
-        (["--camera", f"{rig}/finger", *ball], 2, "either --pixel-pitch or --view"),
+        (["--camera", f"{rig}/finger", *pitch], 2, "give the ball's diameter (or its radius, not both)"),
+        (["--camera", f"{rig}/finger", *ball], 2, "give --pixel-pitch or --view: nothing is known"),
         (["--camera", "finger", *ball, *pitch], 2, "give rig and sensor"),
         (["--camera", f"{rig}/thumb", *ball, *pitch], 2, "'thumb' is no sensor with a camera; cameras: finger"),
         (["--camera", "mock/lower", *ball, *pitch], 2, "nobody can press its gel"),

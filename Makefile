@@ -15,7 +15,7 @@ DEV := .venv/installed-dev-$(VERSION)
 EXTRAS := .venv-extras/installed-$(VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-deep test-all test-gpu test-extras reliability lock clean python
+.PHONY: help run test check test-deep test-all test-gpu extras test-extras reliability lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -66,7 +66,9 @@ reliability: $(DEV)
 
 # What needs torch or rerun, in an environment of its own: make test shows that all else works without them.
 WITH_EXTRAS := tests/robot/train tests/robot/cli/learn tests/robot/export tests/tacsim/record/test_viewers.py
-test-extras: $(EXTRAS)
+extras: $(EXTRAS)
+
+test-extras: extras
 	@.venv-extras/bin/python -m pytest -q $(PARALLEL) $(WITH_EXTRAS) $(ARGS)
 
 lock:

@@ -295,7 +295,7 @@ def _inverse_equations(press: BallPress, gradient: Float64) -> tuple[Float64, Fl
     """Normal equations from contact and skirt, and from a tenth as many untouched pixels, whose slope is 0."""
     v, u = np.mgrid[: press.shape[0], : press.shape[1]]
     near, far = _near(press), press.distance() > FAR * press.circle.radius
-    far &= (u + 7 * v) % max(1, round(10 * far.sum() / max(near.sum(), 1))) == 0
+    far &= (u + 7 * v) % max(1, round(10 * int(far.sum()) / max(int(near.sum()), 1))) == 0
     target = np.where(far[..., None], 0.0, to_normal(gradient))
     terms = _inverse_terms(press, near | far)
     return terms.T @ terms, terms.T @ target[near | far]

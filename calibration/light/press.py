@@ -93,8 +93,9 @@ def _patch_area(strength: Float64, strong: float) -> int:
     import cv2
 
     count, patches = cv2.connectedComponents((strength > strong / 2).astype(np.uint8))
-    peaks = np.unique(patches[strength > strong])
-    return int(np.bincount(patches.ravel(), minlength=count)[peaks].max(initial=0))
+    numbers = np.asarray(patches, np.intp)
+    peaks = np.unique(numbers[strength > strong])
+    return int(np.bincount(numbers.ravel(), minlength=count)[peaks].max(initial=0))
 
 
 def _drift(difference: Float64, untouched: NDArray[np.bool_]) -> Float64:

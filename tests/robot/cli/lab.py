@@ -86,7 +86,7 @@ class Lab:
         kinematics = Kinematics("ur5e")
         postures = kinematics.solutions(self._frames[arm].flange(se3.to_matrix(sensor)), POSTURE)
         assert postures, f"the start of arm '{arm}' is out of reach"
-        found: list[float] = max(postures, key=kinematics.singularity).tolist()
+        found: list[float] = max(postures, key=lambda q: round(kinematics.singularity(q), 6)).tolist()
         return found
 
     def depth(self, arm: str, base_from_tool: tuple[float, ...] | NDArray[np.float64]) -> float:

@@ -45,7 +45,8 @@ def standing(config: UrArmConfig, joints: FloatArray, calibration: FloatArray | 
 
 def at_start(config: UrArmConfig) -> FloatArray:
     flange = ArmFrames.of(config).flange(se3.to_matrix(start_of(config)))
-    return max(KINEMATICS.solutions(flange, np.zeros(6)), key=KINEMATICS.singularity)
+    # Postures come in pairs that are equally far from a singularity: the first, whatever the last digits say.
+    return max(KINEMATICS.solutions(flange, np.zeros(6)), key=lambda joints: round(KINEMATICS.singularity(joints), 6))
 
 
 def way(config: UrArmConfig) -> Way:

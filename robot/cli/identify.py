@@ -46,9 +46,7 @@ ZeroError = Annotated[
     ),
 ]  # fmt: skip
 PlaceError = Annotated[Any, length("How far the place of the contact may be off along the press.", 1e-9, 1e-2)]
-Preset = Annotated[
-    Literal["learn", "draft", "standard"] | None, typer.Option(help="Resolution.", show_default="standard")
-]
+Preset = Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution of the finest mesh.")]
 Moments = Annotated[int, typer.Option(min=4, max=1000, help="Of a press, that are simulated.")]
 Motions = Annotated[
     Path | None,
@@ -72,7 +70,7 @@ def gel(
     force_noise: ForceNoise = None,
     zero_error: ZeroError = None,
     place_error: PlaceError = "0.02 mm",
-    preset: Preset = None,
+    preset: Preset = "standard",
     moments: Moments = 16,
     motions: Motions = None,
     set_: Overrides = None,
@@ -85,13 +83,14 @@ def gel(
 
     Example: tacsim identify gel runs/presses --force-noise '10 mN' --out runs/my-gel
     """
-    overrides = [*([f"preset={preset or 'standard'}"]), *(set_ or [])]
     where = None
     if indenter is not None:
+        import numpy as np
+
         from tacsim.interface import Pose
 
-        where = Pose(list(indenter))  # type: ignore[arg-type]
-    task = _Task("gel", scene, overrides, fit, moments)
+        where = Pose(np.array(indenter))
+    task = _Task("gel", scene, [f"preset={preset}", *(set_ or [])], fit, moments)
     task.run(presses or [], motions, (force_noise, zero_error, place_error), out, where)
 
 
@@ -105,7 +104,7 @@ def body(
     force_noise: ForceNoise = None,
     zero_error: ZeroError = None,
     place_error: PlaceError = "0.02 mm",
-    preset: Preset = None,
+    preset: Preset = "standard",
     moments: Moments = 16,
     motions: Motions = None,
     set_: Overrides = None,
@@ -118,8 +117,7 @@ def body(
 
     Example: tacsim identify body runs/squeezes --set gel.material=runs/my-gel/material.yaml --out runs/my-clay
     """
-    overrides = [*([f"preset={preset or 'standard'}"]), *(set_ or [])]
-    task = _Task("body", scene, overrides, fit, moments, gel_error)
+    task = _Task("body", scene, [f"preset={preset}", *(set_ or [])], fit, moments, gel_error)
     task.run(squeezes or [], motions, (force_noise, zero_error, place_error), out, None)
 
 

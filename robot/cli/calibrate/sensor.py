@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tacsim.models.hardware import CameraSensorConfig
     from tacsim.models.sensor import CameraNoise, Markers
 
+UNKNOWN = "unknown"  # serial number of a sensor that nobody named
 MAX_PRESSES = 200  # 5 to 8 are enough
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
@@ -78,7 +79,7 @@ def sensor(
     ] = None,
     serial: Annotated[
         str, typer.Option(help="Serial number or name of the sensor; without --out, its folder is sensors/ and this.")
-    ] = "unknown",
+    ] = UNKNOWN,
     known_depth: Annotated[
         list[str] | None,
         typer.Option(
@@ -114,13 +115,15 @@ def sensor(
         raise typer.BadParameter("give either --pixel-pitch or --view")
     if pixel_pitch is None and view is None and profile.gel_size is None:
         raise typer.BadParameter("give --pixel-pitch or --view: nothing is known beforehand of this sensor's")
+    if out is None and Path(serial).name != serial:
+        raise typer.BadParameter(f"'{serial}' cannot be a folder's name; name one by --out", param_hint="--serial")
     from calibration.lens.view import GelView
     from tacsim.config import load
 
     depths = tuple(_known_depth(text) for text in known_depth or ())
     seen = None if view is None else load(GelView, view)
     ball = ball_radius if ball_diameter is None else ball_diameter / 2
-    folder = new_directory(Path("sensors") / serial if out is None and serial != "unknown" else out, "calibration")
+    folder = new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration")
     with busy("loading"):
         from calibration.frame_set import read_folder, rectified_by_view
         from calibration.light.calibrator import calibrate_light
@@ -257,7 +260,9 @@ def _write(
             draw(fit, residuals)
             written.append(residuals)
         written.append(folder / page.FILE)
-        page.write_page(written[-1], serial, fit, scale, verdict, residuals, facts)
+        page.write_page(
+            written[-1], folder.name if serial == UNKNOWN else serial, fit, scale, verdict, residuals, facts
+        )
     for finding in verdict.findings:
         notes.print(f"{finding.word}: {finding.what}. {finding.todo}", markup=False)
     results.print(f"verdict: {verdict.word}")

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from calibration.lens.view import fit_lens as fit_lens
     from calibration.lens.view import fit_view as fit_view
     from calibration.lens.view import view_of_corners as view_of_corners
-    from calibration.light.calibrator import LightFit as LightFit
     from calibration.light.calibrator import calibrate_light as calibrate_light
+    from calibration.light.fit import LightFit as LightFit
     from calibration.light.noise import measure_noise as measure_noise
     from calibration.markers.flow import MarkerFlow as MarkerFlow
     from calibration.markers.flow import find_markers as find_markers

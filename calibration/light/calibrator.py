@@ -9,25 +9,21 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from importlib import metadata
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bundle import FORMAT, Calibration, Provenance, Residual
 from calibration.errors import BadFrames
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
-from calibration.lens.view import GelView
 from calibration.light.circle import NoCircle
-from calibration.light.dent import ContactCircle, dent_gradient, rim_slope
+from calibration.light.dent import dent_gradient, rim_slope
+from calibration.light.fit import LightFit, PressPrediction
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
 from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, untouched_mean
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
 from calibration.reference import STALE_COLOUR, exchanged
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
-from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -43,84 +39,6 @@ RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [p
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
 BAD_NORMALS = 8.0  # errors of a press's normals that deserve a warning [degrees]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PressPrediction:
-    """How well one press is predicted by a calibration made without it."""
-
-    name: str
-    circle: ContactCircle
-    error: float  # mean |error| in contact and near it (r < 1.5 a) [grey levels]
-    null_error: float  # the same, if no change were predicted: the background alone
-    correlation: float  # of predicted and real change there
-    predicted: NDArray[np.float32]  # (H, W, 3) change of colour [grey levels]
-    real: NDArray[np.float32]  # (H, W, 3) the same, as seen, without drift
-    angle: float  # mean error of the normal by the inverse model in contact [degrees]
-    untouched_angle: float  # the same, far from contact
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LightFit:
-    """A calibrated light."""
-
-    forward: PhotometricModel
-    inverse: InverseModel
-    size: ModelSize
-    thickness: float  # of the gel, as the skirts of the dents tell it [px]
-    radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
-    unexplained: tuple[float, ...]  # share of each press's change of colour that no dent explains
-    predictions: tuple[PressPrediction, ...]
-    left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
-    warnings: tuple[str, ...]
-    reference: Image
-    presses: tuple[BallPress, ...]
-    frames: tuple[str, ...]  # names of all that were given
-
-    def to_calibration(
-        self,
-        serial: str,
-        ball_radius: float,
-        pixel_pitch: float,
-        *,
-        view: GelView | None = None,
-        markers: Markers | None = None,
-        noise: CameraNoise | None = None,
-    ) -> Calibration:
-        """The calibration of sensor `serial`, made now; `ball_radius`, `pixel_pitch` [m]. `write_bundle` sets the
-        checksums."""
-        rows, columns, _ = self.reference.shape
-        return Calibration(
-            format=FORMAT,
-            serial=serial,
-            geometry=view.geometry if view else SensorGeometry(width=columns, height=rows, pixel_pitch=pixel_pitch),
-            gel_size=(columns * pixel_pitch, rows * pixel_pitch),
-            forward=self.forward,
-            inverse=self.inverse,
-            view=view,
-            markers=markers,
-            noise=noise,
-            residuals=tuple(
-                Residual(
-                    frame=press.name,
-                    circle=(press.circle.x, press.circle.y, press.circle.radius),
-                    error=press.error,
-                    nothing=press.null_error,
-                    correlation=press.correlation,
-                    angle=press.angle,
-                )
-                for press in self.predictions
-            ),
-            provenance=Provenance(
-                made=datetime.now(UTC).isoformat(timespec="seconds"),
-                software=f"tacsim {metadata.version('tacsim')}",
-                ball_radius=ball_radius,
-                frames=self.frames,
-                left_out=dict(self.left_out),
-                warnings=self.warnings,
-            ),
-            reference="0" * 64,
-        )
 
 
 def calibrate_light(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.light.calibrator import LightFit
+from calibration.light.fit import LightFit
 from calibration.light.verdict import KnownScale, Verdict
 
 FILE = "verdict.html"

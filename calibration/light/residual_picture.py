@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.light.calibrator import LightFit
+from calibration.light.fit import LightFit
 
 MAX_PRESSES = 8  # drawn, the worst first
 HALF_SIDE = 2.0  # of what is drawn [contact radii]

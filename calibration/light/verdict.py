@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.light.calibrator import LightFit
 from calibration.light.dent import contact_depth
+from calibration.light.fit import LightFit
 from tacsim.models.photometric import PhotometricLight, PhotometricModel
 
 Word = Literal["good", "usable", "do not trust"]

@@ -22,7 +22,8 @@ from benchmarks.harness.runner import Case
 from tacsim.models.quantity import Config
 
 if TYPE_CHECKING:
-    from calibration.light.calibrator import LightFit, PressPrediction
+    from calibration.light.fit import PressPrediction
+from calibration.light.fit import LightFit
 
 CASE = "ball_presses"
 OWN = "balls.yaml"

@@ -26,7 +26,7 @@ from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.physics.world import make_world
 
 if TYPE_CHECKING:
-    from calibration.light.calibrator import LightFit
+    from calibration.light.fit import LightFit
 
 Mask = NDArray[np.bool_]
 Float64 = NDArray[np.float64]

@@ -33,7 +33,7 @@ from benchmarks.harness.runner import Case
 from tacsim.models.scene import GelMaterial
 
 if TYPE_CHECKING:
-    from calibration.light.calibrator import LightFit
+    from calibration.light.fit import LightFit
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

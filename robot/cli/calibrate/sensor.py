@@ -16,7 +16,7 @@ from robot.cli.output import busy, new_directory, notes, results, say_files, sho
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
     from calibration.lens.view import GelView
-    from calibration.light.calibrator import LightFit
+    from calibration.light.fit import LightFit
     from calibration.light.verdict import KnownScale
     from calibration.profiles import SensorProfile
     from tacsim.models.hardware import CameraSensorConfig

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.light.calibrator import LightFit, calibrate_light
+from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import contact_depth
+from calibration.light.fit import LightFit
 from calibration.light.page import write_page
 from calibration.light.verdict import KnownScale, judge
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor

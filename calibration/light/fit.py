@@ -1,0 +1,97 @@
+"""What calibrating a light ends in: its models, how well they predict presses that took no part, and its bundle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.bundle import FORMAT, Calibration, Provenance, Residual
+from calibration.height.slope_polynomial import InverseModel
+from calibration.lens.view import GelView
+from calibration.light.dent import ContactCircle
+from calibration.light.photometry import ModelSize
+from calibration.light.press import BallPress, Image
+from tacsim.models.photometric import PhotometricModel
+from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PressPrediction:
+    """How well one press is predicted by a calibration made without it."""
+
+    name: str
+    circle: ContactCircle
+    error: float  # mean |error| in contact and near it (r < 1.5 a) [grey levels]
+    null_error: float  # the same, if no change were predicted: the background alone
+    correlation: float  # of predicted and real change there
+    predicted: NDArray[np.float32]  # (H, W, 3) change of colour [grey levels]
+    real: NDArray[np.float32]  # (H, W, 3) the same, as seen, without drift
+    angle: float  # mean error of the normal by the inverse model in contact [degrees]
+    untouched_angle: float  # the same, far from contact
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightFit:
+    """A calibrated light."""
+
+    forward: PhotometricModel
+    inverse: InverseModel
+    size: ModelSize
+    thickness: float  # of the gel, as the skirts of the dents tell it [px]
+    radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
+    unexplained: tuple[float, ...]  # share of each press's change of colour that no dent explains
+    predictions: tuple[PressPrediction, ...]
+    left_out: tuple[tuple[str, str], ...]  # frames that took no part, and why
+    warnings: tuple[str, ...]
+    reference: Image
+    presses: tuple[BallPress, ...]
+    frames: tuple[str, ...]  # names of all that were given
+
+    def to_calibration(
+        self,
+        serial: str,
+        ball_radius: float,
+        pixel_pitch: float,
+        *,
+        view: GelView | None = None,
+        markers: Markers | None = None,
+        noise: CameraNoise | None = None,
+    ) -> Calibration:
+        """The calibration of sensor `serial`, made now; `ball_radius`, `pixel_pitch` [m]. `write_bundle` sets the
+        checksums."""
+        rows, columns, _ = self.reference.shape
+        return Calibration(
+            format=FORMAT,
+            serial=serial,
+            geometry=view.geometry if view else SensorGeometry(width=columns, height=rows, pixel_pitch=pixel_pitch),
+            gel_size=(columns * pixel_pitch, rows * pixel_pitch),
+            forward=self.forward,
+            inverse=self.inverse,
+            view=view,
+            markers=markers,
+            noise=noise,
+            residuals=tuple(
+                Residual(
+                    frame=press.name,
+                    circle=(press.circle.x, press.circle.y, press.circle.radius),
+                    error=press.error,
+                    nothing=press.null_error,
+                    correlation=press.correlation,
+                    angle=press.angle,
+                )
+                for press in self.predictions
+            ),
+            provenance=Provenance(
+                made=datetime.now(UTC).isoformat(timespec="seconds"),
+                software=f"tacsim {metadata.version('tacsim')}",
+                ball_radius=ball_radius,
+                frames=self.frames,
+                left_out=dict(self.left_out),
+                warnings=self.warnings,
+            ),
+            reference="0" * 64,
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 from calibration.errors import error_context
 from calibration.normaliser import FrameNormaliser, normaliser_for_camera, normaliser_for_simulation
@@ -83,29 +83,10 @@ def open_hardware(
         check(spec)
     with ExitStack() as stack:
         cell = stack.enter_context(MockCell(config))
-        sensors: dict[str, TactileSource] = {}
-        for name, sensor in config.sensors.items():
-            if isinstance(sensor, CameraSensorConfig):
-                sensors[name] = Camera(sensor, name)
-            else:
-                assert isinstance(sensor, SimSensorConfig)
-                sensors[name] = CellSensor(cell, name, sensor)
-            stack.callback(sensors[name].close)
-        arms: dict[str, CommandedArm] = {}
-        for name, arm in config.arms.items():
-            assert isinstance(arm, UrArmConfig)
-            arms[name] = CommandedArm(URArm(arm, name, keep_out=config.kept_out(name)), dry_run=dry_run)
-            stack.callback(arms[name].close)
+        sensors = {name: stack.enter_context(closing(_sensor(name, config, cell))) for name in config.sensors}
+        arms = {name: stack.enter_context(closing(_arm(name, config, dry_run))) for name in config.arms}
         cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Camera)}
-        mock_cameras = {name: camera for name, camera in cameras.items() if name in cell.cameras}
-        clock: LockStep | WallClock
-        if config.lock_step and not real and cell.simulated:
-            clock = LockStep(config.period, arms, mock_cameras, cell)
-        elif cell.simulated:
-            cell.run_free()
-            clock = WallClock(config.period, cell.catch_up, real_time=config.contact == "hertz")
-        else:
-            clock = WallClock(config.period)
+        clock = _clock(config, cell, arms, cameras, real=bool(real))
         for name, camera in cameras.items():
             camera.spec = spec.sensors[name]
         monitor = _gel_monitor(config, spec.sensors, arms)
@@ -122,14 +103,6 @@ def open_hardware(
             tell=tell,
         )
 
-        def diagnostics() -> Mapping[str, float]:
-            values = {**cell.diagnostics(), **clock.diagnostics()}
-            for name, arm in arms.items():
-                values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
-            for name, camera in cameras.items():
-                values |= camera_counts(name, camera)
-            return values
-
         logs = {name: arm.driver.package_log() for name, arm in arms.items() if config.record.arm_packages}
         rig = Rig(
             name=config.name,
@@ -139,7 +112,7 @@ def open_hardware(
             normalisers=normalisers,
             reset=reset,
             truth=cell.truth if cell.knows_truth else None,
-            diagnostics=diagnostics,
+            diagnostics=lambda: _diagnostics(cell, clock, arms, cameras),
             packages=lambda: {name: log.take() for name, log in logs.items()},
             on_close=cell.close,
             on_tactile=monitor,
@@ -147,6 +120,49 @@ def open_hardware(
         )
         stack.pop_all()
         return rig
+
+
+def _sensor(name: str, config: RigConfig, cell: MockCell) -> Camera | CellSensor:
+    sensor = config.sensors[name]
+    if isinstance(sensor, CameraSensorConfig):
+        return Camera(sensor, name)
+    assert isinstance(sensor, SimSensorConfig)
+    return CellSensor(cell, name, sensor)
+
+
+def _arm(name: str, config: RigConfig, dry_run: bool) -> CommandedArm:
+    arm = config.arms[name]
+    assert isinstance(arm, UrArmConfig)
+    return CommandedArm(URArm(arm, name, keep_out=config.kept_out(name)), dry_run=dry_run)
+
+
+def _clock(
+    config: RigConfig,
+    cell: MockCell,
+    arms: Mapping[str, CommandedArm],
+    cameras: Mapping[str, Camera],
+    *,
+    real: bool,
+) -> LockStep | WallClock:
+    """In lock step where everything waits for us: no real arm, and gels simulated here."""
+    if not cell.simulated:
+        return WallClock(config.period)
+    if config.lock_step and not real:
+        mock_cameras = {name: camera for name, camera in cameras.items() if name in cell.cameras}
+        return LockStep(config.period, arms, mock_cameras, cell)
+    cell.run_free()
+    return WallClock(config.period, cell.catch_up, real_time=config.contact == "hertz")
+
+
+def _diagnostics(
+    cell: MockCell, clock: LockStep | WallClock, arms: Mapping[str, CommandedArm], cameras: Mapping[str, Camera]
+) -> Mapping[str, float]:
+    values = {**cell.diagnostics(), **clock.diagnostics()}
+    for name, arm in arms.items():
+        values |= {f"{ALIGNMENT}{name}": arm.alignment, f"{LIMITS}{name}": float(arm.limits_hit)}
+    for name, camera in cameras.items():
+        values |= camera_counts(name, camera)
+    return values
 
 
 def _spec(config: RigConfig, normalisers: Mapping[str, FrameNormaliser]) -> RigSpec:

@@ -32,6 +32,18 @@ def size_of(change: Float32) -> float:
     return float(np.abs(change).mean(axis=0).max())
 
 
+def without_drift(change: NDArray[np.floating], level: NDArray[np.floating]) -> Float32:
+    """A change of colour (H, W, 3) [grey levels] since a picture whose mean colour is `level` (3,), its drift taken
+    off; as it is, where too little is untouched to measure one."""
+    scale = np.maximum(np.asarray(level, dtype=np.float32), 1.0)
+    planes = np.ascontiguousarray(np.moveaxis(change / scale, -1, 0), dtype=np.float32)
+    find = DriftFinder((change.shape[0], change.shape[1]))
+    drift = find(planes, np.zeros(change.shape[:2], dtype=np.bool_))
+    if drift.measured:
+        find.remove(planes, drift)
+    return np.asarray(np.moveaxis(planes, 0, -1) * scale, dtype=np.float32)
+
+
 class DriftFinder:
     """Finds the drift in a view of `shape` (H, W): a quadratic in the place through the untouched pixels, fitted
     twice, the second time to those near the first; the median where too few are untouched."""

@@ -6,7 +6,7 @@ A calibration takes its presses from one, a comparison each of its two sides.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,9 @@ class FrameSet:
     frames: tuple[Frame, ...]
     untouched: tuple[Frame, ...] = ()  # more frames without contact
     estimated: bool = False  # the reference is the median of `frames`
+    simulated: bool = False  # known to be rendered, not photographed
+    placed: bool = False  # made in the pixels of the frames that it is compared with, under their names
+    notes: tuple[str, ...] = ()  # what there is to know of it, in words
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -192,7 +195,7 @@ def _mapped(of: FrameSet, change: Callable[[Image], Image]) -> FrameSet:
         tuple(Frame(frame.name, change(frame.image), frame.surface) for frame in part)
         for part in (of.frames, of.untouched)
     )
-    return FrameSet(of.name, change(of.reference), of.reference_from, frames, untouched, of.estimated)
+    return replace(of, reference=change(of.reference), frames=frames, untouched=untouched)
 
 
 def _read(folder: Path, paths: list[Path], max_frames: int) -> list[Frame]:
@@ -252,4 +255,5 @@ def _frame_set(
             f"{path}: {other.name} is {other.image.shape[1]} x {other.image.shape[0]} px, the picture without contact "
             f"({source}) {picture.shape[1]} x {picture.shape[0]}; all must be of one camera and one setting"
         )
-    return FrameSet(str(path), picture, source, tuple(frames), untouched, estimated)
+    simulated = all(frame.surface is not None for frame in frames)  # a camera knows no surface
+    return FrameSet(str(path), picture, source, tuple(frames), untouched, estimated, simulated)

@@ -15,15 +15,23 @@ from numpy.typing import NDArray
 
 from calibration.compare.compare import METRICS, Comparison, Metric, Overall
 from calibration.compare.invariance import CHANGES, VIEWS, Report
+from calibration.compare.judgement import judgement
 
 Image = NDArray[np.uint8]
 
 MAX_PICTURED = 24  # pairs with pictures, the worst first
 THUMBNAIL = 240  # longer side [px]
+ZOOM_MARGIN = 0.5  # of the contact's width, that a zoomed picture shows round it
 JPEG_QUALITY = 85
 WORST_BY = "contact_mae"
 FORMAT = 1
 
+CONTACT_MASK = (
+    "Figures named contact are means over the pixels where either picture of a pair differs from its reference as a "
+    "contact does, by more than noise and a quarter of the strongest change, drift of the light taken off; pressed "
+    "figures and those of the surface over where it lies deeper than half of its depth. Published figures often are "
+    "those of a circle that was clicked: they do not compare."
+)
 FILES = ("compare.json", "compare.csv", "compare.html")
 
 
@@ -49,8 +57,10 @@ def as_json(comparison: Comparison, report: Report | None = None) -> dict[str, A
     known is null."""
     return {
         "format": FORMAT,
-        "a": {"name": comparison.a.name, "reference": comparison.a.reference_from},
-        "b": {"name": comparison.b.name, "reference": comparison.b.reference_from},
+        "judgement": judgement(comparison),
+        "a": {"name": comparison.a.name, "is": comparison.names[0], "reference": comparison.a.reference_from},
+        "b": {"name": comparison.b.name, "is": comparison.names[1], "reference": comparison.b.reference_from},
+        "units": {metric.key: metric.si for metric in METRICS},
         "alignment": {"said": comparison.alignment.said, "shift": list(comparison.alignment.shift)},
         "notes": list(comparison.notes),
         "overall": {key: _known(overall) for key, overall in comparison.overall.items()},
@@ -140,6 +150,8 @@ def _html(comparison: Comparison, report: Report | None) -> str:
     return template.render(
         comparison=comparison,
         report=report,
+        judgement=judgement(comparison),
+        mask=CONTACT_MASK,
         rows=known,
         columns=columns,
         shown=shown,
@@ -158,14 +170,34 @@ def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
     base_a, base_b = comparison.aligned(comparison.a.reference), comparison.b.reference
     change_a, change_b = (_grey(one, base) for one, base in ((a, base_a), (b, base_b)))
     error = np.abs(a.astype(np.float32) - b).mean(axis=2)
-    found = [("A", a), ("B", b), ("A − its reference", change_a), ("B − its reference", change_b)]
-    found.append(("|A − B|, 0 to 64 grey; contact outlined", _outlined(_coloured(error, 64.0), pair.region)))
+    name_a, name_b = comparison.names
+    near = _near(pair.region)
+    found = [
+        (f"{name_b}, whole", b),
+        (name_a, a[near]),
+        (name_b, b[near]),
+        (f"{name_a} − its reference", change_a[near]),
+        (f"{name_b} − its reference", change_b[near]),
+        (f"|{name_a} − {name_b}|, 0 to 64 grey; contact outlined",
+         _outlined(_coloured(error, 64.0), pair.region)[near]),
+    ]  # fmt: skip
     if comparison.surfaces_a is not None and comparison.surfaces_b is not None:
         height_a, height_b = comparison.surfaces_a[k].height, comparison.surfaces_b[k].height
         deepest = max(float(height_a.max()), float(height_b.max()), 1e-6)
         found += [(f"height of {side}, 0 to {deepest * 1e3:.2f} mm", _coloured(height, deepest))
-                  for side, height in (("A", height_a), ("B", height_b))]  # fmt: skip
+                  for side, height in ((name_a, height_a), (name_b, height_b))]  # fmt: skip
     return [(caption, _inline(picture)) for caption, picture in found]
+
+
+def _near(region: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns of a contact (H, W) and what lies round it; of the whole picture without contact."""
+    rows_, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    if len(rows_) == 0:
+        return slice(None), slice(None)
+    half = max(8, round((0.5 + ZOOM_MARGIN) * max(np.ptp(rows_), np.ptp(columns))))
+    middles = ((int(one[0]) + int(one[-1])) // 2 for one in (rows_, columns))
+    down, across = (slice(max(0, middle - half), middle + half + 1) for middle in middles)
+    return down, across
 
 
 def _grey(image: Image, base: Image) -> Image:

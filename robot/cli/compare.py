@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -42,7 +43,10 @@ def compare(
     sensor_a: Annotated[str, typer.Option(help="Sensor of A, if its episode has more than one.")] = "",
     sensor_b: Annotated[str, typer.Option(help="The same for B.")] = "",
     pair: Annotated[Pair, typer.Option(help="auto: by name where all names are the same, else in order.")] = "auto",
-    shift: Annotated[bool, typer.Option("--shift/--no-shift", help="Find the shift between A and B.")] = True,
+    shift: Annotated[
+        bool | None,
+        typer.Option("--shift/--no-shift", help="Find the shift between A and B.", show_default="unless A is a scene"),
+    ] = None,
     invariance: Annotated[
         bool, typer.Option("--invariance", help="Also: can a policy tell A from B? (rho, AUC, drift of the light)")
     ] = False,
@@ -133,10 +137,8 @@ def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides
 
     with counted("pressing") as on_press:
         metric = read_sensor_model(bundle).model_copy(update={"view": None})
-        made, warnings = match_presses(truth, scene, metric, CanonicalGrid(), on_press)
-    for words in warnings:
-        warn(words)
-    return made
+        made, said = match_presses(truth, scene, metric, CanonicalGrid(), on_press)
+    return replace(made, notes=tuple(said))
 
 
 def _rectify_corners(
@@ -208,20 +210,21 @@ def _beyond_limits(limits: list[Limit], values: dict[str, float]) -> list[str]:
 
 
 def _show(result: Comparison, report: Report | None) -> None:
+    from calibration.compare.judgement import judgement
     from calibration.compare.report import rows, shown, verdict
 
+    results.print(judgement(result), markup=False)
     width = None if results.is_terminal else 160
     overall_rows = (
         (
-            f"{metric.label} ({metric.unit})" if metric.unit else metric.label,
-            shown(overall.mean, metric),
+            metric.label, metric.unit or "1", shown(overall.mean, metric),
             f"{shown(overall.low, metric)} to {shown(overall.high, metric)}",
             shown(overall.null, metric), shown(overall.floor, metric), verdict(overall),
         )
         for metric, overall in rows(result)
     )  # fmt: skip
-    columns = ("metric", "A against B", "95 % interval", "null", "floor", "than null")
-    show_table(f"{len(result.pairs)} pairs", columns, overall_rows, left={0}, width=width)
+    columns = ("metric", "unit", " against ".join(result.names), "95 % interval", "null", "floor", "than null")
+    show_table(f"{len(result.pairs)} pairs", columns, overall_rows, left={0, 1}, width=width)
     if report is not None:
         _show_invariance(report, width)
     notes.print(result.alignment.said, markup=False)
@@ -243,7 +246,7 @@ def _show_invariance(report: Report, width: int | None) -> None:
         for view in report.views
     )  # fmt: skip
     title = f"Invariance, {report.presses} presses, patch {report.patch}"
-    show_table(title, ("view", "rho", "95 %", "AUC", "95 %"), views, left={0}, width=width)
+    show_table(title, ("view", "rho (1)", "95 %", "AUC (1)", "95 %"), views, left={0}, width=width)
     if report.drifts:
         drifts = ((row.change.name, f"{row.fresh:.2f}", f"{row.stale:.2f}") for row in report.drifts)
         title = f"Extra gradient error under drift (°), beyond {report.angle:.1f}"

@@ -20,13 +20,16 @@ from tacsim.models.scene import GelSurface, Scene, Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
+from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.world import World, make_world
 
 Image = NDArray[np.uint8]
 
 RADIUS_TOLERANCE = 0.25  # the contact is as wide as the real one when its radius differs by no more [px]
-MAX_ATTEMPTS = 4  # presses that look for the depth
-MAX_DEPTH = 0.8  # of the gel's thickness
+MAX_ATTEMPTS = 6  # presses that look for the depth
+MAX_DEPTH = 0.7  # of the gel's thickness; from 0.75 the elements under the ball are crushed, at any preset
+CLOSE = 0.97  # of the deepest press, and of a contact's radius: then it is as good as that
+MAX_STEP = 1.3  # from one attempt's depth to the next, as a factor
 
 
 def match_presses(
@@ -44,7 +47,8 @@ def match_presses(
         sensor: makes the pictures, of the size of the real ones: that of the sensor's calibration.
         grid: on which the surfaces are kept.
 
-    Raises BadFrames for a scene without ball, pictures of another size, or no contact at all; SimulationDiverged.
+    A press that cannot be made (too deep for the gel, or the simulation diverged) has no frame. Raises BadFrames for a
+    scene without ball, pictures of another size, or no contact at all.
     """
     if scene.indenter is None or not isinstance(scene.indenter.geometry, Sphere):
         raise BadFrames(f"scene '{scene.name}' presses no ball; what it presses is placed by the circle of a ball")
@@ -57,15 +61,30 @@ def match_presses(
     circles, notes = _circles(real, ball / sensor.geometry.pixel_pitch)
     gel = _PressedGel(scene, ball, sensor, grid)
     done: dict[str, Frame] = {}
+    not_made: set[str] = set()
     # in the order of the depths the gel is only ever pressed farther: it does not peel off the ball
     for name, circle in sorted(circles.items(), key=lambda item: item[1].radius):
-        on_press(len(done), len(circles))
-        image, surface, warning = gel.press(circle)
+        on_press(len(done) + len(not_made), len(circles))
+        try:
+            image, surface, warning = gel.press(circle)
+        except (CannotPress, SimulationDiverged) as why:  # the gel is as it was before
+            not_made.add(name)
+            notes.append(f"{name}: not pressed: {why}")
+            continue
         done[name] = Frame(name, image, surface)
         notes += [f"{name}: {warning}"] if warning else []
     untouched = gel.untouched
-    frames = tuple(done.get(frame.name, Frame(frame.name, *untouched)) for frame in real.frames)
-    return FrameSet(f"scene {scene.name}", untouched[0], "the untouched simulated gel", frames), notes
+    frames = tuple(
+        done.get(frame.name, Frame(frame.name, *untouched)) for frame in real.frames if frame.name not in not_made
+    )
+    made = FrameSet(
+        f"scene {scene.name}", untouched[0], "the untouched simulated gel", frames, simulated=True, placed=True
+    )
+    return made, notes
+
+
+class CannotPress(ValueError):
+    """A contact is wider than this gel can be pressed: why, and how deep it can be."""
 
 
 class _PressedGel:
@@ -75,29 +94,51 @@ class _PressedGel:
     def __init__(self, scene: Scene, ball: float, sensor: SensorModel, grid: CanonicalGrid) -> None:
         self.ball, self._sensor, self._grid = ball, sensor, grid
         self._world: World = make_world(scene)
-        self._deepest = MAX_DEPTH * scene.gel.size[2]
+        self._thickness = scene.gel.size[2]
+        self._deepest = MAX_DEPTH * self._thickness
+        self._last: tuple[float, float] | None = None  # contact radius [px] and depth [m] of the press before
         self._render = Renderer(sensor, scene.gel.size[:2])
         self.untouched = self._seen(0.0, 0.0)
 
     def press(self, circle: Circle) -> tuple[Image, SurfaceMap, str]:
-        """Picture and surface of a press with this contact circle [px]; and a word if it did not come out."""
+        """Picture and surface of a press with this contact circle [px]; and a word if it did not come out. Raises
+        CannotPress, SimulationDiverged."""
         pitch = self._sensor.geometry.pixel_pitch
         u0, v0 = self._sensor.geometry.principal
         x, y = (circle.x - u0) * pitch, (circle.y - v0) * pitch
-        depth = (circle.radius * pitch) ** 2 / self.ball  # Hertz
+        contact = circle.radius * pitch
+        self._require_room(contact, self.ball - np.sqrt(max(self.ball**2 - contact**2, 0.0)))
+        hertz = contact**2 / self.ball
+        depth = min(hertz if self._last is None else _deeper(*self._last, circle.radius), self._deepest)
+        tried: list[tuple[float, float]] = []
         for _ in range(MAX_ATTEMPTS):
-            stats = self._press_to(min(depth, self._deepest))
+            settled = self._press_to(depth)
             image, surface = self._seen(x, y)
             try:
                 radius = contact_circle(image, self.untouched[0], self.ball / pitch).radius
             except NoCircle as error:
                 return image, surface, f"our own picture: {error}"
+            self._last = radius, depth
             if abs(radius - circle.radius) <= RADIUS_TOLERANCE:
-                return image, surface, "" if stats else "not settled; raise settling.max_substeps"
-            if depth > self._deepest:
+                return image, surface, "" if settled else "not settled; raise settling.max_substeps"
+            tried.append((radius, depth))
+            wanted = _next_depth(tried, circle.radius)
+            if wanted > self._deepest and depth > CLOSE * self._deepest:
+                if radius < CLOSE * circle.radius:
+                    self._require_room(contact, wanted)
                 break
-            depth *= (circle.radius / radius) ** 2
-        return image, surface, f"the contact is {radius - circle.radius:+.1f} px wider than the real one"
+            depth = min(wanted, self._deepest)
+        words = f"{abs(radius - circle.radius):.1f} px {'wider' if radius > circle.radius else 'narrower'}"
+        return image, surface, f"the contact is {words} than the real one"
+
+    def _require_room(self, contact: float, depth: float) -> None:
+        """Raises CannotPress where a contact radius [m] needs a `depth` [m] beyond what is possible."""
+        if depth > self._deepest:
+            raise CannotPress(
+                f"a contact of {contact * 1e3:.2f} mm radius needs the ball {depth * 1e3:.2f} mm deep or more, and a "
+                f"gel of {self._thickness * 1e3:.3g} mm can be pressed {self._deepest * 1e3:.2f} mm; give the gel's "
+                "true thickness (--set gel.size=...), and check the ball's radius and the pixel pitch"
+            )
 
     def _press_to(self, depth: float) -> bool:
         """Moves the ball to this depth [m]; True if the gel came to rest."""
@@ -109,6 +150,22 @@ class _PressedGel:
         surface = self._world.surface("lower")
         at: GelSurface = replace(surface, origin=(surface.origin[0] + x, surface.origin[1] + y))
         return self._render(at), surface_map(at, self._grid, self._sensor.markers)
+
+
+def _deeper(radius: float, depth: float, wanted: float) -> float:
+    """The depth at which Hertz's contact radius grows from `radius` to `wanted`, MAX_STEP at most."""
+    return depth * float(np.clip((wanted / radius) ** 2, 1 / MAX_STEP, MAX_STEP))
+
+
+def _next_depth(tried: list[tuple[float, float]], wanted: float) -> float:
+    """The depth [m] for a contact radius `wanted` [px] after some that were `tried`, each a radius and its depth: by
+    the two nearest, because beyond small slopes the contact grows slower than Hertz's."""
+    near, *others = sorted(tried, key=lambda one: abs(one[0] - wanted))
+    if others and (near[0] - others[0][0]) * (near[1] - others[0][1]) > 0:
+        growth = (near[1] - others[0][1]) / (near[0] ** 2 - others[0][0] ** 2)
+        found = near[1] + (wanted**2 - near[0] ** 2) * growth
+        return float(np.clip(found, near[1] / MAX_STEP, near[1] * MAX_STEP))
+    return _deeper(*near, wanted)
 
 
 def _circles(real: FrameSet, ball: float) -> tuple[dict[str, Circle], list[str]]:

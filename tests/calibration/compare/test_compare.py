@@ -14,6 +14,7 @@ from PIL import Image
 
 from calibration.compare.alignment import by_geometry, by_size
 from calibration.compare.compare import METRICS, Comparison, Options, Pairing, bootstrap, compare_frames, paired
+from calibration.compare.judgement import judgement
 from calibration.compare.report import as_json, figures, write
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet, read_folder, read_frame_set, rectified_by_corners, rectified_shape
@@ -363,7 +364,7 @@ def test_the_files_say_the_same_and_load_nothing(compared: Comparison, tmp_path:
     assert float(table[2]["contact_mae"]) == compared.pairs[2].numbers["contact_mae"]
     assert float(table[2]["null_contact_mae"]) == compared.pairs[2].null["contact_mae"]
     page = paths[2].read_text(encoding="utf-8")
-    assert page.count("data:image/jpeg;base64,") == 5 * len(compared.pairs)
+    assert page.count("data:image/jpeg;base64,") == 6 * len(compared.pairs)
     assert "http://" not in page and "https://" not in page and "<script" not in page
     worst = max(compared.pairs, key=lambda pair: pair.numbers["contact_mae"])
     assert page.index(f"<td>{worst.a.name}</td>") == min(
@@ -393,3 +394,72 @@ def test_every_metric_is_a_figure(compared: Comparison) -> None:
     assert {metric.key for metric in METRICS} <= set(values)
     assert values["contact_mae"] == compared.overall["contact_mae"].mean
     assert math.isnan(values["rho_gradient"])
+
+
+# drift, sides, judgement
+
+
+def test_drift_of_the_light_is_no_contact(good: FrameSet, real: FrameSet) -> None:
+    """A light that has changed by a quadratic of the place: 22 grey levels in one corner. The contact regions must be
+    those without it."""
+    v, u = np.mgrid[-1 : 1 : ROWS * 1j, -1 : 1 : COLUMNS * 1j]
+    drift = (4.0 + 8.0 * u + 6.0 * v * v + 4.0 * u * v)[..., None] * np.array([1.0, 0.2, -0.5])
+
+    def drifted(image: np.ndarray) -> np.ndarray:
+        return np.clip(np.rint(image + drift), 0, 255).astype(np.uint8)
+
+    plain, found = compare_frames(good, real), compare_frames(good, changed(real, drifted))
+    assert plain.overall["contact_iou"].mean > 0.9
+    assert found.overall["contact_iou"].mean > plain.overall["contact_iou"].mean - 0.03
+    assert found.overall["contact_radius"].mean < plain.overall["contact_radius"].mean + 0.5
+    assert found.alignment.shift == pytest.approx((0.0, 0.0), abs=0.15)
+
+
+def test_no_shift_is_sought_where_a_is_made_in_the_pixels_of_b(good: FrameSet, real: FrameSet) -> None:
+    placed = replace(changed(good, lambda image: shifted(image, 3.0, 0.0), "all"), placed=True)
+    assert compare_frames(placed, real).alignment.shift == (0.0, 0.0)
+    asked = compare_frames(placed, real, options=Options(shift=True))
+    assert asked.alignment.shift == pytest.approx((3.0, 0.0), abs=0.1)
+
+
+def test_what_could_not_be_made_is_left_out_and_said(good: FrameSet, real: FrameSet) -> None:
+    words = "press_1.png: not pressed: too deep"
+    part = replace(good, frames=(good.frames[0], *good.frames[2:]), placed=True, simulated=True, notes=(words,))
+    result = compare_frames(part, real)
+    assert [pair.b.name for pair in result.pairs] == [frame.name for frame in part.frames]
+    assert words in result.notes
+    with pytest.raises(BadFrames, match=r"press_1\.png: not pressed"):
+        compare_frames(replace(part, frames=()), real)
+
+
+def test_a_simulation_and_its_truth_are_called_so(good: FrameSet, real: FrameSet, tmp_path: Path) -> None:
+    result = compare_frames(replace(good, simulated=True), real)
+    assert result.names == ("simulated", "real")
+    page = write(tmp_path, result)[2].read_text(encoding="utf-8")
+    assert "simulated against real" in page and "A against B" not in page
+    assert compare_frames(good, replace(real, simulated=True)).names == ("real", "simulated")
+    assert as_json(result)["a"]["is"] == "simulated"
+
+
+def test_the_judgement_is_one_plain_sentence(
+    compared: Comparison, other: FrameSet, good: FrameSet, real: FrameSet, tmp_path: Path
+) -> None:
+    close = judgement(compared)
+    assert close.startswith("In contact A looks like B: they differ by 1.") and "noise alone by 1." in close
+    assert "no more like B than a picture without contact" in judgement(compare_frames(other, real))
+    dull = changed(good, lambda image: np.rint(0.5 * (image + np.float64(good.reference))).astype(np.uint8))
+    assert "A resembles B, but is not close to it" in judgement(compare_frames(dull, real))
+    assert "no more like B than a picture without contact" in judgement(compare_frames(blank(real), real))
+    few = compare_frames(replace(good, frames=good.frames[:1]), replace(real, frames=real.frames[:1]))
+    assert judgement(few).startswith("Too few pairs to judge")
+    still = compare_frames(blank(real), blank(real))
+    assert judgement(still) == "No pair shows contact, so nothing can be judged."
+    page = write(tmp_path, compared)[2].read_text(encoding="utf-8")
+    assert page.index(close[:40]) < page.index("<table")
+
+
+def test_every_table_of_the_page_has_units(compared: Comparison, tmp_path: Path) -> None:
+    page = write(tmp_path, compared)[2].read_text(encoding="utf-8")
+    assert "<td>grey</td>" in page and "contact NCC of the difference [1]" in page
+    assert as_json(compared)["units"]["height_rmse"] == "m"
+    assert "quarter of the strongest change" in page  # which pixels the figures are of

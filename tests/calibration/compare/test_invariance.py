@@ -160,4 +160,4 @@ def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: 
     assert values["stale_offset"] == report.drifts[3].stale
     page = write(tmp_path, good, report)[2].read_text(encoding="utf-8")
     assert "gain −30 %" in page and f"{report.views[2].rho:.2f}" in page
-    assert page.count("data:image/jpeg;base64,") == 7 * len(good.pairs)  # heights too
+    assert page.count("data:image/jpeg;base64,") == 8 * len(good.pairs)  # heights too

@@ -11,12 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration.bundle import write_bundle
+from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from robot.cli import app
-from robot.studies.matched_press import match_presses
+from robot.studies.matched_press import _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene
+from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid, SensorGeometry, SensorModel
+from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import calibrated, save
 
@@ -52,7 +55,7 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
     assert overall["gradient_angle"]["mean"] < 4
     assert overall["surface_centroid"]["mean"] < 0.15e-3
     assert [pair["a"] for pair in config["pairs"]] == ["press_0.png", "press_1.png", "still.png"]
-    assert config["pairs"][2]["flags"] == ["A: no contact", "B: no contact"]
+    assert config["pairs"][2]["flags"] == ["simulated: no contact", "real: no contact"]
 
 
 def test_what_cannot_be_pressed_is_refused(frames: FrameSet) -> None:
@@ -67,3 +70,51 @@ def test_what_cannot_be_pressed_is_refused(frames: FrameSet) -> None:
     still = replace(frames, frames=(Frame("still.png", np.array(frames.reference)),))
     with pytest.raises(BadFrames, match="no frame shows a ball's contact"):
         match_presses(still, scene, sensor, CanonicalGrid())
+
+
+def scene_of(thickness: str) -> Scene:
+    return load_scene("press", [*SCENE[:1], f"gel.size=[12 mm, 12 mm, {thickness}]", "element_size=0.5 mm"])
+
+
+def sensor_of() -> SensorModel:
+    return SensorModel(geometry=SensorGeometry(width=260, height=200, pixel_pitch=0.08e-3))
+
+
+def test_a_press_that_diverges_is_reported_and_the_others_go_on(
+    frames: FrameSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press_to(self: _PressedGel, depth: float) -> bool:
+        if depth > 0.58e-3:
+            raise SimulationDiverged("a gel node moves at 0.535 of the wave speed", LaunchSpan("in a test"))
+        return original(self, depth)
+
+    original = _PressedGel._press_to
+    monkeypatch.setattr(_PressedGel, "_press_to", press_to)
+    made, notes = match_presses(frames, scene_of("8 mm"), sensor_of(), CanonicalGrid())
+    assert [frame.name for frame in made.frames] == ["press_0.png", "still.png"]
+    assert any("press_1.png: not pressed: " in words and "wave speed" in words for words in notes)
+    result = compare_frames(replace(made, notes=tuple(notes)), frames)
+    assert [pair.b.name for pair in result.pairs] == ["press_0.png", "still.png"]
+    assert any("press_1.png: not pressed" in words for words in result.notes)
+
+
+def test_a_contact_that_the_gel_is_too_thin_for_is_refused_beforehand(frames: FrameSet) -> None:
+    """The cap of a ball of 2.5 mm with a rim of 1.94 mm is 0.92 mm high, and elements of a gel of 1 mm are crushed at
+    0.75 mm; a contact of 1.12 mm is possible there."""
+    sensor = HiddenSensor(3)
+    deep = Frame("deep.png", sensor.press(1.5e-3, 130, 100).image)
+    both = replace(frames, frames=(deep, frames.frames[0]))
+    made, notes = match_presses(both, scene_of("1 mm"), sensor_of(), CanonicalGrid())
+    assert [frame.name for frame in made.frames] == ["press_0.png"]
+    assert any(
+        words.startswith("deep.png: not pressed: a contact of 1.") and "can be pressed 0.70 mm" in words
+        for words in notes
+    )
+
+
+def test_the_next_depth_follows_the_two_nearest_presses() -> None:
+    """A contact that grows as the square root of depth is met at once; one that hardly grows is not overshot."""
+    assert _next_depth([(10.0, 1e-3)], 11.0) == pytest.approx(1.21e-3)
+    assert _next_depth([(10.0, 1e-3), (11.0, 1.3e-3)], 10.5) == pytest.approx(1e-3 + 0.3e-3 * 10.25 / 21)
+    assert _next_depth([(40.0, 2e-3), (40.01, 2.2e-3)], 44.0) == pytest.approx(1.3 * 2.2e-3)
+    assert _next_depth([(40.0, 2e-3), (39.9, 2.2e-3)], 44.0) == pytest.approx(1.21 * 2e-3)

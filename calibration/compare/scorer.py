@@ -1,0 +1,135 @@
+"""Scores one pair of pictures in the pixels of B."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.compare import metrics
+from calibration.compare.alignment import Alignment
+from calibration.compare.surfaces import SurfaceEstimate, flat_surface
+from calibration.drift import without_drift
+from calibration.frame_set import Frame, FrameSet, frame_warnings
+from tacsim.control.contact_signal import CONTACT_HEIGHT
+from tacsim.models.sensor import CanonicalGrid
+
+Mask = NDArray[np.bool_]
+Numbers = dict[str, float]
+
+SWAPPED_GAIN = 0.2  # of the correlation, by red and blue exchanged, that makes them look swapped
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """One frame of A against one of B."""
+
+    a: Frame
+    b: Frame
+    numbers: Numbers
+    null: Numbers  # the same of A's reference
+    flags: tuple[str, ...]
+    region: Mask  # (H, W) contact in either, in the pixels of B
+    contact_b: metrics.Patch | None  # contact of B alone, in its pixels
+
+
+class Scorer:
+    """Scores pairs in the pixels of B."""
+
+    def __init__(
+        self, a: FrameSet, b: FrameSet, alignment: Alignment, grid: CanonicalGrid, names: tuple[str, str]
+    ) -> None:
+        self._b, self._alignment, self._grid, self.names = b, alignment, grid, names
+        self._covered = alignment.covered
+        self._whole = None if self._covered.all() else self._covered
+        self._reference_a = alignment(a.reference)
+        self._plain: list[float] = []  # correlations of the pairs as they are, and with red and blue exchanged
+        self._swapped: list[float] = []
+
+    def pair(self, a: Frame, b: Frame, surface_a: SurfaceEstimate | None, surface_b: SurfaceEstimate | None) -> Pair:
+        seen_a, seen_b = self._alignment(a.image), b.image.astype(np.float32)
+        change_a, change_b = seen_a - self._reference_a, seen_b - self._b.reference
+        contact_a, contact_b = (
+            metrics.contact_region(without_drift(change, self._b.reference.mean(axis=(0, 1)))) & self._covered
+            for change in (change_a, change_b)
+        )
+        region = contact_a | contact_b
+        numbers = self.pictures(seen_a, seen_b, region) | _contacts(contact_a, contact_b)
+        numbers["contact_ncc"] = metrics.correlation(change_a, change_b, region)
+        null = self.pictures(self._reference_a, seen_b, region) | _contacts(np.zeros_like(contact_b), contact_b)
+        null["contact_ncc"] = metrics.correlation(np.zeros_like(change_b), change_b, region)
+        if surface_a is not None and surface_b is not None:
+            numbers |= self._surfaces(surface_a, surface_b, surface_a)
+            null |= self._surfaces(flat_surface(surface_b), surface_b, surface_a)
+        if region.any():
+            self._plain.append(numbers["contact_ncc"])
+            self._swapped.append(metrics.correlation(change_a[..., ::-1], change_b, region))
+        reference_b = self._b.reference.astype(np.float32)
+        flags = [
+            *(f"{self.names[0]}: {words}" for words in frame_warnings(seen_a, self._reference_a, contact_a)),
+            *(f"{self.names[1]}: {words}" for words in frame_warnings(seen_b, reference_b, contact_b)),
+        ]
+        return Pair(a, b, numbers, null, tuple(flags), region, metrics.patch_of(contact_b))
+
+    def pictures(self, one: metrics.Picture, other: metrics.Picture, region: Mask) -> Numbers:
+        """Of two pictures whose contact is `region`."""
+        similarity = metrics.similarity_map(one, other)
+        rim = metrics.WINDOW // 2
+        inner = np.zeros_like(self._covered)
+        inner[rim:-rim, rim:-rim] = True
+        inner &= self._covered
+        return {
+            "mae": metrics.mean_absolute_error(one, other, self._whole),
+            "psnr": metrics.peak_signal_to_noise(one, other, self._whole),
+            "ssim": float(similarity[inner].mean()) if inner.any() else math.nan,
+            "contact_mae": metrics.mean_absolute_error(one, other, region),
+            "contact_psnr": metrics.peak_signal_to_noise(one, other, region),
+            "contact_ssim": float(similarity[region].mean()) if region.any() else math.nan,
+        }
+
+    def _surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, shown: SurfaceEstimate) -> Numbers:
+        """Of A's surface against B's, where B or `shown` is pressed."""
+        pressed_a, pressed_b, of_shown = (metrics.pressed_region(t.height, CONTACT_HEIGHT) for t in (a, b, shown))
+        pressed = _contacts(pressed_a, pressed_b)
+        no_flow = a.flow is None or b.flow is None or a.flow.shape != b.flow.shape
+        return surface_errors(a, b, (of_shown | pressed_b) & b.valid, b) | {
+            "surface_iou": pressed["contact_iou"],
+            "surface_radius": pressed["contact_radius"] * self._grid.pitch,
+            "surface_centroid": pressed["contact_centroid"] * self._grid.pitch,
+            "marker_error": math.nan if no_flow else metrics.end_point_error(np.asarray(a.flow), np.asarray(b.flow)),
+        }
+
+    def swapped(self) -> list[str]:
+        """A warning if the pairs agree better with red and blue exchanged."""
+        plain, swapped = (float(np.mean(values)) if values else 0.0 for values in (self._plain, self._swapped))
+        if swapped > 0.5 and swapped > plain + SWAPPED_GAIN:
+            return [
+                f"red and blue look swapped in {' or '.join(self.names)}: exchanged they correlate by {swapped:.2f}, "
+                f"as they are by {plain:.2f}; OpenCV's pictures are BGR"
+            ]
+        return []
+
+
+def surface_errors(a: SurfaceEstimate, b: SurfaceEstimate, where: Mask, pressed: SurfaceEstimate) -> Numbers:
+    """Errors of gradient and height in a region (h, w); the share is of the depth of `pressed`."""
+    error = metrics.height_error(a.height, b.height, where)
+    deepest = float(pressed.height.max(initial=0.0))
+    return {
+        "gradient_angle": metrics.gradient_angle(a.gradient, b.gradient, where),
+        "height_rmse": error,
+        "height_share": error / deepest if deepest > CONTACT_HEIGHT else math.nan,
+    }
+
+
+def _contacts(a: Mask, b: Mask) -> Numbers:
+    patch_a, patch_b = metrics.patch_of(a), metrics.patch_of(b)
+    radius = abs((patch_a.radius if patch_a else 0.0) - (patch_b.radius if patch_b else 0.0))
+    return {
+        "contact_iou": metrics.overlap(a, b),
+        "contact_radius": radius if patch_a or patch_b else math.nan,
+        "contact_centroid": math.hypot(patch_a.x - patch_b.x, patch_a.y - patch_b.y)
+        if patch_a and patch_b
+        else math.nan,
+    }

@@ -30,6 +30,7 @@ from tacsim.config.bundle import (
     read_files,
     require_unchanged,
 )
+from tacsim.models.darkness import DarknessModel
 from tacsim.models.hardware import Placement
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.quantity import Config, Length, Time
@@ -38,7 +39,12 @@ from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
 FORMAT = FORMATS[-1]
-NOT_YET = {1: {"view", "noise"}, 2: {"noise"}}  # by format: the fields it lacks
+NOT_YET = {
+    1: {"view", "noise", "darkness"},
+    2: {"noise", "darkness"},
+    3: {"darkness"},
+    4: {"darkness"},
+}  # by format: the fields it lacks
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -73,12 +79,13 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3, 4]
+    format: Literal[1, 2, 3, 4, 5]
     serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
-    forward: PhotometricModel  # slope -> colour
-    inverse: InverseModel  # colour -> slope
+    forward: PhotometricModel | None = None  # slope -> colour
+    inverse: InverseModel | None = None  # colour -> slope
+    darkness: DarknessModel | None = None  # both, of a light that tells depth and no direction
     # Of the dent that a ball presses [m], [-]; None: that of an elastic layer, as it is taken to be now
     skirt_length: Positive | None = None
     skirt_fraction: Annotated[float, Field(gt=0)] | None = None
@@ -99,6 +106,8 @@ class Calibration(Config):
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
+        if (self.forward is None) != (self.inverse is None) or (self.forward is None) == (self.darkness is None):
+            raise ValueError("a light is told either by forward and inverse, or by darkness")
         pitch = self.geometry.pixel_pitch
         shown = (self.geometry.width * pitch, self.geometry.height * pitch)
         if any(abs(one - other) > pitch for one, other in zip(shown, self.gel_size, strict=True)):
@@ -123,7 +132,8 @@ def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.u
     stamped = stamped.model_copy(update={"checksum": stamped.digest()})
     (folder / REFERENCE).write_bytes(png)
     path = folder / FILE
-    text = yaml.safe_dump(stamped.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
+    content = stamped.model_dump(mode="json", exclude=NOT_YET.get(stamped.format))
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
     path.write_text(text, encoding="utf-8")
     return path
 

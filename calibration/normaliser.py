@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from calibration.bundle import BadBundle, Calibration, read_bundle
 from calibration.drift import DriftFinder, size_of
 from calibration.errors import BadFrames
-from calibration.height.colour_table import from_model
+from calibration.height.colour_table import GradientModel, from_model
+from calibration.height.darkness import DarknessSlopes
 from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
 from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view, seen_box
@@ -240,7 +241,13 @@ def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], g
             "camera `calibration: BUNDLE` in place of `model`"
         )
     rectify = _of_model(model, gel_size, extended_view(grid, gel_size))
-    find = SurfaceFinder(from_model(model), rectify.valid, grid, dots=model.markers is not None)
+    slopes: GradientModel
+    if model.darkness is not None:
+        shape = rectify.valid[seen_box(rectify.valid)].shape
+        slopes = DarknessSlopes(model.darkness, shape, grid.pitch / grid.image_scale)
+    else:
+        slopes = from_model(model)
+    find = SurfaceFinder(slopes, rectify.valid, grid, dots=model.markers is not None)
     return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size, model.view))
 
 
@@ -263,7 +270,12 @@ def normaliser_for_calibration(
         rectify = from_view(calibration.view, wide)
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
     x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
-    slopes = PolynomialSlopes(calibration.inverse, x, y)
+    slopes: GradientModel
+    if calibration.darkness is not None:
+        slopes = DarknessSlopes(calibration.darkness, x.shape, wide.pitch)
+    else:
+        assert calibration.inverse is not None
+        slopes = PolynomialSlopes(calibration.inverse, x, y)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=calibration.markers is not None, drifts=True)
     flow = _marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view)
     known = None

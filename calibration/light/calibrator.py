@@ -15,15 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
+from calibration.height.darkness import DarknessSlopes
 from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
 from calibration.light.circle import NoCircle
-from calibration.light.dent import dent_gradient, rim_slope
+from calibration.light.darkness import find_dark_press, fit_darkness, tells_no_direction
+from calibration.light.dent import dent_gradient, dent_height, rim_slope
 from calibration.light.fit import LightFit, PressPrediction
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
 from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, untouched_mean
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
 from calibration.reference import STALE_COLOUR, exchanged
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
+from tacsim.optics.darkness import darkened
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -34,11 +37,17 @@ REFINEMENT_PIXELS = 2500  # of each press, about
 # A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
 MAX_UNEXPLAINED = 0.5  # share of the change
 MAX_UNEXPLAINED_RATIO = 5.0  # times the median press's share, with three presses or more; at least GOOD_FIT
+DARK_UNEXPLAINED = 0.1  # the same of darkness that is no function of depth; 0.003 on real frames
 GOOD_FIT = 0.05  # share of the change: a press that is explained so well always stays
 RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
+NO_DIRECTION = "this light tells no direction: all flanks of a dent change alike"
 BAD_NORMALS = 8.0  # errors of a press's normals that deserve a warning [degrees]
+
+
+class NoDirection(BadFrames):
+    """A light tells neither direction nor depth: no model of it can be made."""
 
 
 def calibrate_light(
@@ -55,20 +64,26 @@ def calibrate_light(
         ball: radius of the ball [px].
         erase: takes away the dots that are printed on the gel.
 
-    Raises BadFrames, with what is wrong in every frame, when no press can be used.
+    Which kind of light it is, the pictures tell: if colours change alike all round each contact, it tells no direction,
+    and is calibrated as one that tells depth by darkness.
+
+    Raises BadFrames, with what is wrong in every frame, when no press can be used; NoDirection.
     """
     _check(reference, frames)
     shown = reference
     if erase is not None:
         reference, frames = erase(reference), [(name, erase(image)) for name, image in frames]
     mean = untouched_mean(reference)
+    dark = tells_no_direction((image - np.float64(reference)) / mean for _, image in frames[:ORDER_FRAMES])
     found: list[BallPress] = []
     left_out: list[tuple[str, str]] = []
     for name, image in frames:
         try:
-            found.append(find_press(name, image, reference, mean, ball))
+            found.append((find_dark_press if dark else find_press)(name, image, reference, mean, ball))
         except (NoCircle, BadFrames) as error:
             left_out.append((name, str(error)))
+    if dark:
+        return replace(_darkness(found, left_out, mean, reference, ball), reference=shown, frames=_names(frames))
     presses, refined = _refined(found, left_out, ball)
     v, u = np.mgrid[: reference.shape[0], : reference.shape[1]].astype(np.float64)
     labels = [dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR) for press in presses]
@@ -102,8 +117,64 @@ def calibrate_light(
         warnings=(*_warnings(presses, mean, len(left_out)), *_badly_predicted(predictions)),
         reference=shown,
         presses=tuple(presses),
-        frames=tuple(name for name, _ in frames),
+        frames=_names(frames),
     )
+
+
+def _names(frames: Sequence[tuple[str, Image]]) -> tuple[str, ...]:
+    return tuple(name for name, _ in frames)
+
+
+def _darkness(
+    found: list[BallPress], left_out: list[tuple[str, str]], mean: Float64, reference: Image, ball: float
+) -> LightFit:
+    """The calibration of a light that tells depth and no direction. Raises BadFrames where it does not do that, too."""
+    if not found:
+        raise _nothing_left(left_out)
+    try:
+        fit = fit_darkness(found, ball)
+        while max(fit.unexplained) > DARK_UNEXPLAINED and len(found) > 1:
+            worst = int(np.argmax(fit.unexplained))
+            left_out.append(
+                (found.pop(worst).name, f"depth explains only {1 - fit.unexplained[worst]:.0%} of its darkness")
+            )
+            fit = fit_darkness(found, ball)
+    except BadFrames as why:
+        raise NoDirection(f"{NO_DIRECTION}, and {why}") from None
+    if max(fit.unexplained) > DARK_UNEXPLAINED:
+        raise NoDirection(
+            f"{NO_DIRECTION}, and depth explains only {1 - max(fit.unexplained):.0%} of how dark it gets: is the ball "
+            "round, its radius right, and exposure fixed?"
+        )
+    predictions = []
+    for press, model in zip(fit.presses, fit.left_out, strict=True):
+        if model is None:
+            continue
+        v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
+        change, _ = darkened(model, dent_height(u, v, press.circle, fit.thickness, ball).astype(np.float32), 1.0)
+        slopes, _ = DarknessSlopes(model, press.shape, 1.0)(press.change.astype(np.float32))
+        label = dent_gradient(u, v, press.circle, fit.thickness, ball)
+        angles = normal_angle(to_normal(slopes.astype(np.float64)), to_normal(label))
+        predictions.append(_compared(press, change.astype(np.float64) * mean, angles, mean, reference))
+    return LightFit(
+        forward=None,
+        inverse=None,
+        size=None,
+        thickness=fit.thickness,
+        radius_uncertainty=fit.radius_uncertainty,
+        unexplained=fit.unexplained,
+        predictions=tuple(predictions),
+        left_out=tuple(left_out),
+        warnings=(*_warnings(fit.presses, mean, len(left_out)), *_badly_predicted(predictions)),
+        reference=reference,
+        presses=fit.presses,
+        frames=(),
+        darkness=fit.model,
+    )
+
+
+def _nothing_left(left_out: Sequence[tuple[str, str]]) -> BadFrames:
+    return BadFrames("no frame can be used. " + "; ".join(f"{name}: {why}" for name, why in left_out))
 
 
 def _check(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
@@ -143,7 +214,7 @@ def _refined(
             f"{1 - limit:.0%} needed)"
         )
         left_out.append((found.pop(worst).name, why))
-    raise BadFrames("no frame can be used. " + "; ".join(f"{name}: {why}" for name, why in left_out))
+    raise _nothing_left(left_out)
 
 
 def _warnings(presses: Sequence[BallPress], mean: Float64, left_out: int) -> list[str]:
@@ -228,18 +299,25 @@ def _prediction(
     press: BallPress, gradient: Float64, model: PhotometricModel, inverse: Float64, mean: Float64, reference: Image
 ) -> PressPrediction:
     """Of a press labelled `gradient` (H, W, 2), by a forward model and the inverse's weights made without it."""
-    rows, columns = press.shape
-    distance = press.distance() / press.circle.radius
-    light, _ = PhotometricLight(model).change(gradient.astype(np.float32), *places_in_image(columns, rows))
+    light, _ = PhotometricLight(model).change(gradient.astype(np.float32), *places_in_image(*press.shape[::-1]))
     predicted = smooth(light.astype(np.float64), BLUR) * mean
+    angles = np.zeros(press.shape)
+    distance = press.distance() / press.circle.radius
+    for where in (distance < 1, distance > FAR):
+        angles[where] = normal_angle(_inverse_terms(press, where) @ inverse, to_normal(gradient[where]))
+    return _compared(press, predicted, angles, mean, reference)
+
+
+def _compared(
+    press: BallPress, predicted: Float64, angles: Float64, mean: Float64, reference: Image
+) -> PressPrediction:
+    """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
+    were found are off (H, W) [degrees]."""
+    distance = press.distance() / press.circle.radius
     untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
     predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
     real = press.change * mean
-    contact = distance < 1.5
-
-    def angle(where: NDArray[np.bool_]) -> float:
-        return float(normal_angle(_inverse_terms(press, where) @ inverse, to_normal(gradient[where])).mean())
-
+    contact, far = distance < 1.5, distance > FAR
     return PressPrediction(
         press.name,
         press.circle,
@@ -248,8 +326,8 @@ def _prediction(
         correlation=float(np.corrcoef(predicted[contact].ravel(), real[contact].ravel())[0, 1]),
         predicted=predicted.astype(np.float32),
         real=real.astype(np.float32),
-        angle=angle(distance < 1),
-        untouched_angle=angle(distance > FAR) if (distance > FAR).any() else 0.0,
+        angle=float(angles[distance < 1].mean()),
+        untouched_angle=float(angles[far].mean()) if far.any() else 0.0,
     )
 
 

@@ -24,6 +24,7 @@ Float64 = NDArray[np.float64]
 
 MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite at 1
 POISSON = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
+FAR = 6.0  # up to which a dent is followed [ball radii]
 STEP = 0.25  # of the radii at which a blurred slope is found [px]
 
 
@@ -109,6 +110,20 @@ def dent_gradient(
         slope = np.interp(r, reach[: len(reach) - side], np.convolve(odd, kernel / kernel.sum(), mode="valid"))
     steepness = slope / np.maximum(r, 1e-9)
     return np.stack([-steepness * dx, -steepness * dy], axis=-1)
+
+
+def depth_profile(radii: Float64, contact: float, ball: float, thickness: float) -> Float64:
+    """(n,) depth of a dent at `radii`, which rise evenly from 0; 0 at the last; all in one unit."""
+    slope = dent_slope(radii, contact, ball, thickness)
+    depth = np.concatenate([[0.0], np.cumsum((slope[1:] + slope[:-1]) / 2 * np.diff(radii))])
+    return np.asarray(depth[-1] - depth, dtype=np.float64)
+
+
+def dent_height(u: Float64, v: Float64, circle: ContactCircle, thickness: float, ball: float) -> Float64:
+    """(...,) height (into the gel) of that dent at pixels u, v (...,) [px]; 0 at FAR ball radii."""
+    radii = np.arange(0.0, FAR * ball, STEP)
+    depth = depth_profile(radii, circle.radius, ball, thickness)
+    return np.asarray(np.interp(np.hypot(u - circle.x, v - circle.y), radii, depth), dtype=np.float64)
 
 
 def contact_depth(contact: float, ball: float, thickness: float) -> float:

@@ -15,6 +15,7 @@ from calibration.lens.view import GelView
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
 from calibration.light.press import BallPress, Image
+from tacsim.models.darkness import DarknessModel
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
 
@@ -38,9 +39,9 @@ class PressPrediction:
 class LightFit:
     """A calibrated light."""
 
-    forward: PhotometricModel
-    inverse: InverseModel
-    size: ModelSize
+    forward: PhotometricModel | None  # None, as the next two: of a light that tells no direction
+    inverse: InverseModel | None
+    size: ModelSize | None
     thickness: float  # of the gel, as the skirts of the dents tell it [px]
     radius_uncertainty: float  # of the scale of all contact radii [-]; NaN for a single press
     unexplained: tuple[float, ...]  # share of each press's change of colour that no dent explains
@@ -50,6 +51,7 @@ class LightFit:
     reference: Image
     presses: tuple[BallPress, ...]
     frames: tuple[str, ...]  # names of all that were given
+    darkness: DarknessModel | None = None  # of a light that tells depth and no direction; lengths in pixels
 
     def to_calibration(
         self,
@@ -71,6 +73,7 @@ class LightFit:
             gel_size=(columns * pixel_pitch, rows * pixel_pitch),
             forward=self.forward,
             inverse=self.inverse,
+            darkness=None if self.darkness is None else self.darkness.scaled(pixel_pitch),
             view=view,
             markers=markers,
             noise=noise,

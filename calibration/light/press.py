@@ -63,16 +63,24 @@ def find_press(name: str, image: Image, reference: Image, mean: Float64, ball: f
 
     Raises NoCircle, BadFrames.
     """
-    raw = image.astype(np.float64) - reference
     half = contact_circle(_halved(image), _halved(reference), ball / 2)
     circle = ContactCircle(2 * half.x + 0.5, 2 * half.y + 0.5, min(2 * half.radius, 0.95 * MAX_RIM_RATIO * ball))
+    return press_at(name, image, reference, mean, circle)
+
+
+def press_at(
+    name: str, image: Image, reference: Image, mean: Float64, circle: ContactCircle, reach: float = NEAR
+) -> BallPress:
+    """The same with a contact that is known, about; `reach`: how far it changes the gel [contact radii]. Raises
+    BadFrames."""
+    raw = image.astype(np.float64) - reference
     height, width = reference.shape[:2]
     if not (0 <= circle.x < width and 0 <= circle.y < height):
         raise BadFrames("the middle of the contact lies outside the picture")
     v, u = np.mgrid[:height, :width].astype(np.float64)
     distance = np.hypot(u - circle.x, v - circle.y)
     lit = (image < SATURATED) & (reference < SATURATED)
-    drift = _drift(raw, (distance > NEAR * circle.radius) & lit.all(axis=2))
+    drift = _drift(raw, (distance > reach * circle.radius) & lit.all(axis=2))
     contact = distance < circle.radius
     saturated = 1.0 - float(lit[contact].all(axis=1).mean()) if contact.any() else 1.0
     if saturated > MAX_SATURATED_SHARE:

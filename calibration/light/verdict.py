@@ -76,7 +76,8 @@ def judge(fit: LightFit, scale: KnownScale) -> Verdict:
 def _of_presses(fit: LightFit) -> Iterable[Finding]:
     count = len(fit.presses)
     if count < ENOUGH_PRESSES:
-        word: Word = "do not trust" if count < MIN_PRESSES else "usable"
+        # depth needs one table, which one press gives; slopes need colours of all directions everywhere
+        word: Word = "do not trust" if count < MIN_PRESSES and fit.darkness is None else "usable"
         yield Finding(word, f"{count} press{'es' * (count > 1)} could be used", "press five at least, eight are good")
     yield from _beyond(
         RADIUS, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
@@ -89,7 +90,7 @@ def _of_presses(fit: LightFit) -> Iterable[Finding]:
 
 def _of_pictures(fit: LightFit) -> Iterable[Finding]:
     unexplained = float(np.mean(fit.unexplained))
-    if undirected(fit.forward):
+    if fit.forward is not None and undirected(fit.forward):
         yield Finding(
             "do not trust", "this light tells no direction: all flanks of a dent change alike",
             "slopes cannot be found in such pictures; only how dark it is tells of depth",

@@ -109,7 +109,15 @@ def _worn(config: RigConfig) -> tuple[object, object]:
 
 def _unchanging(config: RigConfig) -> RigConfig:
     """What of a rig is the same in all episodes of an environment; the rest is left out."""
-    look = {"lighting": Lighting(), "photometric": None, "texture": 0.0, "texture_seed": 0, "noise": None, "name": ""}
+    look = {
+        "lighting": Lighting(),
+        "photometric": None,
+        "darkness": None,
+        "texture": 0.0,
+        "texture_seed": 0,
+        "noise": None,
+        "name": "",
+    }
     sensors, arms = {}, {}
     for name, sensor in config.sensors.items():
         assert isinstance(sensor, SimSensorConfig)

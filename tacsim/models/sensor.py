@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from tacsim.models.darkness import DarknessModel
 from tacsim.models.geometry import GelView
 from tacsim.models.geometry import SensorGeometry as SensorGeometry
 from tacsim.models.photometric import PhotometricModel
@@ -122,6 +123,7 @@ class SensorModel(Config):
     lighting: Lighting = Lighting()
     # Calibrated on a real sensor: takes the place of the lights; the background stays that of `lighting`.
     photometric: PhotometricModel | None = None
+    darkness: DarknessModel | None = None  # the same of a light that tells depth and no direction
     markers: Markers | None = None
     # Where the picture of `geometry` lies in the camera's own, which is delivered then; None: it is the camera's own.
     view: GelView | None = None
@@ -132,8 +134,11 @@ class SensorModel(Config):
 
     @model_validator(mode="after")
     def _calibrated_change_has_a_base(self) -> Self:
-        if self.photometric is not None and self.lighting.background is None:
-            raise ValueError("photometric tells changes of colour, so it needs lighting.background: the untouched gel")
+        told = [name for name in ("photometric", "darkness") if getattr(self, name) is not None]
+        if len(told) == 2:
+            raise ValueError("photometric and darkness are two lights; give one of them")
+        if told and self.lighting.background is None:
+            raise ValueError(f"{told[0]} tells changes of colour, so it needs lighting.background: the untouched gel")
         return self
 
     @model_validator(mode="after")

@@ -1,5 +1,6 @@
 """Gel surface -> RGB image: by Phong shading, the method of Gomes et al. (RA-L 2021) that the seed paper uses, or by a
-calibrated polynomial (tacsim.models.photometric) where the sensor has one.
+calibrated polynomial (tacsim.models.photometric) where the sensor has one, or from height by a table
+(tacsim.models.darkness) where its light tells no direction.
 
 Camera and lights stand behind the gel, on its -z side. There a surface pressed in by `height` has the unit normal
 
@@ -25,6 +26,7 @@ from tacsim.models.geometry import GelView
 from tacsim.models.photometric import PhotometricLight, places_in_image
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import Lighting, SensorModel
+from tacsim.optics.darkness import darkened
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.ink import lifted_ink
 from tacsim.optics.markers import check_fits, marker_transmission
@@ -64,7 +66,8 @@ class Renderer:
         self._light: PhotometricLight | None = None
         untouched = WHITE * untouched_image(model.lighting, self._grid.shape)
         # Of the image without the lights
-        self._unlit = untouched if model.photometric else WHITE * unlit_image(model.lighting, self._grid.shape)
+        calibrated = model.photometric or model.darkness
+        self._unlit = untouched if calibrated else WHITE * unlit_image(model.lighting, self._grid.shape)
         if model.markers is not None and model.markers.in_background:
             radius = model.markers.radius / model.geometry.pixel_pitch
             clean, self._ink = lifted_ink(np.rint(untouched).astype(np.uint8), radius)
@@ -72,8 +75,9 @@ class Renderer:
             untouched, self._markers = clean.astype(np.float32), None
         elif model.markers is not None:
             check_fits(model.markers, gel_size)
+        self._mean = untouched.mean(axis=(0, 1))
         if model.photometric is not None:
-            red, green, blue = untouched.mean(axis=(0, 1)).tolist()
+            red, green, blue = self._mean.tolist()
             self._light = PhotometricLight(model.photometric, (red, green, blue))
             if model.texture > 0:
                 places = places_in_image(self._grid.columns, self._grid.rows)
@@ -81,7 +85,8 @@ class Renderer:
 
     @property
     def beyond(self) -> float:
-        """Fraction of the last image's surface whose slope was clipped to the calibrated range; 0 for Phong lights."""
+        """Fraction of the last image's surface whose slope, or depth, was clipped to the calibrated range; 0 for Phong
+        lights."""
         return self._beyond
 
     def __call__(self, surface: GelSurface) -> NDArray[np.uint8]:
@@ -90,7 +95,7 @@ class Renderer:
 
         table = SurfaceTable(surface)
         seen = table.points(self._grid, fine=False)
-        light = self._shaded(table, *seen) if self._light is None else self._calibrated(self._light, table, *seen)
+        light = self._light_of(table, *seen)
         inked = self._inked(surface, table, seen[0])
         del seen  # memory that is freed early is used again while it is warm
         image = np.empty((*self._grid.shape, 3), dtype=np.uint8)
@@ -114,6 +119,17 @@ class Renderer:
             ink = self._ink
             return lambda rows: look_up(ink, table.at_rest(points[rows], self._grid))
         return None
+
+    def _light_of(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
+        """Rows of an image -> (rows, W, 3) what light adds to the image without it; 255 is white."""
+        if self._light is not None:
+            return self._calibrated(self._light, table, points, inside)
+        if self.model.darkness is None:
+            return self._shaded(table, points, inside)
+        height = table.at(np.ascontiguousarray(table.fields[..., 0]), points, inside)
+        change, self._beyond = darkened(self.model.darkness, height, self._grid.pitch)
+        coloured: Float32 = change * self._mean
+        return coloured.__getitem__
 
     def _shaded(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) light of the lamps, by the slopes of surface and texture; 255 is white."""

@@ -116,8 +116,8 @@ def ball_presses(folder: Path, of: BallSet, repeat: int) -> list[Measurement]:
         **_interval("grey", [prediction.error for prediction in predictions]),
         "presses": float(len(predictions)),
         "left_out": float(len(fit.left_out)),
-        "weights": 3.0 * fit.size.terms,
-        "steepest": fit.forward.steepest,
+        "weights": 3.0 * fit.size.terms if fit.size else 0.0,
+        "steepest": fit.forward.steepest if fit.forward else 0.0,
     }
     picture = Measurement(
         timing, _mean(predictions, "error"), "grey", "the real frame where r < 1.5 contact radii, its drift removed; "

@@ -72,23 +72,25 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     from tacsim.optics.surface import sample_surface
 
     calibration = made_up(width)
+    forward = calibration.forward
+    assert forward is not None
     world, _ = press(press_scene(Sphere(radius=BALL), 1e-3), DEPTH)
     surface = world.surface("lower")
-    model = SensorModel(geometry=calibration.geometry, photometric=calibration.forward, texture=0.0)
+    model = SensorModel(geometry=calibration.geometry, photometric=forward, texture=0.0)
     render = Renderer(model, (20e-3, 20e-3))
     timing, image = timed(partial(render, surface), max(repeat, MIN_REPETITIONS))
     # the same polynomial, term by term, in double precision and without strips
     slopes = sample_surface(surface, image_grid(calibration.geometry)).gradient.astype(np.float64)
-    steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / calibration.forward.steepest, 1.0)
+    steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / forward.steepest, 1.0)
     u, v = np.meshgrid(*place_in_image(image.shape[1], image.shape[0]))
     terms = features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
-    change = (terms @ np.array(calibration.forward.weights)).reshape(image.shape)
+    change = (terms @ np.array(forward.weights)).reshape(image.shape)
     still = 255.0 * np.array(model.lighting.background, dtype=np.float64)
-    exact = np.clip(still + still * cv2.GaussianBlur(change, (0, 0), calibration.forward.blur), 0, 255)
+    exact = np.clip(still + still * cv2.GaussianBlur(change, (0, 0), forward.blur), 0, 255)
     return [
         Measurement(
             timing, float(np.abs(image - exact).max()), "grey at most", "the polynomial itself, in double precision",
-            f"{image.shape[1]} x {image.shape[0]}", None, {"terms": float(3 * len(calibration.forward.weights))},
+            f"{image.shape[1]} x {image.shape[0]}", None, {"terms": float(3 * len(forward.weights))},
         )
     ]  # fmt: skip
 

@@ -95,6 +95,7 @@ class PunchRenderer:
         self.reference = fit.reference
         self._still = fit.reference.astype(np.float32)
         self._mean = self._still.mean(axis=(0, 1))
+        assert fit.forward is not None
         self._light = PhotometricLight(fit.forward, tuple(self._mean.tolist()))
         self._places = places_in_image(self._still.shape[1], self._still.shape[0])
         self._blur = fit.forward.blur

@@ -126,7 +126,7 @@ def sensor(
     folder = new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration")
     with busy("loading"):
         from calibration.frame_set import read_folder, rectified_by_view
-        from calibration.light.calibrator import calibrate_light
+        from calibration.light.calibrator import NoDirection, calibrate_light
         from calibration.light.verdict import KnownScale
         from calibration.markers.dots import DotEraser
     markers = markers or profile.markers
@@ -146,9 +146,14 @@ def sensor(
         notes.print("no picture without contact: the median of all presses stands for it")
     found = _markers(read, pitch) if markers else None
     erase = None if found is None else DotEraser(found.radius / pitch)
-    with busy(f"calibrating from {len(read.frames)} presses"):
-        named = [(frame.name, frame.image) for frame in read.frames]
-        fit = calibrate_light(read.reference, named, ball / pitch, erase)
+    try:
+        with busy(f"calibrating from {len(read.frames)} presses"):
+            named = [(frame.name, frame.image) for frame in read.frames]
+            fit = calibrate_light(read.reference, named, ball / pitch, erase)
+    except NoDirection as why:
+        notes.print(str(why), markup=False)
+        results.print("verdict: do not trust; no bundle is written")
+        raise typer.Exit(UNTRUSTED) from None
     scale = KnownScale(pitch, ball, profile.gel_size, profile.gel_thickness, depths)
     _write(folder, fit, read, serial, scale, found, profile, view=seen)
 
@@ -327,11 +332,16 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
         )  # fmt: skip
         columns = ("frame", "contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]")
         show_table("Each press predicted by all the others", columns, rows, left={0})
-    size = fit.size
-    results.print(
-        f"model: degree {size.degree} in the normal, {size.position} in the place; calibrated up to a slope of "
-        f"{fit.forward.steepest:.2f}"
-    )
+    if fit.darkness is not None:
+        results.print(
+            f"this light tells no direction: darkness tells depth, up to {fit.darkness.depths[-1] * pitch * 1e3:.2f} "
+            f"mm beyond {fit.darkness.share:.0%} of the mean depth round it"
+        )
+    elif fit.size is not None and fit.forward is not None:
+        results.print(
+            f"model: degree {fit.size.degree} in the normal, {fit.size.position} in the place; calibrated up to a "
+            f"slope of {fit.forward.steepest:.2f}"
+        )
     if fit.predictions:
         results.print(
             f"contact radii ± {fit.radius_uncertainty:.1%}; gel {fit.thickness * pitch * 1e3:.1f} mm thick by the "

@@ -1,0 +1,275 @@
+"""Presses of a ball under a light that tells no direction: how dark a pixel is tells of depth, not of slope.
+
+Such a light is known by its presses: on each ring round the middle of a contact the change of colour is the same. Then
+circles, the gel's thickness and the two numbers of tacsim.models.darkness are found together with a light in proportion
+to depth, by one factor above 0 and one below (variable projection, as in calibration.light.refinement; a quadratic in a
+single press trades against its radius, so it takes several). The table itself is fitted to them last, and is monotone
+by construction. One press is enough for it: what others add is whether it holds for them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import BadFrames
+from calibration.light.circle import NoCircle
+from calibration.light.dent import FAR, MAX_RIM_RATIO, ContactCircle, depth_profile
+from calibration.light.photometry import FEW_PRESSES
+from calibration.light.press import BallPress, press_at, smooth
+from calibration.light.refinement import FIRST_THINNESS, MAX_GROUPS, RIVAL, THINNESS_BOUNDS
+from tacsim.models.darkness import DarknessModel
+
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+ALIKE = 0.6  # share of the power of a press's change that is the same all round, above which no direction is told
+BLUR = 2.0  # through which the darkness of presses is looked at [px]
+MIN_CONTRAST = 0.03  # relative change of colour in the middle of a contact
+EDGE = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
+NEAR = 3.0  # a press changes the gel up to here [contact radii]
+PIXELS = 1200  # of each press, about
+STEP = 1 / 30  # of radii [ball radii]
+FIRST = (0.3, 0.4)  # share, reach [ball radii] that the search starts from
+BOUNDS = ((0.0, 0.05), (0.8, 1.5))  # of share, reach
+KNOTS = 24  # of the table
+FLATTEST = 0.01  # least slope of the table, over its mean
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DarknessFit:
+    """What presses tell of such a light; lengths in pixels."""
+
+    presses: tuple[BallPress, ...]  # with their circles refined
+    thickness: float  # of the gel
+    radius_uncertainty: float  # of the scale of all radii [-]; NaN for a single press with one solution
+    unexplained: tuple[float, ...]  # share of each press's darkness that no table explains
+    model: DarknessModel
+    left_out: tuple[DarknessModel | None, ...]  # the model by all other presses, for each; None: there are none
+
+
+def rough_contact(change: Float64) -> ContactCircle:
+    """Where a change of colour (H, W, 3) is strongest. Raises NoCircle."""
+    import cv2
+
+    strength = np.abs(smooth(change, BLUR)).mean(axis=2)
+    peak = float(strength.max())
+    if not peak > MIN_CONTRAST:
+        raise NoCircle(f"no ball's contact is seen: colours change by {peak:.1%} at most")
+    _, patches = cv2.connectedComponents((strength > peak / 2).astype(np.uint8))
+    numbers = np.asarray(patches, dtype=np.intp)
+    inside = numbers == numbers.ravel()[strength.argmax()]
+    v, u = np.nonzero(inside)
+    return ContactCircle(float(u.mean()), float(v.mean()), EDGE * float(np.sqrt(len(u) / np.pi)))
+
+
+def tells_no_direction(changes: Iterable[Float64]) -> bool:
+    """True where most changes of colour (H, W, 3) are the same all round their contacts."""
+    shares = []
+    for raw in changes:
+        change = raw - np.median(raw, axis=(0, 1))
+        try:
+            circle = rough_contact(change)
+        except NoCircle:
+            continue
+        v, u = np.mgrid[: change.shape[0], : change.shape[1]]
+        distance = np.hypot(u - circle.x, v - circle.y)
+        near = distance < 1.5 * circle.radius
+        rings = (distance[near] * (12 / circle.radius)).astype(np.intp)
+        count = np.maximum(np.bincount(rings), 1)
+        seen = smooth(change, BLUR)[near]
+        means = np.stack([np.bincount(rings, channel) / count for channel in seen.T])
+        shares.append(float((count * means**2).sum() / (seen**2).sum()))
+    return bool(shares) and float(np.median(shares)) > ALIKE
+
+
+def find_dark_press(name: str, image: Image, reference: Image, mean: Float64, ball: float) -> BallPress:
+    """One frame's press: its circle, about, and its change of colour without drift; as calibration.light.press says.
+    Raises NoCircle, BadFrames."""
+    raw = image.astype(np.float64) - reference
+    circle = rough_contact((raw - np.median(raw, axis=(0, 1))) / mean)
+    circle = replace(circle, radius=min(circle.radius, 0.9 * MAX_RIM_RATIO * ball))
+    return press_at(name, image, reference, mean, circle, NEAR)
+
+
+def fit_darkness(presses: Sequence[BallPress], ball: float) -> DarknessFit:
+    """Circles, thickness and model of presses; `ball`: its radius [px]. Raises BadFrames where darkness tells no
+    depth: nowhere does it grow with it."""
+    problem = _Problem(presses, ball)
+    ends = sorted((problem.refined(problem.start(thinness)) for thinness in FIRST_THINNESS), key=lambda end: end[1])
+    best, cost = ends[0]
+    rivals = [_log_ratio(end, best) for end, other in ends[1:] if other < RIVAL * cost]
+    depths = [problem.own_depth(i, best) for i in range(len(presses))]
+    seen = [problem.windows[i].change for i in range(len(presses))]
+    whole = _table(depths, seen)
+    models = [whole] + [_table(_without(depths, i), _without(seen, i)) for i in range(len(presses)) if len(presses) > 1]
+    finished = [_model(table, float(best[-2]), float(best[-1]) * ball) for table in models]
+    circles = [ContactCircle(*map(float, best[3 * i : 3 * i + 3])) for i in range(len(presses))]
+    return DarknessFit(
+        presses=tuple(replace(press, circle=circle) for press, circle in zip(presses, circles, strict=True)),
+        thickness=ball / float(best[-3]),
+        radius_uncertainty=float(max([*problem.jackknife(best), *rivals], default=np.nan)),
+        unexplained=tuple(_unexplained(*pair, whole) for pair in zip(depths, seen, strict=True)),
+        model=finished[0],
+        left_out=tuple(finished[1:]) or (None,),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """The n pixels of one press that take part."""
+
+    u: Float64
+    v: Float64
+    change: Float64  # (n, 3) relative
+
+
+class _Problem:
+    """Least squares for (x, y, radius) of each press [px], then the gel's thinness (ball radius over thickness), the
+    share and the reach [ball radii]."""
+
+    def __init__(self, presses: Sequence[BallPress], ball: float) -> None:
+        self.presses, self._ball = presses, ball
+        self.windows = [_window(press) for press in presses]
+        self._features = functools.lru_cache(maxsize=8 * len(presses) + 8)(self._new_features)
+
+    def start(self, thinness: float) -> Float64:
+        circles = [number for p in self.presses for number in (p.circle.x, p.circle.y, p.circle.radius)]
+        return np.array([*circles, thinness, *FIRST])
+
+    def refined(self, start: Float64) -> tuple[Float64, float]:
+        """The least near `start`, and its cost."""
+        from scipy.optimize import least_squares
+
+        low, high = [], []
+        for press in self.presses:
+            side = 0.3 * press.circle.radius
+            low += [press.circle.x - side, press.circle.y - side, 0.05 * self._ball]
+            high += [press.circle.x + side, press.circle.y + side, MAX_RIM_RATIO * self._ball]
+        low, high = [*low, THINNESS_BOUNDS[0], *BOUNDS[0]], [*high, THINNESS_BOUNDS[1], *BOUNDS[1]]
+        start = np.clip(start, np.array(low) + 1e-6, np.array(high) - 1e-6)
+        scale = np.array([1.0, 1.0, 1.0] * len(self.presses) + [0.3, 0.1, 0.1])
+        found = least_squares(
+            self._residual,
+            start,
+            bounds=(low, high),
+            x_scale=scale,
+            diff_step=[1e-4] * len(start),
+            max_nfev=40,
+            ftol=1e-4,
+            tr_solver="lsmr",  # no decomposition of all pixels by all numbers
+        )
+        return np.asarray(found.x, dtype=np.float64), float(found.cost)
+
+    def jackknife(self, best: Float64) -> list[float]:
+        """Standard deviation of the scale of all radii by leaving out groups of presses; none for a single press."""
+        count = len(self.presses)
+        if count < 2:
+            return []
+        groups, scales = min(count, MAX_GROUPS), []
+        for group in range(groups):
+            kept = [i for i in range(count) if i % groups != group]
+            part = _Problem([self.presses[i] for i in kept], self._ball)
+            begin = np.concatenate([*(best[3 * i : 3 * i + 3] for i in kept), best[-3:]])
+            scales.append(_log_ratio(part.refined(begin)[0], begin, signed=True))
+        return [float(np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2)))]
+
+    def own_depth(self, i: int, at: Float64) -> Float64:
+        """(n,) depth beyond the share of that round it, in the window of press `i` [px]."""
+        x, y, radius = map(float, at[3 * i : 3 * i + 3])
+        thinness, share, reach = map(float, at[-3:])
+        profile = _profile(radius / self._ball, thinness)
+        own = profile - share * (_mean_round(reach) @ profile)
+        window = self.windows[i]
+        distance = np.hypot(window.u - x, window.v - y)
+        return np.asarray(np.interp(distance, _radii() * self._ball, own) * self._ball, dtype=np.float64)
+
+    def _new_features(self, i: int, at: tuple[float, ...]) -> Float64:
+        deep = self.own_depth(i, np.array([*([0.0] * 3 * i), *at])) / self._ball
+        above, below = np.maximum(deep, 0.0), np.minimum(deep, 0.0)
+        return np.stack([above, below, above**2][: 3 if len(self.presses) > FEW_PRESSES else 2], axis=-1)
+
+    def _residual(self, at: Float64) -> Float64:
+        shared = tuple(map(float, at[-3:]))
+        terms = [self._features(i, (*map(float, at[3 * i : 3 * i + 3]), *shared)) for i in range(len(self.presses))]
+        rows, seen = np.concatenate(terms), np.concatenate([w.change.mean(axis=1) for w in self.windows])
+        square = rows.T @ rows
+        weights = np.linalg.solve(square + 1e-9 * np.trace(square) * np.eye(len(square)), rows.T @ seen)
+        return np.asarray(rows @ weights - seen, dtype=np.float64)
+
+
+def _log_ratio(one: Float64, other: Float64, *, signed: bool = False) -> float:
+    """Mean logarithm of the ratio of radii."""
+    ratio = float(np.mean(np.log(one[2:-3:3] / other[2:-3:3])))
+    return ratio if signed else abs(ratio)
+
+
+def _window(press: BallPress) -> _Window:
+    v, u = np.nonzero((press.distance() < NEAR * press.circle.radius) & press.lit.all(axis=2))
+    thin = max(1, round(np.sqrt(len(u) / PIXELS)))
+    keep = (u % thin == 0) & (v % thin == 0)
+    u, v = u[keep], v[keep]
+    return _Window(u.astype(np.float64), v.astype(np.float64), smooth(press.change, BLUR)[v, u])
+
+
+@functools.cache
+def _radii() -> Float64:
+    return np.arange(0.0, FAR, STEP)
+
+
+@functools.lru_cache(maxsize=64)
+def _profile(contact: float, thinness: float) -> Float64:
+    """Depth of a dent at :func:`_radii`; all in ball radii."""
+    return depth_profile(_radii(), contact, 1.0, 1 / thinness)
+
+
+@functools.lru_cache(maxsize=8)
+def _mean_round(reach: float) -> Float64:
+    """(n, n) from a profile at :func:`_radii` to that of its Gaussian mean over the plane."""
+    from scipy.special import ive
+
+    r, s = _radii()[:, None], _radii()[None, :]
+    weights = s * np.exp(-(((r - s) / reach) ** 2) / 2) * ive(0, r * s / reach**2)
+    return np.asarray(weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300), dtype=np.float64)
+
+
+def _without(parts: Sequence[Float64], i: int) -> list[Float64]:
+    return [part for k, part in enumerate(parts) if k != i]
+
+
+def _table(depths: Sequence[Float64], seen: Sequence[Float64]) -> tuple[Float64, Float64]:
+    """Knots (k,) and changes (k, 3) that fall from each to the next and are 0 at depth 0: the least squares of changes
+    `seen` (n, 3) at `depths` (n,) by non-negative steps. Raises BadFrames where nothing falls."""
+    from scipy.optimize import nnls
+
+    deep, change = np.concatenate(depths), np.concatenate(seen)
+    lowest, highest = min(float(deep.min()), -1e-3 * float(deep.max())), float(deep.max())
+    below = max(2, round(KNOTS * -lowest / (highest - lowest)))
+    knots = np.concatenate([np.linspace(lowest, 0.0, below + 1), np.linspace(0.0, highest, KNOTS + 1)[1:]])
+    low, high = knots[:-1], knots[1:]
+    ramps = np.clip((deep[:, None] - low) / (high - low), 0.0, 1.0) - (low < 0)  # 0 at depth 0
+    square, right = ramps.T @ ramps, ramps.T @ change
+    lower = np.linalg.cholesky(square + 1e-9 * np.trace(square) * np.eye(len(square)))
+    steps = np.stack([nnls(lower.T, -np.linalg.solve(lower, channel))[0] for channel in right.T], axis=-1)
+    total = steps.sum(axis=0)
+    if not (total > 0).all():
+        raise BadFrames("how dark it is does not grow with the depth")
+    steps = np.maximum(steps, FLATTEST * total * ((high - low) / (highest - lowest))[:, None])
+    changes = -np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return knots, changes - changes[below]
+
+
+def _model(table: tuple[Float64, Float64], share: float, reach: float) -> DarknessModel:
+    knots, changes = table
+    rows = tuple((float(r), float(g), float(b)) for r, g, b in changes)
+    return DarknessModel(depths=tuple(map(float, knots)), changes=rows, share=share, reach=reach)
+
+
+def _unexplained(depth: Float64, seen: Float64, table: tuple[Float64, Float64]) -> float:
+    knots, changes = table
+    told = np.stack([np.interp(depth, knots, channel) for channel in changes.T], axis=-1)
+    return float(((told - seen) ** 2).sum() / max(float((seen**2).sum()), 1e-300))

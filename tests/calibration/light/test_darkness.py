@@ -1,0 +1,138 @@
+"""Lights that tell no direction: what darkness tells of depth, on made-up pictures whose true surface is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from calibration.bundle import read_bundle, read_sensor_model, write_bundle
+from calibration.height.darkness import DarknessSlopes
+from calibration.light.calibrator import NoDirection, calibrate_light
+from calibration.light.darkness import tells_no_direction
+from calibration.light.fit import LightFit
+from calibration.light.verdict import KnownScale, judge
+from calibration.normaliser import normaliser_for_calibration, normaliser_for_pictures
+from tacsim.interface import TactileFrame
+from tacsim.models.sensor import CanonicalGrid
+from tacsim.optics.grid import canonical_cells
+from tacsim.optics.render import Renderer
+from tacsim.optics.surface import sample_surface
+from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor, Made
+from tests.tacsim.optics.surfaces import dent, flat
+
+
+class DarkSensor(HiddenSensor):
+    """White light from behind a translucent skin. `share`, `reach` [px]: as tacsim.models.darkness says."""
+
+    def __init__(self, seed: int, share: float = 0.0, reach: float = 15.0, noise: float = 1.0) -> None:
+        super().__init__(seed, noise)
+        self._share, self._reach = share, reach
+        self._base = np.full((ROWS, COLUMNS, 3), (150.0, 160.0, 155.0))
+
+    def press(self, depth: float, x: float, y: float, drift: np.ndarray | float = 0.0, ball: float = BALL_PX) -> Made:
+        made = super().press(depth, x, y, drift, ball)
+        own = made.height - self._share * gaussian_filter(made.height, self._reach, mode="nearest")
+        return replace(made, image=self.seen(self.darkness(own * 1e3)))
+
+    def darkness(self, own: np.ndarray) -> np.ndarray:
+        return np.where(own > 0, 0.9 * (1 - np.exp(-own)), 1.2 * own)
+
+    def seen(self, darkness: np.ndarray) -> np.ndarray:
+        noise = self._rng.normal(0, self._noise, self._base.shape)
+        colour = self._base * (1 - darkness[..., None] * (1.0, 0.95, 0.9))
+        return np.clip(np.rint(colour + noise), 0, 255).astype(np.uint8)
+
+    def empty(self) -> np.ndarray:
+        return self.seen(np.zeros((ROWS, COLUMNS)))
+
+
+class RingSensor(DarkSensor):
+    """Dark on steep flanks, all alike, and bright where the surface is flat: depth is not told."""
+
+    def press(self, depth: float, x: float, y: float, drift: np.ndarray | float = 0.0, ball: float = BALL_PX) -> Made:
+        made = HiddenSensor.press(self, depth, x, y, drift, ball)
+        return replace(made, image=self.seen(0.5 * np.minimum(np.hypot(*np.moveaxis(made.gradient, -1, 0)), 1) ** 2))
+
+
+def calibrated(sensor: HiddenSensor, count: int) -> tuple[LightFit, list[Made]]:
+    presses = sensor.presses(count)
+    return calibrate_light(sensor.empty(), [(f"{i}", press.image) for i, press in enumerate(presses)], BALL_PX), presses
+
+
+def height_error(fit: LightFit, sensor: DarkSensor, unseen: Made) -> float:
+    """Root mean square in contact and near it, over the depth."""
+    assert fit.darkness is not None
+    change = (unseen.image.astype(np.float32) - fit.reference) / fit.reference.mean(axis=(0, 1), dtype=np.float32)
+    found, _ = DarknessSlopes(fit.darkness.scaled(PITCH), (ROWS, COLUMNS), PITCH).depth(change)
+    x, y, radius = unseen.circle
+    v, u = np.mgrid[:ROWS, :COLUMNS]
+    near = np.hypot(u - x, v - y) < 1.5 * radius
+    off = PITCH * found[near] - unseen.height[near]
+    return float(np.sqrt(((off - off.mean()) ** 2).mean()) / unseen.height.max())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_heights_of_an_unseen_press_come_back(share: float) -> None:
+    sensor = DarkSensor(1, share)
+    fit, presses = calibrated(sensor, 4)
+    assert fit.forward is None and fit.inverse is None and not fit.left_out
+    for found, true in zip(fit.presses, presses, strict=True):
+        assert np.hypot(found.circle.x - true.circle[0], found.circle.y - true.circle[1]) < 0.5
+        assert found.circle.radius == pytest.approx(true.circle[2], rel=0.06)
+    assert height_error(fit, sensor, sensor.press(0.45e-3, 120, 110)) < 0.04
+    assert all(prediction.correlation > 0.98 for prediction in fit.predictions)
+    shallower = sorted(fit.predictions, key=lambda prediction: prediction.circle.radius)[:-1]
+    assert all(prediction.angle < 4 for prediction in shallower)  # the deepest reaches beyond the others' table
+    assert judge(fit, KnownScale(PITCH, BALL)).word == "usable"  # four presses
+
+
+def test_one_press_gives_the_table_and_is_said_to_be_one() -> None:
+    sensor = DarkSensor(2, 0.4)
+    press = sensor.press(0.65e-3, 130, 100)
+    fit = calibrate_light(sensor.empty(), [("one", press.image)], BALL_PX)
+    assert height_error(fit, sensor, sensor.press(0.4e-3, 90, 80)) < 0.06
+    verdict = judge(fit, KnownScale(PITCH, BALL))
+    assert verdict.word == "usable" and "1 press could be used" in str(verdict)
+
+
+def test_the_pictures_tell_which_light_it_is() -> None:
+    for sensor, alike in ((HiddenSensor(3), False), (DarkSensor(3), True), (DarkSensor(3, 0.4), True)):
+        reference = sensor.empty().astype(float)
+        assert tells_no_direction((p.image - reference) / 100 for p in sensor.presses(4)) is alike
+
+
+def test_flanks_that_are_dark_all_alike_tell_no_depth() -> None:
+    with pytest.raises(NoDirection, match="this light tells no direction"):
+        calibrated(RingSensor(4), 3)
+
+
+def test_a_frame_without_contact_is_left_out() -> None:
+    sensor = DarkSensor(4)
+    frames = [("press", sensor.press(0.5e-3, 130, 100).image), ("nothing", sensor.empty())]
+    assert [name for name, _ in calibrate_light(sensor.empty(), frames, BALL_PX).left_out] == ["nothing"]
+
+
+def test_a_bundle_rendered_and_found_again_gives_the_same_heights(tmp_path: Path) -> None:
+    fit, _ = calibrated(DarkSensor(5, 0.4), 4)
+    write_bundle(tmp_path, fit.to_calibration("dark", BALL, PITCH), fit.reference)
+    calibration, reference = read_bundle(tmp_path)
+    assert calibration.darkness is not None and calibration.forward is None
+    model, grid = read_sensor_model(tmp_path), CanonicalGrid()
+    render = Renderer(model, (COLUMNS * PITCH, ROWS * PITCH))
+    np.testing.assert_array_equal(render(flat()), reference)
+    picture = render(dent())
+    true = sample_surface(dent(), canonical_cells(grid))
+    for normalise in (
+        normaliser_for_calibration(calibration, grid, reference),
+        normaliser_for_pictures(model, (COLUMNS * PITCH, ROWS * PITCH), grid),
+    ):
+        normalise.take_reference(TactileFrame(reference, 0.0, 0))
+        seen = normalise(TactileFrame(picture, 0.1, 1), now=0.2)
+        assert seen.height is not None and seen.gradient is not None
+        off = (seen.height - true.height)[seen.valid]
+        assert np.sqrt((off**2).mean()) < 0.03 * true.height.max()
+        assert np.sqrt(((seen.gradient - true.gradient)[seen.valid] ** 2).mean()) < 0.05

@@ -165,6 +165,7 @@ class FrameNormaliser:
             flow=flow,
             time=frame.time,
             age=now - frame.time,
+            picture=frame.image,
         )
 
     def _surface(self, frame: TactileFrame, change: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, ...]:

@@ -81,6 +81,8 @@ class TactileObservation:
     flow: NDArray[np.float32] | None  # (m, n, 2) tactile flow [m]
     time: float  # exposure time [s]
     age: float  # time of the observation minus time of exposure [s]
+    # (H, W, 3) RGB as the camera gave it: not canonical, so what learns from it learns one sensor's light, too
+    picture: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@
 | touch | (frames * numbers,)                 | named by `FeatureEncoder.inputs`                        |
 | goal  | (1,) or (2,)                        | of the task                                            |
 
-Every number is its SI value over the scale of its quantity in `SCALES`. Nothing is clipped and nothing is normalised
+Every number is its SI value over the scale of its quantity in `SCALES` (of a picture less 1: white is 1, black -1). Nothing is clipped and nothing is normalised
 further here: what else a network wants is inside the network.
 """
 
@@ -33,6 +33,7 @@ SCALES = {
     "slope": 1.0,  # [-]
     "contact": 1.0,  # share of a cell that is in contact [-]
     "image": 1.0,  # relative change of colour, (v - 128) / 128 [-]
+    "picture": 127.5,  # of the camera, from black (-1) to white (1) [grey levels]
     "flow": 0.2e-3,  # [m]
     "area": 1e-4,  # in contact [m^2]
     "depth": 1e-3,  # greatest, and mean over the contact [m]
@@ -51,6 +52,7 @@ PARTS: dict[str, dict[str, str]] = {
     "slope": {"slope_x": "slope", "slope_y": "slope"},
     "contact": {"contact": "contact"},
     "image": dict.fromkeys(("red", "green", "blue"), "image"),
+    "picture": dict.fromkeys(("picture_red", "picture_green", "picture_blue"), "picture"),
     "flow": {"flow_x": "flow", "flow_y": "flow"},
     "area": {"area": "area"},
     "depth": {"depth_greatest": "depth", "depth_mean": "depth"},
@@ -74,7 +76,8 @@ class FeatureEncoder:
 
     def __init__(self, features: Features, canonical: CanonicalGrid) -> None:
         self.features = features
-        self._pool = _Pool(features.grid, canonical) if features.maps else None
+        canonical_maps = set(features.maps) - {"picture"}
+        self._pool = _Pool(features.grid, canonical) if canonical_maps else None
         self._rows, self._columns = (_centres(n, canonical.pitch) for n in (canonical.rows, canonical.columns))
         self._cell_area = canonical.pitch**2
         self._goal: Arrays = {}
@@ -140,16 +143,21 @@ class FeatureEncoder:
         wanted = self.features
         touches = [observation.tactile[name] for name in wanted.sensors]
         arrays: Arrays = {}
-        if self._pool is not None:
-            arrays["maps"] = np.concatenate(
-                [self._pool(_channel(t, kind), t.valid) for t in touches for kind in wanted.maps]
-            )
+        if wanted.maps:
+            arrays["maps"] = np.concatenate([self._map(touch, kind) for touch in touches for kind in wanted.maps])
         if wanted.flow:
             arrays["flow"] = np.concatenate([_flow(touch).transpose(2, 0, 1) / SCALES["flow"] for touch in touches])
         if wanted.touch:
             arms = {name: observation.arms[name] for name in wanted.arms}
             arrays["touch"] = np.concatenate([self._numbers(quantity, touches, arms) for quantity in wanted.touch])
         return {key: value.astype(np.float32) for key, value in arrays.items()}
+
+    def _map(self, touch: TactileObservation, kind: Channel) -> FloatArray:
+        """(channels, h, w) of one sensor."""
+        if kind == "picture":
+            return _parts(touch.picture, self.features.grid) / SCALES["picture"] - 1.0
+        assert self._pool is not None
+        return self._pool(_channel(touch, kind), touch.valid)
 
     def _numbers(
         self, quantity: Quantity, touches: Sequence[TactileObservation], arms: Mapping[str, ArmState]
@@ -218,6 +226,23 @@ class _Pool:
         blocks = values.reshape(rows, self._every, columns, self._every, values.shape[-1])
         total: FloatArray = blocks.sum(axis=(1, 3))
         return total
+
+
+def _parts(picture: NDArray[np.uint8] | None, grid: MapGrid) -> FloatArray:
+    """(3, h, w) means over the parts of a picture [grey levels], which differ in size by a pixel at most."""
+    if picture is None:
+        raise IncompatibleRig("the policy sees pictures as the camera gave them, and this sensor delivers none")
+    rows, columns = picture.shape[:2]
+    if rows < grid.rows or columns < grid.columns:
+        raise IncompatibleRig(
+            f"the policy's picture of {rows} x {columns} px has fewer than {grid.rows} x {grid.columns} parts: give the "
+            "sensor a larger picture"
+        )
+    down, right = np.arange(grid.rows) * rows // grid.rows, np.arange(grid.columns) * columns // grid.columns
+    sums = np.add.reduceat(np.add.reduceat(picture, down, axis=0, dtype=np.float64), right, axis=1)
+    pixels = np.outer(np.diff(down, append=rows), np.diff(right, append=columns))
+    means: FloatArray = sums.transpose(2, 0, 1) / pixels
+    return means
 
 
 def _named(kind: str, owner: str) -> list[tuple[str, float]]:

@@ -9,12 +9,13 @@ from pydantic import Field, model_validator
 from tacsim.models.hardware import Name
 from tacsim.models.quantity import Config, Length
 
-Channel = Literal["height", "slope", "contact", "image"]
+Channel = Literal["height", "slope", "contact", "image", "picture"]
 Quantity = Literal["area", "depth", "centroid", "shear", "wrench", "moved", "between"]
 
 
 class MapGrid(Config):
-    """Cells of the maps, centred on the gel. Each is the mean of whole cells of the rig's canonical grid."""
+    """Cells of the maps, centred on the gel. Each is the mean of whole cells of the rig's canonical grid; of `picture`
+    it is the mean of a part of the camera's picture, whatever that shows, and `pitch` says nothing."""
 
     rows: Annotated[int, Field(ge=1, le=1024)] = 16
     columns: Annotated[int, Field(ge=1, le=1024)] = 16

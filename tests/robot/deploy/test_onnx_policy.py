@@ -33,16 +33,18 @@ AXES = (ActionAxis(arm="lower", direction=(0, 0, 1)), ActionAxis(arm="upper", di
 WEIGHTS = np.random.default_rng(5).normal(0, 0.3, (TOUCH, 2)).astype(np.float32)
 
 
+SPEC: dict[str, Any] = {
+    "task": "squeeze",
+    "period": 0.1,
+    "features": FEATURES,
+    "inputs": FeatureEncoder(FEATURES, GRID).inputs,
+    "axes": AXES,
+    "max_step": 0.2e-3,
+}
+
+
 def spec(**changed: Any) -> dict[str, Any]:
-    whole = PolicySpec(
-        task="squeeze",
-        period=0.1,
-        features=FEATURES,
-        inputs=FeatureEncoder(FEATURES, GRID).inputs,
-        axes=AXES,
-        max_step=0.2e-3,
-    )
-    return {**json.loads(whole.model_dump_json()), **changed}
+    return {**json.loads(PolicySpec(**SPEC).model_dump_json()), **changed}
 
 
 def graph(
@@ -79,10 +81,15 @@ def read(path: Path) -> OnnxPolicy:
     return OnnxPolicy(path, GRID, 2e-3)
 
 
-def test_it_does_on_a_rig_what_it_did_in_the_environment(write: Callable[..., Path]) -> None:
+@pytest.mark.parametrize(("sight", "channels"), [("height", 4), ("picture", 12)])
+def test_it_does_on_a_rig_what_it_did_in_the_environment(
+    sight: Any, channels: int, write: Callable[..., Path]
+) -> None:
     """The same actions to the last bit, and so the same motion."""
-    path = write()
-    env, session = make(features=FEATURES, variants=()), onnxruntime.InferenceSession(path)
+    features = FEATURES.model_copy(update={"maps": (sight,)})
+    said = {"features": features, "inputs": FeatureEncoder(features, GRID).inputs}
+    path = write(graph(maps=(1, channels, 4, 4)), spec(**json.loads(PolicySpec(**{**SPEC, **said}).model_dump_json())))
+    env, session = make(features=features, variants=()), onnxruntime.InferenceSession(path)
     with open_rig("sim", task="squeeze", overrides=SMALL) as rig:
         task = make_task(SqueezeConfig(kind="squeeze", goal=2e-3))
         policy = load_policy(str(path), task, rig.spec, GRID)

@@ -79,6 +79,31 @@ def test_maps_lie_in_the_middle_and_leave_out_what_is_not_valid() -> None:
     assert maps[0, 0, 1:].tolist() == [0.0] * 3  # nothing valid there
 
 
+def test_a_picture_is_seen_whole_as_the_camera_gave_it() -> None:
+    picture = np.random.default_rng(3).integers(0, 256, (13, 18, 3), dtype=np.uint8)
+    seen = observation(picture=picture)
+    asked = encoder(sensors=("lower",), maps=("height", "picture"), touch=())
+    maps = asked.begin(seen)["maps"]
+    assert maps.shape == (1 + 3, 4, 6)
+    wanted = 2 * picture[3:6, 6:9].mean(axis=(0, 1)) / 255 - 1  # rows 3 to 5 of 13: parts differ by a row at most
+    assert maps[1:, 1, 2] == pytest.approx(wanted, abs=1e-6)
+    assert maps[1:, 3, 5] == pytest.approx(2 * picture[9:, 15:].mean(axis=(0, 1)) / 255 - 1, abs=1e-6)
+    assert asked.inputs["maps"].names[1:] == tuple(f"picture_{c}_lower" for c in ("red", "green", "blue"))
+    assert asked.inputs["maps"].scales[1:] == (127.5,) * 3  # grey levels
+    # Of the canonical image nothing is left in it, so no canonical grid need fit.
+    odd = encoder(sensors=("lower",), maps=("picture",), touch=(), grid=MapGrid(rows=3, columns=5, pitch=0.3e-3))
+    assert odd.begin(seen)["maps"].shape == (3, 3, 5)
+    assert odd.needs == Needs(frozenset({"lower"}), frozenset({"lower", "upper"}))
+
+
+def test_a_picture_that_is_missing_or_too_small_is_told() -> None:
+    asked = encoder(maps=("picture",), touch=())
+    with pytest.raises(IncompatibleRig, match="pictures as the camera gave them, and this sensor delivers none"):
+        asked.begin(observation())
+    with pytest.raises(IncompatibleRig, match="picture of 3 x 18 px has fewer than 4 x 6 parts"):
+        asked.begin(observation(picture=np.zeros((3, 18, 3), np.uint8)))
+
+
 @pytest.mark.parametrize(
     "grid",
     [

@@ -19,7 +19,7 @@ MARKERS = [f"sensors.{name}.model.markers={{rows: 3, columns: 4}}" for name in (
 
 def test_check_env_is_content_without_a_warning() -> None:
     env = make(
-        features={**FEATURES, "flow": True, "maps": ["height", "slope", "contact", "image"]},
+        features={**FEATURES, "flow": True, "maps": ["height", "slope", "contact", "image", "picture"]},
         overrides=[*SMALL, *MARKERS],
     )
     env.spec = None
@@ -27,7 +27,7 @@ def test_check_env_is_content_without_a_warning() -> None:
         warnings.simplefilter("error")
         check_env(env, skip_render_check=True)
     shapes = {key: box.shape for key, box in env.observation_space.items()}
-    assert shapes == {"maps": (2 * 2 * 7, 4, 4), "flow": (2 * 2 * 2, 3, 4), "touch": (2 * 43,), "goal": (1,)}
+    assert shapes == {"maps": (2 * 2 * 10, 4, 4), "flow": (2 * 2 * 2, 3, 4), "touch": (2 * 43,), "goal": (1,)}
     env.close()
 
 
@@ -49,7 +49,8 @@ def test_they_are_those_of_the_flat_observation_and_the_goal_of_the_episode() ->
 
 
 def test_a_batch_shows_what_each_alone_shows() -> None:
-    batch, alone = make_native(2, features=FEATURES), make(features=FEATURES)
+    pictured = {**FEATURES, "maps": ["height", "picture"]}
+    batch, alone = make_native(2, features=pictured), make(features=pictured)
     seen, _ = batch.reset(seed=[3, 4])
     for index, seed in enumerate((3, 4)):
         assert_equal({key: value[index] for key, value in seen.items()}, alone.reset(seed=seed)[0])

@@ -7,8 +7,8 @@
 | touch | (frames * numbers,)                 | named by `FeatureEncoder.inputs`                        |
 | goal  | (1,) or (2,)                        | of the task                                            |
 
-Every number is its SI value over the scale of its quantity in `SCALES` (of a picture less 1: white is 1, black -1). Nothing is clipped and nothing is normalised
-further here: what else a network wants is inside the network.
+Every number is its SI value over the scale of its quantity in `SCALES`; of a picture less 1, so that black is -1 and
+white 1. Nothing is clipped and nothing is normalised further here: what else a network wants is inside the network.
 """
 
 from __future__ import annotations
@@ -235,8 +235,8 @@ def _parts(picture: NDArray[np.uint8] | None, grid: MapGrid) -> FloatArray:
     rows, columns = picture.shape[:2]
     if rows < grid.rows or columns < grid.columns:
         raise IncompatibleRig(
-            f"the policy's picture of {rows} x {columns} px has fewer than {grid.rows} x {grid.columns} parts: give the "
-            "sensor a larger picture"
+            f"the policy's picture of {rows} x {columns} px has fewer than {grid.rows} x {grid.columns} parts: "
+            "give the sensor a larger picture"
         )
     down, right = np.arange(grid.rows) * rows // grid.rows, np.arange(grid.columns) * columns // grid.columns
     sums = np.add.reduceat(np.add.reduceat(picture, down, axis=0, dtype=np.float64), right, axis=1)

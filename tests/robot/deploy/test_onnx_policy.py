@@ -82,9 +82,7 @@ def read(path: Path) -> OnnxPolicy:
 
 
 @pytest.mark.parametrize(("sight", "channels"), [("height", 4), ("picture", 12)])
-def test_it_does_on_a_rig_what_it_did_in_the_environment(
-    sight: Any, channels: int, write: Callable[..., Path]
-) -> None:
+def test_it_does_on_a_rig_what_it_did_in_the_environment(sight: Any, channels: int, write: Callable[..., Path]) -> None:
     """The same actions to the last bit, and so the same motion."""
     features = FEATURES.model_copy(update={"maps": (sight,)})
     said = {"features": features, "inputs": FeatureEncoder(features, GRID).inputs}

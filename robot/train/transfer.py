@@ -1,7 +1,8 @@
 """The same policies in simulation and on the mock rig, whose hidden twin differs: what of their success is kept.
 
-Each episode is played twice by each policy: in the simulation, which has of the twin only what a person sees of it (the
-task and the body's shape), and on the mock rig, over the real wire, with all that the twin was drawn to be.
+Each episode is played twice by each policy: in the simulation that it was trained in, which has of the twin only what a
+person sees of it (the task and the body's shape), and on the mock rig, over the real wire, with all that the twin was
+drawn to be.
 """
 
 from __future__ import annotations
@@ -15,11 +16,14 @@ from typing import Literal
 import numpy as np
 
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
+from robot.deploy.onnx_policy import OnnxPolicy
 from robot.deploy.policy import load_policy, require_fit
 from robot.open import open_rig
-from robot.train.evaluate import Interval, bootstrap, wilson
+from robot.train.evaluate import UNSEEN, Interval, bootstrap, wilson
 from tacsim.config import LoadedRig, load_rig
+from tacsim.interface import RigSpec
 from tacsim.models.randomisation import Randomisation
+from tacsim.models.training import Training
 from tacsim.record.episode import Episode
 from tacsim.report.series import FELT
 from tacsim.rig import Rig
@@ -112,22 +116,47 @@ def _line(played: Played) -> str:
 
 
 def _on_twin(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
-    if not left:
-        return
-    loaded = _loaded(study, side, twin, left[0][1])
-    with open_rig(loaded) as rig:
-        for policy, number in left:
-            yield _episode(study, side, rig, _loaded(study, side, twin, number), policy, number)
+    """One rig for all policies on a twin; in simulation, where each has its own, one for each."""
+    names = [None] if side == "twin" else list(dict.fromkeys(policy for policy, _ in left))
+    for name in names:
+        mine = [each for each in left if name in (None, each[0])]
+        if not mine:
+            continue
+        loaded = [_loaded(study, side, twin, number, name) for _, number in mine]
+        with open_rig(loaded[0]) as rig:
+            for (policy, number), each in zip(mine, loaded, strict=True):
+                yield _episode(study, side, rig, each, policy, number)
 
 
-def _loaded(study: Study, side: Side, twin: int, number: int) -> LoadedRig:
+def _loaded(study: Study, side: Side, twin: int, number: int, policy: str | None = None) -> LoadedRig:
     """The rig of an episode: its task's values are drawn anew for each episode, all others for each twin."""
     drawn = study.twins.model_copy(update={"draws": max(study.episodes, twin + 1)}).drawn()
     words = [word for word in drawn[twin] if not word.startswith("task.")]
     words += [word for word in drawn[number] if word.startswith("task.")]
     if side == "simulation":
         words = [word for word in words if word.startswith(SEEN)]
+        words = [*_own_simulation(policy, study.task, twin), *words]
     return load_rig(RIGS[side], task=study.task, overrides=[*study.overrides, *words])
+
+
+def _own_simulation(policy: str | None, task: str, twin: int) -> list[str]:
+    """Overrides of the rig that a learned policy was trained in, drawn anew; none of another policy."""
+    if policy is None or not (policy == "learned" or policy.endswith(".onnx")):
+        return []
+    loaded = load_rig(RIGS["simulation"], task=task)
+    assert loaded.config.task is not None
+    nothing = RigSpec({}, (), truth=False, period=loaded.config.period)
+    acts = load_policy(policy, make_task(loaded.config.task), nothing, loaded.config.canonical)
+    assert isinstance(acts, OnnxPolicy)
+    told = acts.spec.trained.get("training")
+    if told is None:
+        return []
+    training = Training.model_validate(told)
+    drawn = training.randomise
+    if drawn is None:
+        return list(training.overrides)
+    unseen = drawn.model_copy(update={"draws": twin + 1, "seed": UNSEEN + drawn.seed})
+    return [*training.overrides, *unseen.drawn()[twin]]
 
 
 def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str, number: int) -> Played:

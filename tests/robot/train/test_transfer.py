@@ -57,6 +57,17 @@ def test_the_simulation_has_of_a_twin_what_a_person_sees() -> None:
     assert other.scene.body == twin.scene.body and other.task.goal != twin.task.goal  # type: ignore[union-attr]
 
 
+def test_a_learned_policy_is_played_in_the_simulation_that_it_was_trained_in() -> None:
+    twin, own = (_loaded(study(), side, 1, 3, "learned").config for side in transfer.SIDES[::-1])
+    assert own.scene is not None and own.scene.body is not None and own.task is not None and twin.scene is not None
+    assert own.scene.preset == "learn" and own.motion == "flowing" and twin.scene.preset == "draft"
+    assert own.scene.body.geometry == twin.scene.body.geometry  # type: ignore[union-attr]
+    assert own.task.goal == twin.task.goal  # type: ignore[attr-defined, union-attr]
+    other = _loaded(study(), "simulation", 2, 3, "learned").config
+    assert other.scene is not None and other.scene.body is not None
+    assert other.scene.body.material != own.scene.body.material  # which its training draws
+
+
 def test_the_shipped_twin_fits_both_rigs() -> None:
     for side in transfer.SIDES:
         for number in range(3):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -147,7 +147,7 @@ def main(
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     cells = [(sight, materials) for sight in SIGHTS for materials in MATERIALS]
-    parts = {
+    parts: dict[str, Callable[[], None]] = {
         "record": lambda: record(folder, preset),
         "identify": lambda: identify(folder, known),
         "train": lambda: train(folder, [each for each in cells if not cell or "-".join(each) in cell]),

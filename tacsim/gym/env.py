@@ -115,7 +115,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
 
         options: `variant`, the number of one of the environment's variants, in place of a drawn one; or `task`
         (SqueezeConfig, RepositionConfig) and `scene` (Scene), which hold until others are given. Raises ValueError for
-        others, and for what cannot change between episodes.
+        others, for what cannot change between episodes, and for a goal that no policy can reach (GoalOutOfReach).
         """
         super().reset(seed=seed)
         self._choose(dict(options or {}))
@@ -157,6 +157,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         observation = self.rig.reset(seed)
         self._targets: dict[str, Pose] = {name: arm.pose for name, arm in observation.arms.items()}  # last sent there
         self._truth_at_start = self._truth()
+        self.task.require_reachable(self._truth_at_start)
         self._effort = Effort(observation.arms)
         self._count, self.phase = 0, "running"
         self._observation, self._teacher = observation, None

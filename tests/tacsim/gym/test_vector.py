@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tacsim.limits import ActionError
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.batch import Batch
+from tacsim.tasks import GoalOutOfReach
 from tests.tacsim.gym.small import NAME, SMALL, VARIANTS, assert_equal, make, make_native
 
 MODES = ("NextStep", "SameStep", "Disabled")
@@ -239,3 +240,14 @@ def test_a_reset_with_a_new_body_and_goal() -> None:
     with pytest.raises(ValueError, match="has some"):
         env.reset(options={"variant": 0})
     env.close()
+
+
+def test_a_goal_that_nobody_can_reach_is_refused_at_reset_alone_and_in_a_batch() -> None:
+    beyond = [*SMALL, "task.goal=3.2 mm"]
+    env, batch = make(overrides=beyond, variants=()), make_native(2, overrides=beyond, variants=())
+    for each in (env, batch):
+        with pytest.raises(GoalOutOfReach, match=r"task.goal: 3.2 mm is above the body, which is 2"):
+            each.reset(seed=1)
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros(2, np.float32))
+    batch.close()

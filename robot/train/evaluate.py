@@ -75,16 +75,21 @@ class Judged:
         return float(np.mean(forces)), float(np.quantile(forces, 0.95))
 
 
+Say = Callable[[Judged], None]
+
+
 def evaluate(
     training: Training,
     policies: Sequence[str],
     episodes: int = 200,
     seed: int = 0,
     tell: Tell = lambda words, done, of: None,
+    say: Say = lambda so_far: None,
 ) -> list[Judged]:
     """Each policy in the same episodes, of bodies and goals drawn as in training but with other seeds.
 
     policies: "teacher" (acts by the truth), "random", and what `load_policy` knows: "scripted", "FILE.onnx" ...
+    say: is told how the episodes so far ended, each time that all environments have played one.
     Raises PolicyNotFound, IncompatibleRig, and as `make_vector_env`.
     """
     config = load_with_task(training.rig, training.task, training.overrides).config
@@ -97,12 +102,14 @@ def evaluate(
     try:
         for name in policies:
             _fitting(name, envs.members[0], config.canonical)
-        return [_judge(envs, name, episodes, seed, config.canonical, tell) for name in policies]
+        return [_judge(envs, name, episodes, seed, config.canonical, tell, say) for name in policies]
     finally:
         envs.close()
 
 
-def _judge(envs: TacsimVectorEnv, name: str, episodes: int, seed: int, canonical: CanonicalGrid, tell: Tell) -> Judged:
+def _judge(
+    envs: TacsimVectorEnv, name: str, episodes: int, seed: int, canonical: CanonicalGrid, tell: Tell, say: Say
+) -> Judged:
     rows: list[Ended] = []
     members = envs.members
     count = len(members)
@@ -128,6 +135,7 @@ def _judge(envs: TacsimVectorEnv, name: str, episodes: int, seed: int, canonical
                         max(0.0, 1.0 - float(info["distance"][i]) / float(start[i])),
                     )
         rows += [ends[i] for i in range(count)]
+        say(Judged(name, tuple(rows[:episodes])))
     return Judged(name, tuple(rows[:episodes]))
 
 

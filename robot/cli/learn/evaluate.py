@@ -44,15 +44,17 @@ def evaluate(
     from tacsim.models.training import Training
 
     training = load(Training, task, set_ or [])
-    if not notes.is_terminal:
-        notes.print(f"{episodes} episodes of each policy")
     with one_bar("starting") as bar:
 
         def tell(words: str, done: int, of: int) -> None:
             bar.say(words)
             bar.count(done, of)
 
-        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, tell)
+        def say(so_far: Judged) -> None:
+            done, success = len(so_far.episodes), interval_text(so_far.success, 100, 0)
+            notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %", markup=False)
+
+        judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, tell, say)
     _show(judged)
     if json_ is not None:
         import json

@@ -79,13 +79,15 @@ def test_the_command_writes_a_table_and_a_file(tmp_path: Path) -> None:
         "--policy",
         "scripted",
         "--episodes",
-        "3",
+        "4",
         "--json",
         str(found),
     )
     result = tacsim(*words)
     assert result.exit_code == 0, result.output
-    assert "3 unseen episodes, 95 % intervals" in result.stdout
+    assert "4 unseen episodes, 95 % intervals" in result.stdout
+    said = [line.partition(",")[0] for line in result.stderr.splitlines() if " of 4 episodes" in line]
+    assert said == [f"{name}: {done} of 4 episodes" for name in ("teacher", "scripted") for done in (3, 4)]
     assert "teacher" in result.stdout and "scripted" in result.stdout
-    assert len(json.loads(found.read_text())["scripted"]) == 3
+    assert len(json.loads(found.read_text())["scripted"]) == 4
     assert "exists already" in tacsim(*words).stderr

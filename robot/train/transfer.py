@@ -92,8 +92,14 @@ def play(study: Study, folder: Path, tell: Callable[[str, int, int], None]) -> l
                     done[each.policy, each.side, each.episode] = each
                     file.write(_line(each))
                     file.flush()
-                    tell(f"{each.policy}: {side}", len(done), total)
+                    tell(f"{each.policy}, {side}: {_ended(each)}", len(done), total)
     return [done[p, side, n] for p in study.policies for side in SIDES for n in range(study.episodes)]
+
+
+def _ended(played: Played) -> str:
+    if played.error or played.distance is None:
+        return played.error or "it never began"
+    return f"{1e3 * played.distance:.3f} mm from the goal{'' if played.success else ', not reached'}"
 
 
 def _read(rows: Path) -> Iterator[Played]:

@@ -51,8 +51,6 @@ def transfer(
     twins = load(Randomisation, f"{task}-twin" if twin is None else twin)
     policies = tuple(policy or ("learned", "scripted"))
     study = Study(task, policies, twins, episodes, every, steps, tuple(set_ or ()))
-    if not notes.is_terminal:
-        notes.print(f"{episodes} episodes of each policy on each side")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     with one_bar("starting") as bar:
@@ -60,6 +58,8 @@ def transfer(
         def tell(words: str, done: int, of: int) -> None:
             bar.say(words)
             bar.count(done, of)
+            if not notes.is_terminal:
+                notes.print(f"{done} of {of}: {words}", markup=False)
 
         rows = summary(play(study, out, tell))
     with writing(out):

@@ -113,7 +113,13 @@ def fake(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -
 
 def test_a_study_that_is_killed_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer, "_on_twin", fake)
-    whole = play(study(), tmp_path, lambda *_: None)
+    told: list[str] = []
+    whole = play(study(), tmp_path, lambda words, done, of: told.append(f"{done} of {of}, {words}"))
+    assert told[:2] == [
+        "1 of 20, scripted, simulation: 0.000 mm from the goal",
+        "2 of 20, scripted, simulation: 0.100 mm from the goal",
+    ]
+    assert told[-1] == "20 of 20, grip, twin: 0.500 mm from the goal, not reached"
     assert [(each.policy, each.side, each.episode) for each in whole] == [
         (policy, side, n) for policy in ("scripted", "grip") for side in ("simulation", "twin") for n in range(5)
     ]

@@ -108,7 +108,7 @@ def run_episode(
     feel = task.estimator(setup.canonical) if task is not None and can_feel else None
     kept: list[Step] = []
     episode = Episode(meta, kept if sink is None else sink.steps)
-    count = 0
+    count, thinking = 0, False
 
     def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
         nonlocal count
@@ -129,7 +129,9 @@ def run_episode(
         keep(observation, None, {})
         while count <= steps and not stop():
             started = time.perf_counter()
+            thinking = True
             action = policy(observation)
+            thinking = False
             observation, sent = rig.step(action)
             keep(observation, action, sent)
     except (EndOfEpisode, KeyboardInterrupt):
@@ -137,6 +139,8 @@ def run_episode(
     except (Exception, SystemExit) as failure:  # a policy may call sys.exit
         done = max(count - 1, 0)
         why = f"{type(failure).__name__}: {failure}"
+        if thinking:
+            why = f"policy '{setup.policy}' raised {why}; the arms hold. Mend it, and try it in simulation"
         raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", episode) from failure
     finally:
         rig.stop()

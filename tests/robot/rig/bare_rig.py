@@ -105,10 +105,20 @@ def cameras_of(config: RigConfig) -> Iterator[dict[str, MockCamera]]:
 
 
 @contextlib.contextmanager
-def opened(rig: Path | str, *overrides: str, dry_run: bool = False, link_timeout: float = 20.0) -> Iterator[Opened]:
+def opened(
+    rig: Path | str,
+    *overrides: str,
+    dry_run: bool = False,
+    link_timeout: float = 20.0,
+    action_timeout: float = 5.0,
+) -> Iterator[Opened]:
     """No time-out of the arms depends on how busy the machine is; `link_timeout` [s] is long for the same reason."""
     config = load_rig(rig, overrides=overrides).config
-    patient = {"watchdog": 0.05, "action_timeout": 5.0, "observation_timeout": 60.0}  # model_copy does not validate
+    patient = {
+        "watchdog": 0.05,
+        "action_timeout": action_timeout,
+        "observation_timeout": 60.0,
+    }  # model_copy does not validate
     slow = {"link_timeout": link_timeout, **patient}
     config = config.model_copy(
         update={"arms": {name: arm.model_copy(update=slow) for name, arm in config.arms.items()}}

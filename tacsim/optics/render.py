@@ -43,6 +43,7 @@ WHITE = np.float32(255.0)
 STEEPEST = 2.0  # largest slope in the table of light
 TABLE_POINTS = 256  # of that table, from slope 0 to STEEPEST
 ASTRAY = 0.5  # [px] that a pixel put on the gel and back may be off
+LEAST_PIXELS = 128 * 128  # of a picture that is worth a table
 TABLE_ERROR = 0.5  # largest error of the table [grey levels]; narrower highlights are computed without it
 
 
@@ -64,6 +65,8 @@ class Renderer:
         self._texture = texture_gradient(self._grid, gel_size, model.texture, model.texture_seed)
         self._beyond = 0.0
         self._light: PhotometricLight | None = None
+        self._lights: Float32 | None = None  # the table of Phong lights, once it is asked for
+        self._tabulated = self._grid.rows * self._grid.columns < LEAST_PIXELS  # nothing is left to tabulate
         untouched = WHITE * untouched_image(model.lighting, self._grid.shape)
         # Of the image without the lights
         calibrated = model.photometric or model.darkness
@@ -138,7 +141,9 @@ class Renderer:
         lighting = self.model.lighting
         slopes = table.at(table.fields[..., 1:], points, inside)
         cv2.add(slopes, self._texture, dst=slopes)
-        lights = light_table(lighting)
+        if not self._tabulated:
+            self._lights, self._tabulated = light_table(lighting), True
+        lights = self._lights
         if lights is None or not max(-float(slopes.min()), float(slopes.max())) <= STEEPEST:
             return lambda rows: shade(slopes[rows], lighting, white=255.0)
         return lambda rows: light_at(lights, slopes[rows])

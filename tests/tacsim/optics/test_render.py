@@ -1,11 +1,13 @@
 import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from tacsim.models.sensor import Light, Lighting, SensorGeometry, SensorModel
+from tacsim.optics import render
 from tacsim.optics.grid import PixelGrid, image_grid
 from tacsim.optics.render import (
     STEEPEST,
@@ -97,6 +99,31 @@ def test_steep_flanks_and_narrow_highlights_are_shaded_pixel_by_pixel(shininess:
     exact = 255.0 * unlit_image(model.lighting, slopes.shape[:2]) + shade(slopes, model.lighting, white=255.0)
     image = Renderer(model, GEL)(surface)
     assert np.abs(image - exact.clip(0.0, 255.0)).max() < 0.5 + 1e-3
+
+
+def test_lights_that_differ_are_tabulated_once_each_and_small_pictures_not_at_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A table takes as long as seven pictures of 320 x 240 px; many sensors, each in a light of its own, take turns."""
+    made: list[Lighting] = []
+
+    def counted(lighting: Lighting) -> Any:
+        made.append(lighting)
+        return light_table.__wrapped__(lighting)
+
+    monkeypatch.setattr(render, "light_table", counted)
+    lights = [Lighting(shininess=6.0 + 0.5 * each) for each in range(3)]
+    surface = dent()
+    small = {"width": 80, "height": 60, "pixel_pitch": 0.25e-3}
+    for geometry, tables in ((SMOOTH.geometry, 3), (SMOOTH.geometry.model_copy(update=small), 0)):
+        made.clear()
+        renderers = [
+            Renderer(SMOOTH.model_copy(update={"lighting": light, "geometry": geometry}), GEL) for light in lights
+        ]
+        for _ in range(2):
+            for renderer in renderers:
+                renderer(surface)
+        assert len(made) == tables
 
 
 def test_order_of_lights_changes_no_bit() -> None:

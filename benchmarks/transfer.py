@@ -68,7 +68,7 @@ def record(folder: Path, preset: str) -> None:
 
 
 def identify(folder: Path, preset: str) -> None:
-    """By the shipped command, on the mesh that policies are trained on."""
+    """By the shipped command, on a coarser mesh than the twin's."""
     for kind, more in (("gel", []), ("body", sets([f"gel.material={folder / 'my-gel/material.yaml'}"]))):
         out = folder / f"my-{kind}"
         if not out.exists():
@@ -143,7 +143,7 @@ def main(
     every: int = 3,
     steps: int | None = None,
     preset: Annotated[str, typer.Option(help="Mesh of the twin that is recorded.")] = "standard",
-    known: Annotated[str, typer.Option(help="Mesh on which it is identified.")] = "learn",
+    known: Annotated[str, typer.Option(help="Mesh on which it is identified.")] = "draft",
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     cells = [(sight, materials) for sight in SIGHTS for materials in MATERIALS]

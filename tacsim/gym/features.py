@@ -24,6 +24,7 @@ from tacsim import pose as se3
 from tacsim.interface import ArmState, FloatArray, IncompatibleRig, Needs, Observation, Pose, TactileObservation
 from tacsim.models.features import Channel, Features, MapGrid, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
+from tacsim.tasks.reposition import pressed_at
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -41,6 +42,7 @@ SCALES = {
     "shear": 0.2e-3,  # mean flow of all markers, sensor x and y [m]
     "force": 10.0,  # [N]
     "torque": 0.05,  # [N m]
+    "pressure": 5e-3,  # where the normal force acts, less where it did at the first touch; sensor x and y [m]
     "moved": 5e-3,  # of an arm since reset, in the axes of its sensor then [m]
     "between": 10e-3,  # from the first arm's sensor to another's, in the axes of the first [m]
     "turn": 0.1,  # first two columns of a rotation, less those of no rotation [-]
@@ -59,6 +61,7 @@ PARTS: dict[str, dict[str, str]] = {
     "centroid": {"centroid_x": "centroid", "centroid_y": "centroid"},
     "shear": {"shear_x": "shear", "shear_y": "shear"},
     "wrench": {f"{what}_{axis}": what for what in ("force", "torque") for axis in "xyz"},
+    "pressure": {"pressure_x": "pressure", "pressure_y": "pressure"},
     "moved": {f"moved_{axis}": "moved" for axis in "xyz"}
     | {f"turn_{column}{axis}": "turn" for column in "xy" for axis in "xyz"},
     "between": {f"between_{axis}": "between" for axis in "xyz"},
@@ -82,6 +85,7 @@ class FeatureEncoder:
         self._cell_area = canonical.pitch**2
         self._goal: Arrays = {}
         self._start: Mapping[str, Pose] = {}
+        self._pressed: dict[str, FloatArray] = {}  # where the normal force acted first
         self._frames: deque[Arrays] = deque(maxlen=features.frames)
 
     @property
@@ -128,6 +132,7 @@ class FeatureEncoder:
                 raise IncompatibleRig("the policy is told a goal, but the rig has no task: name one (--task)")
             self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
         self._start = {name: observation.arms[name].pose for name in self.features.arms}
+        self._pressed = {}
         self._frames.extend([self._encode(observation)] * self.features.frames)
         return self._stacked()
 
@@ -176,12 +181,19 @@ class FeatureEncoder:
             each = [
                 np.concatenate([a.wrench[:3] / SCALES["force"], a.wrench[3:] / SCALES["torque"]]) for a in arms.values()
             ]
+        elif quantity == "pressure":
+            each = [self._pressure(name, arm) / SCALES["pressure"] for name, arm in arms.items()]
         elif quantity == "moved":
             each = [moved(self._start[name], arm.pose) for name, arm in arms.items()]
         else:
             first, *others = arms.values()
             each = [se3.relative(first.pose, arm.pose).position / SCALES["between"] for arm in others]
         return np.concatenate(each)
+
+    def _pressure(self, name: str, arm: ArmState) -> FloatArray:
+        """(2,) since the first touch of the episode [m]; 0 without contact."""
+        here = pressed_at(arm)
+        return np.zeros(2) if here is None else here - self._pressed.setdefault(name, here)
 
     def _centroid(self, touch: TactileObservation) -> FloatArray:
         """(2,) of what is pressed in where there is contact [m]; the middle without contact."""

@@ -115,11 +115,15 @@ def estimated_position(observation: Observation) -> FloatArray | None:
 
 
 def centre_of_pressure(arm: ArmState) -> FloatArray | None:
-    """(3,) the point of the gel's rest plane where the normal force acts, world [m]; None without contact.
+    """(3,) the point of the gel's rest plane where the normal force acts, world [m]; None without contact."""
+    here = pressed_at(arm)
+    return None if here is None else se3.transform(arm.pose, np.append(here, 0.0))
+
+
+def pressed_at(arm: ArmState) -> FloatArray | None:
+    """(2,) the same in the axes of the sensor.
 
     A force at (x, y, 0) in the sensor frame has the moment (y Fz, -x Fz, ...), hence x = -My / Fz, y = Mx / Fz.
     """
     _, _, force, moment_x, moment_y, _ = arm.wrench
-    if -force < LEAST_FORCE:
-        return None
-    return se3.transform(arm.pose, np.array([-moment_y / force, moment_x / force, 0.0]))
+    return None if -force < LEAST_FORCE else np.array([-moment_y / force, moment_x / force])

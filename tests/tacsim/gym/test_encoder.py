@@ -160,6 +160,25 @@ def test_a_turn_is_that_since_reset() -> None:
     assert values["turn_yx_upper"] == pytest.approx(0.1, rel=1e-3)
 
 
+def test_pressure_is_where_the_force_acts_since_reset() -> None:
+    """A force at (x, y) of a sensor has the moment (y Fz, -x Fz)."""
+
+    def pressed(x: float, y: float, force: float) -> Observation:
+        seen = observation()
+        wrench = (0.0, 0.0, force, y * force, -x * force, 0.0)
+        return replace(seen, arms={**seen.arms, "lower": arm(Pose(), wrench)})
+
+    asked = encoder(touch=("pressure",))
+    names = asked.inputs["touch"].names
+    assert names == ("pressure_x_lower", "pressure_y_lower", "pressure_x_upper", "pressure_y_upper")
+    assert asked.begin(pressed(1e-3, -2e-3, -3.0))["touch"].tolist() == [0.0] * 4
+    assert asked(pressed(3e-3, -1e-3, -5.0))["touch"] == pytest.approx([0.4, 0.2, 0, 0], rel=1e-6)
+    assert asked(pressed(3e-3, -1e-3, -1e-6))["touch"].tolist() == [0.0] * 4  # nothing touches
+    asked.begin(pressed(1e-3, -2e-3, 0.0))
+    assert asked(pressed(1.5e-3, -2e-3, -1.0))["touch"].tolist() == [0.0] * 4  # the first touch of an episode
+    assert asked(pressed(2.5e-3, -2e-3, -1.0))["touch"] == pytest.approx([0.2, 0, 0, 0], abs=1e-7)
+
+
 def test_without_contact_nothing_is_felt_and_all_is_finite() -> None:
     flat = np.zeros((8, 12), np.float32)
     seen = observation(height=flat, contact=flat > 0)

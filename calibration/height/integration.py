@@ -1,4 +1,4 @@
-"""Slopes -> height, by Poisson's equation; the untouched rim of the view is zero."""
+"""Slopes -> height by Poisson's equation, zero at the untouched rim of the view; and the slopes of that height."""
 
 from __future__ import annotations
 
@@ -52,3 +52,13 @@ class Integrator:
         height: Float32 = idctn(spectrum, norm="ortho", overwrite_x=True)
         height -= np.median(height.ravel()[self._rim])
         return height
+
+
+def slopes_of(height: Float32, pitch: float) -> tuple[Float32, Float32]:
+    """Slopes by x and by y (rows, columns) of a height (rows, columns) [m] on pixels `pitch` [m] apart.
+
+    Of a height that :class:`Integrator` made they are the part of its slopes that a surface can have: errors that turn
+    round a place (half the power of errors without order) are gone.
+    """
+    by_y, by_x = np.gradient(height, np.float32(pitch))
+    return np.asarray(by_x, dtype=np.float32), np.asarray(by_y, dtype=np.float32)

@@ -1,7 +1,8 @@
 """Change of colour over a sensor's view -> height and gradient on the canonical grid.
 
 The view is wider than the canonical image: all of the gel that the camera sees. Slopes are integrated over all of it,
-because its border, farther from the contact, is the best zero.
+because its border, farther from the contact, is the best zero. The slopes that are told are those of the height:
+colours alone may tell slopes that no surface has.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.drift import STRIDE, DriftFinder, size_of
 from calibration.height.colour_table import GradientModel
-from calibration.height.integration import Integrator
+from calibration.height.integration import Integrator, slopes_of
 from calibration.lens.rectification import seen_box
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import PixelGrid, canonical_image
@@ -34,7 +35,7 @@ class FoundSurface:
     """The gel surface found in a picture, on the canonical grid."""
 
     height: Float32  # (h, w) into the gel, 0 at the contact-free border of the view [m]
-    gradient: Float32  # (h, w, 2) [-]
+    gradient: Float32  # (h, w, 2) of the height [-]
     beyond_range: float  # share of the view's pixels whose colour lies beyond the calibrated slopes
     drift: float | None  # mean relative change of the untouched gel's colour [-]; None: too little of it
     drift_slope: float | None  # mean angle of the slopes that this change would look like [degrees]
@@ -57,14 +58,14 @@ class SurfaceFinder:
         self._slopes, self._grid, self._dots = slopes, grid, dots
         self._box = seen_box(valid)
         self._unseen = ~valid[self._box]
-        pitch = grid.pitch / grid.image_scale
+        self._pitch = grid.pitch / grid.image_scale
         self._drift_finder, self._remove_drift = DriftFinder(self._unseen.shape), drifts
         # the canonical image in the seen box: its first row and column, and its size
         self._image = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
         corner = [(there - own) // 2 for there, own in zip(valid.shape, self._image, strict=True)]
         self._corner = (corner[0] - self._box[0].start, corner[1] - self._box[1].start)
         self._response = _response(slopes, self._unseen.shape)
-        self._integrate = Integrator(self._unseen.shape, pitch)
+        self._integrate = Integrator(self._unseen.shape, self._pitch)
         self._shape = valid.shape
         self._any_unseen = bool(self._unseen.any())
         self._known: _PreparedReference | None = None
@@ -91,6 +92,7 @@ class SurfaceFinder:
         if self._any_unseen:
             by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
         height = self._integrate(np.stack([by_x, by_y], axis=-1))
+        by_x, by_y = slopes_of(height, self._pitch)
         return FoundSurface(
             height=self._cells(height),
             gradient=np.stack([self._cells(by_x), self._cells(by_y)], axis=-1),

@@ -16,11 +16,18 @@ from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.height.darkness import DarknessSlopes
-from calibration.height.slope_polynomial import InverseModel, fit_inverse, inverse_features, to_normal
+from calibration.height.integration import Integrator, slopes_of
+from calibration.height.slope_polynomial import (
+    InverseModel,
+    PolynomialSlopes,
+    fit_inverse,
+    inverse_features,
+    to_normal,
+)
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import find_dark_press, fit_darkness, tells_no_direction
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
-from calibration.light.fit import LightFit, PressPrediction
+from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
 from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, untouched_mean
 from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
@@ -97,17 +104,16 @@ def calibrate_light(
             press,
             labels[i],
             _forward_model(all_equations - forward_sets[i], size, steepest),
-            fit_inverse([*inverse_sets[:i], *inverse_sets[i + 1 :]], with_position=len(presses) - 1 > FEW_PRESSES),
+            _inverse_model([*inverse_sets[:i], *inverse_sets[i + 1 :]], steepest),
             mean,
             reference,
         )
         for i, press in enumerate(presses)
         if len(presses) > 1
     )
-    inverse = fit_inverse(inverse_sets, with_position=len(presses) > FEW_PRESSES)
     return LightFit(
         forward=_forward_model(all_equations, size, steepest),
-        inverse=InverseModel(weights=tuple((float(x), float(y)) for x, y in inverse), steepest=steepest),
+        inverse=_inverse_model(inverse_sets, steepest),
         size=size,
         thickness=refined.thickness,
         radius_uncertainty=refined.radius_uncertainty,
@@ -155,7 +161,7 @@ def _darkness(
         slopes, _ = DarknessSlopes(model, press.shape, 1.0)(press.change.astype(np.float32))
         label = dent_gradient(u, v, press.circle, fit.thickness, ball)
         angles = normal_angle(to_normal(slopes.astype(np.float64)), to_normal(label))
-        predictions.append(_compared(press, change.astype(np.float64) * mean, angles, mean, reference))
+        predictions.append(compared(press, change.astype(np.float64) * mean, angles, mean, reference))
     return LightFit(
         forward=None,
         inverse=None,
@@ -295,49 +301,26 @@ def _forward_model(pixels: NormalEquations, size: ModelSize, steepest: float) ->
     return PhotometricModel(degree=size.degree, position=size.position, weights=weights, steepest=steepest, blur=BLUR)
 
 
+def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> InverseModel:
+    weights = fit_inverse(sets, with_position=len(sets) > FEW_PRESSES)
+    return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=steepest)
+
+
 def _prediction(
-    press: BallPress, gradient: Float64, model: PhotometricModel, inverse: Float64, mean: Float64, reference: Image
+    press: BallPress,
+    gradient: Float64,
+    forward: PhotometricModel,
+    inverse: InverseModel,
+    mean: Float64,
+    reference: Image,
 ) -> PressPrediction:
-    """Of a press labelled `gradient` (H, W, 2), by a forward model and the inverse's weights made without it."""
-    light, _ = PhotometricLight(model).change(gradient.astype(np.float32), *places_in_image(*press.shape[::-1]))
+    """Of a press labelled `gradient` (H, W, 2), by models made without it. Slopes are found as in every picture: from
+    each pixel's colour, then made those of a surface."""
+    places = places_in_image(*press.shape[::-1])
+    light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places)
     predicted = smooth(light.astype(np.float64), BLUR) * mean
-    angles = np.zeros(press.shape)
-    distance = press.distance() / press.circle.radius
-    for where in (distance < 1, distance > FAR):
-        angles[where] = normal_angle(_inverse_terms(press, where) @ inverse, to_normal(gradient[where]))
-    return _compared(press, predicted, angles, mean, reference)
-
-
-def _compared(
-    press: BallPress, predicted: Float64, angles: Float64, mean: Float64, reference: Image
-) -> PressPrediction:
-    """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
-    were found are off (H, W) [degrees]."""
-    distance = press.distance() / press.circle.radius
-    untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
-    predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
-    real = press.change * mean
-    contact, far = distance < 1.5, distance > FAR
-    return PressPrediction(
-        press.name,
-        press.circle,
-        error=float(np.abs(predicted - real)[contact].mean()),
-        null_error=float(np.abs(real)[contact].mean()),
-        correlation=float(np.corrcoef(predicted[contact].ravel(), real[contact].ravel())[0, 1]),
-        predicted=predicted.astype(np.float32),
-        real=real.astype(np.float32),
-        angle=float(angles[distance < 1].mean()),
-        untouched_angle=float(angles[far].mean()) if far.any() else 0.0,
-    )
-
-
-def normal_angle(one: Float64, other: Float64) -> Float64:
-    """(...,) angle [degrees] between unit normals given by their parts (..., 2) in the plane."""
-
-    def full_normal(parts: Float64) -> Float64:
-        square = (parts**2).sum(axis=-1, keepdims=True)
-        shorter = parts * np.minimum(1.0, 0.999 / np.sqrt(np.maximum(square, 1e-12)))
-        return np.concatenate([shorter, np.sqrt(1.0 - (shorter**2).sum(axis=-1, keepdims=True))], axis=-1)
-
-    cosine = (full_normal(one) * full_normal(other)).sum(axis=-1)
-    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    seen = smooth(press.change, INVERSE_BLUR).astype(np.float32)
+    slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)
+    found = np.stack(slopes_of(Integrator(press.shape, 1.0)(slopes), 1.0), axis=-1)
+    angles = normal_angle(to_normal(found.astype(np.float64)), to_normal(gradient))
+    return compared(press, predicted, angles, mean, reference)

@@ -14,10 +14,12 @@ from calibration.height.slope_polynomial import InverseModel
 from calibration.lens.view import GelView
 from calibration.light.dent import ContactCircle
 from calibration.light.photometry import ModelSize
-from calibration.light.press import BallPress, Image
+from calibration.light.press import FAR, BallPress, Image
 from tacsim.models.darkness import DarknessModel
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, Markers, SensorGeometry
+
+Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,3 +100,36 @@ class LightFit:
             ),
             reference="0" * 64,
         )
+
+
+def compared(press: BallPress, predicted: Float64, angles: Float64, mean: Float64, reference: Image) -> PressPrediction:
+    """A press beside what was predicted of it: change of colour (H, W, 3) [grey levels], and how far the normals that
+    were found are off (H, W) [degrees]."""
+    distance = press.distance() / press.circle.radius
+    untouched_here = np.float64(reference) + press.drift  # what this frame would show without contact
+    predicted = np.clip(untouched_here + predicted, 0.0, 255.0) - untouched_here
+    real = press.change * mean
+    contact, far = distance < 1.5, distance > FAR
+    return PressPrediction(
+        press.name,
+        press.circle,
+        error=float(np.abs(predicted - real)[contact].mean()),
+        null_error=float(np.abs(real)[contact].mean()),
+        correlation=float(np.corrcoef(predicted[contact].ravel(), real[contact].ravel())[0, 1]),
+        predicted=predicted.astype(np.float32),
+        real=real.astype(np.float32),
+        angle=float(angles[distance < 1].mean()),
+        untouched_angle=float(angles[far].mean()) if far.any() else 0.0,
+    )
+
+
+def normal_angle(one: Float64, other: Float64) -> Float64:
+    """(...,) angle [degrees] between unit normals given by their parts (..., 2) in the plane."""
+
+    def full_normal(parts: Float64) -> Float64:
+        square = (parts**2).sum(axis=-1, keepdims=True)
+        shorter = parts * np.minimum(1.0, 0.999 / np.sqrt(np.maximum(square, 1e-12)))
+        return np.concatenate([shorter, np.sqrt(1.0 - (shorter**2).sum(axis=-1, keepdims=True))], axis=-1)
+
+    cosine = (full_normal(one) * full_normal(other)).sum(axis=-1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

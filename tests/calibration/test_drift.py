@@ -9,7 +9,7 @@ import pytest
 
 from calibration.drift import STRIDE, Drift, DriftFinder
 from calibration.height.slope_polynomial import to_normal
-from calibration.light.calibrator import normal_angle
+from calibration.light.fit import normal_angle
 from calibration.normaliser import (
     FrameNormaliser,
     normaliser_for_calibration,

@@ -6,9 +6,9 @@ import pytest
 from calibration.errors import BadFrames
 from calibration.height.integration import Integrator
 from calibration.height.slope_polynomial import PolynomialSlopes, to_normal
-from calibration.light.calibrator import calibrate_light, normal_angle
+from calibration.light.calibrator import calibrate_light
 from calibration.light.dent import ContactCircle, dent_gradient
-from calibration.light.fit import LightFit
+from calibration.light.fit import LightFit, normal_angle
 from calibration.markers.dots import DotEraser
 from tacsim.models.photometric import PhotometricLight, place_in_image, places_in_image
 from tests.calibration.dotted import draw, lattice_points

@@ -2,8 +2,10 @@
 
 Each truth is drawn and simulated in a process of its own, on a mesh that identification does not use, and recorded with
 the motions that `tacsim identify … --motions` writes; its numbers come back in a file that is opened when all is done.
-Then the noise of the force is drawn again many times: how often do the intervals hold the truth? docs/identify.md has
-the figures. A gel takes half a minute, a body some minutes.
+Then noise, zeros and places are drawn again many times: how often do the intervals hold the truth, how often is a drift
+or a wrong ball noticed, how often something that is not there? No draw needs a simulation: near the estimate the
+simulation is the linear system that the fit ended with, and what is drawn is added to the recordings as they were. The
+lines are those of the table in docs/identify.md. A gel takes half a minute, a body some minutes.
 """
 
 from __future__ import annotations
@@ -11,7 +13,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +21,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from calibration.materials.checks import findings
 from calibration.materials.estimate import Fit, Priors, Signals, estimate
-from calibration.materials.presses import Noise, gathered, signals_of, thinned
+from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify
 from robot.studies.identify.motions import motions
 from robot.studies.identify.recordings import Recordings, find_recordings, read_all
@@ -31,6 +33,7 @@ from tacsim.interface import FloatArray
 TRUE_MESH = ("scene.element_size=0.4 mm", "scene.particle_spacing=0.2 mm")  # between those that identification uses
 RIGS = {"gel": "press", "body": "sim"}
 MOTIONS = {"gel": ("press", "slide"), "body": ("squeeze", "tilt")}
+DRIFTS = {"gel": (0.05, 0.1, 0.2), "body": (0.2, 0.5, 1.0)}  # of the normal force during the first recording [N]
 PLACE, ZERO = 0.02e-3, 0.2  # standard deviations of what the recordings are spoilt with [m, N]
 
 
@@ -70,14 +73,12 @@ def record(kind: str, seed: int, folder: Path) -> None:
     (folder / "truth.json").write_text(json.dumps(truth), encoding="utf-8")
 
 
-def redrawn(found: Identified, clean: Signals, seed: int, priors: Priors) -> Fit:
-    """The fit of the same presses with other noise, zeros and places, by the simulation as it is near the estimate."""
-    fit, random = found.fit, np.random.default_rng(seed)
-    p, t = len(fit.free), clean.presses
-    zeros = clean.zeros()
+def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:
+    """The fit to `values` (m,) with other noise, zeros and places, by the simulation as it is near the estimate."""
+    fit, random, signals = found.fit, np.random.default_rng(seed), found.signals
+    p, t, zeros = len(fit.free), signals.presses, signals.zeros()
     places = fit.system[:, p : p + t] @ random.normal(0, priors.place, t)
-    values = clean.values + places + zeros @ random.normal(0, priors.zero, zeros.shape[1])
-    signals = replace(clean, values=values + random.normal(0, clean.noise), noise=fit.sigma)
+    values = values + places + zeros @ random.normal(0, priors.zero, zeros.shape[1]) + random.normal(0, signals.noise)
     own = fit.predicted - zeros @ fit.nuisances[t:]
 
     def predict(points: Any) -> list[FloatArray]:
@@ -88,9 +89,24 @@ def redrawn(found: Identified, clean: Signals, seed: int, priors: Priors) -> Fit
             for point in points
         ]
 
-    again = estimate([predict], signals, [replace(each, start=fit.value(each.name)) for each in fit.parameters],
-                     priors, 0.0)  # fmt: skip
-    return replace(again, mesh_shift=fit.mesh_shift).with_sigma(again.sigma)
+    drawn = replace(signals, values=values)
+    again = estimate([predict], replace(drawn, noise=fit.sigma),
+                     [replace(each, start=fit.value(each.name)) for each in fit.parameters], priors, 0.0)  # fmt: skip
+    return replace(again, mesh_shift=fit.mesh_shift).with_sigma(again.sigma), drawn
+
+
+def recordings_of(kind: Kind, number: int, folder: Path) -> tuple[list[Path], dict[str, float]]:
+    """Recordings and truth in `folder`; made by another process, unless they are there."""
+    if not (folder / "truth.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        twin = "import sys, pathlib; from benchmarks.identify import record; record(sys.argv[1], int(sys.argv[2]), "
+        subprocess.run(
+            [sys.executable, "-c", twin + "pathlib.Path(sys.argv[3]))", kind, str(number), str(folder)], check=True
+        )
+    truth = {}
+    for key, value in json.loads((folder / "truth.json").read_text(encoding="utf-8")).items():
+        truth[f"friction_{key.rpartition('.')[2]}" if ".friction." in key else key.rpartition(".")[2]] = value
+    return find_recordings([folder / "runs"]), truth
 
 
 def main(
@@ -100,59 +116,83 @@ def main(
     seed: int = 0,
     force_noise: Annotated[float, typer.Option(help="[N]")] = 0.02,
     preset: str = "standard",
+    forces_only: Annotated[bool, typer.Option(help="As if no sensor had seen heights and flow.")] = False,
+    folder: Annotated[Path, typer.Option(help="Of the recordings; those that are there are not made again.")] = Path(
+        "runs/identify"
+    ),
 ) -> None:
-    """Prints a line for each parameter of each truth."""
+    """Prints a line of the table for each truth."""
     what: Kind = "gel" if kind == "gel" else "body"
     noise, priors = Noise(force_noise), Priors(PLACE, ZERO)
     for number in range(seed, seed + truths):
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            twin = "import sys, pathlib; from benchmarks.identify import record; record(sys.argv[1], int(sys.argv[2]), "
-            subprocess.run(
-                [sys.executable, "-c", twin + "pathlib.Path(sys.argv[3]))", kind, str(number), name], check=True
-            )
-            scene = load_scene("press" if kind == "gel" else "squeeze", [f"preset={preset}"])
-            recordings, began = Recordings(scene), time.perf_counter()
-            presses = read_all(recordings, find_recordings([folder / "runs"]))
-            random = np.random.default_rng(number)
-            noisy = [
-                replace(
-                    press,
-                    readings={
-                        key: values + random.normal(0, force_noise, len(values)) + random.normal(0, ZERO)
-                        if key.rpartition(".")[2] in ("fx", "fy", "fz") else values
-                        for key, values in press.readings.items()
-                    },
-                )
-                for press in presses
-            ]  # fmt: skip
-            found = identify(what, scene, recordings, noisy, noise, priors)
-            seconds = time.perf_counter() - began
-            truth = {}
-            for key, value in json.loads((folder / "truth.json").read_text(encoding="utf-8")).items():
-                truth[f"friction_{key.rpartition('.')[2]}" if ".friction." in key else key.rpartition(".")[2]] = value
+        paths, truth = recordings_of(what, number, folder / f"{kind}-{number}")
+        scene = load_scene("press" if kind == "gel" else "squeeze", [f"preset={preset}"])
+        recordings, began = Recordings(scene), time.perf_counter()
+        presses = [_without_heights(press) if forces_only else press for press in read_all(recordings, paths)]
+        random = np.random.default_rng(number)
+        found = identify(what, scene, recordings, [_spoilt(press, force_noise, random) for press in presses], noise,
+                         priors)  # fmt: skip
+        seconds = time.perf_counter() - began
         clean = signals_of([thinned(gathered(press), MOMENTS) for press in presses], noise)
-        _say(found, clean, truth, draws, priors, seconds)
+        typer.echo(line(found, clean.values, truth, draws, priors, f"{kind} {number}", seconds))
 
 
-def _say(
-    found: Identified, clean: Signals, truth: dict[str, float], draws: int, priors: Priors, seconds: float
-) -> None:
-    fit = found.fit
-    fits = [redrawn(found, clean, k, priors) for k in range(draws)]
-    typer.echo(f"{found.kind}: {len(found.presses)} recordings, {fit.runs} simulated, {seconds:.0f} s; "
-               f"against it: {[each.kind for each in found.findings]}")  # fmt: skip
+def _without_heights(press: Press) -> Press:
+    return replace(press, readings={key: each for key, each in press.readings.items() if _is_force(key)})
+
+
+def _spoilt(press: Press, noise: float, random: np.random.Generator) -> Press:
+    """With noise, and with zeros of the force that are off."""
+    return replace(
+        press,
+        readings={
+            key: values + random.normal(0, noise, len(values)) + random.normal(0, ZERO) if _is_force(key) else values
+            for key, values in press.readings.items()
+        },
+    )
+
+
+def _is_force(channel: str) -> bool:
+    return channel.rpartition(".")[2] in ("fx", "fy", "fz")
+
+
+def line(
+    found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str, seconds: float
+) -> str:
+    """A row of the table; clean: (m,) the signals without noise."""
+    fit, names = found.fit, tuple(press.name for press in found.presses)
+    cells = []
+    again = [redrawn(found, clean, k, priors) for k in range(draws)]
     for each in fit.told:
         low, high = fit.interval(each.name)
-        held = sum(a.interval(each.name)[0] <= truth[each.name] <= a.interval(each.name)[1] for a in fits)
-        true, value = truth[each.name], fit.value(each.name)
-        typer.echo(
-            f"  {each.name:18} truth {true:10.4g}  found {value:10.4g}  off {100 * (value / true - 1):+5.1f} %  "
-            f"95 %: {low:.4g} to {high:.4g} {'holds' if low <= true <= high else 'MISSES'}; "
-            f"{held} of {draws} draws hold"
+        ends = [fit.interval(each.name) for fit, _ in again if each.name in {one.name for one in fit.told}]
+        held = sum(low <= truth[each.name] <= high for low, high in ends)
+        cells.append(
+            f"{each.name} {100 * (fit.value(each.name) / truth[each.name] - 1):+.1f} % "
+            f"(-{100 * (1 - low / fit.value(each.name)):.0f}, +{100 * (high / fit.value(each.name) - 1):.0f}; "
+            f"{'holds' if low <= truth[each.name] <= high else 'MISSES'}, {held} of {len(ends)})"
         )
-    for each in fit.untold:
-        typer.echo(f"  {each.name:18} not told")
+    cells += [f"{each.name} not told" for each in fit.untold]
+    false = sum(bool(findings(fit, signals, names, found.by_size)) for fit, signals in again)
+    noticed = [f"nothing wrong {false} of {draws}"]
+    for what, change in _faults(found).items():
+        seen = (redrawn(found, clean + change, k, priors) for k in range(draws))
+        noticed.append(f"{what} {sum(bool(findings(*one, names, found.by_size)) for one in seen)} of {draws}")
+    against = ", ".join(each.kind for each in found.findings) or "nothing"
+    return (f"| {name} | {len(names)} | {fit.runs} | {seconds:.0f} s | {', '.join(cells)} | {against} | "
+            f"{', '.join(noticed)} |")  # fmt: skip
+
+
+def _faults(found: Identified) -> dict[str, FloatArray]:
+    """What is to be noticed, as a change of the signals (m,)."""
+    signals = found.signals
+    channel = signals.channels.index("lower.fz")
+    rows = (signals.press == 0) & (signals.channel == channel)
+    along = np.where(rows, signals.time - signals.time[rows].min(), 0.0) / np.ptp(signals.time[rows])
+    faults = {f"drift of {size} N": size * along for size in DRIFTS[found.kind]}
+    if found.by_size is not None:
+        faults |= {f"ball {factor} times as large": found.by_size * np.log(factor) for factor in (1.1, 1.25)}
+    return faults
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ gives, are told; the fit is then not to be used.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -17,54 +19,89 @@ from calibration.materials.estimate import Fit, Signals
 from tacsim.interface import FloatArray
 
 CHANCE = 1e-3  # a finding that chance alone would bring more seldom counts
+SIZE_ALLOWED = 0.05  # of an indenter: moves the stiffness by 3 to 4 %
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
     """Something that speaks against the fit."""
 
-    kind: Literal["misfit", "drift"]
+    kind: Literal["misfit", "drift", "size"]
     words: str
     chance: float  # of the like without a cause
 
 
-def findings(fit: Fit, signals: Signals, names: tuple[str, ...]) -> list[Finding]:
-    """What speaks against the fit, the drift first: it explains a misfit too. names: of the presses."""
-    drifts = _drifts(fit, signals, names)
-    return drifts or _misfits(fit, signals, names)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Suspect:
+    """A cause that a fit of materials leaves out: one more linear unknown."""
+
+    column: FloatArray  # (m,)
+    kind: Literal["drift", "size"]
+    words: Callable[[float, float], str]  # of its size and twice its standard deviation
+    allowed: float = 0.0  # as large as this it does no harm
 
 
-def _drifts(fit: Fit, signals: Signals, names: tuple[str, ...]) -> list[Finding]:
-    """Zeros that drift, each as one more unknown beside all others of the fit: a slope over the time of its press."""
+def findings(fit: Fit, signals: Signals, names: tuple[str, ...], by_size: FloatArray | None = None) -> list[Finding]:
+    """What speaks against the fit; causes first, they explain a misfit too.
+
+    names: of the presses. by_size: (m,) derivative of the signals by the logarithm of the indenter's size.
+    """
+    suspects = _drifts(signals, names)
+    if by_size is not None:
+        suspects.append(_Suspect(by_size, "size", _size_in_words, SIZE_ALLOWED))
+    return _caused(fit, signals, suspects) or _misfits(fit, signals, names)
+
+
+def size_error(fit: Fit, by_size: FloatArray) -> float:
+    """Standard deviation of the logarithm of the indenter's size, if the signals alone were to tell it."""
+    return _one_more(fit, [by_size], np.zeros(len(by_size)))[1]
+
+
+def _drifts(signals: Signals, names: tuple[str, ...]) -> list[_Suspect]:
+    """Zeros that drift: a slope over the time of each press, for each of its forces."""
     found = []
-    residual = (signals.values - fit.predicted) / fit.sigma
-    pairs = sorted({(p, c) for p, c in zip(signals.press.tolist(), signals.channel.tolist(), strict=True)})
-    pairs = [(p, c) for p, c in pairs if signals.force[c]]
-    columns = []
-    for which, force in pairs:
-        rows = (signals.press == which) & (signals.channel == force)
+    for press, force in sorted({(p, c) for p, c in zip(signals.press.tolist(), signals.channel.tolist(), strict=True)}):
+        if not signals.force[force]:
+            continue
+        rows = (signals.press == press) & (signals.channel == force)
         time = np.where(rows, signals.time, 0.0)
         middle, length = time[rows].mean(), max(float(np.ptp(time[rows])), 1e-9)
-        columns.append(np.where(rows, (time - middle) / length, 0.0))
-    seen: list[FloatArray] = []  # those found before: one that drifts pulls at all others
-    while len(seen) < len(pairs):
-        sizes = np.array([_one_more(fit, [*seen, column], residual) for column in columns])
-        worst = int(np.argmax(np.abs(sizes[:, 0]) / sizes[:, 1]))
-        press, channel = pairs[worst]
-        size, spread = (float(each) for each in sizes[worst])
-        chance = float(2 * norm.sf(abs(size) / spread)) * len(pairs)
+        words = partial(_drift_in_words, names[press], signals.channels[force])
+        found.append(_Suspect(np.where(rows, (time - middle) / length, 0.0), "drift", words))
+    return found
+
+
+def _drift_in_words(press: str, channel: str, size: float, spread: float) -> str:
+    return (
+        f"{press}: the zero of {channel} drifts by {size:+.3g} N from beginning to end (give or take {spread:.2g}); "
+        "let the sensor warm up, zero it before each press, and record again"
+    )
+
+
+def _size_in_words(size: float, spread: float) -> str:
+    return (
+        f"the dents are those of an indenter about {math.exp(size):.2f} times as large as stated (give or take "
+        f"{100 * spread:.0f} %), or of another shape; measure it, and check the pixel pitch of the sensor"
+    )
+
+
+def _caused(fit: Fit, signals: Signals, suspects: list[_Suspect]) -> list[Finding]:
+    """The suspects that the signals show, each as one more unknown beside all others of the fit."""
+    found: list[Finding] = []
+    residual = (signals.values - fit.predicted) / fit.sigma
+    seen: list[FloatArray] = []  # the columns of those found before: one that is wrong pulls at all others
+    while len(seen) < len(suspects):
+        sizes = [_one_more(fit, [*seen, each.column], residual) for each in suspects]
+        clear = [
+            max(abs(size) - each.allowed, 0.0) / spread for each, (size, spread) in zip(suspects, sizes, strict=True)
+        ]
+        worst = int(np.argmax(clear))
+        chance = float(2 * norm.sf(clear[worst])) * len(suspects)
         if chance > CHANCE:
             break
-        seen.append(columns[worst])
-        found.append(
-            Finding(
-                "drift",
-                f"{names[press]}: the zero of {signals.channels[channel]} drifts by {size:+.3g} N from beginning to "
-                f"end (give or take {2 * spread:.2g}); let the sensor warm up, zero it before each press, and record "
-                "again",
-                chance,
-            )
-        )
+        seen.append(suspects[worst].column)
+        size, spread = sizes[worst]
+        found.append(Finding(suspects[worst].kind, suspects[worst].words(size, 2 * spread), chance))
     return found
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from calibration.materials.estimate import Signals
 from tacsim.interface import FloatArray, Pose
 
-Quantity = Literal["force", "dent", "slip"]
+Quantity = Literal["force", "dent", "width", "slip"]
 QUANTITY: dict[str, Quantity] = {
-    "fx": "force", "fy": "force", "fz": "force", "dent": "dent", "slip_x": "slip", "slip_y": "slip",
+    "fx": "force", "fy": "force", "fz": "force", "dent": "dent", "width": "width", "slip_x": "slip", "slip_y": "slip",
 }  # fmt: skip
 STILL = 1e-6  # parts that move less are in the same place [m]
 CORNER = np.cos(np.radians(20.0))  # of the directions of two steps: beyond, a path turns
@@ -29,6 +29,7 @@ class Press:
     readings: Mapping[str, FloatArray]  # by channel, such as "lower.fz": (n,) [N, or m], NaN where not measured
     time: FloatArray  # (n,) [s]
     repeats: NDArray[np.int64]  # (n,) how many readings each is the mean of
+    ball: float | None = None  # radius of the ball that was pressed in, where it is not the scene's indenter [m]
 
     @property
     def places(self) -> FloatArray:
@@ -53,6 +54,7 @@ class Noise:
 
     force: float = 0.02  # [N]
     dent: float = 5e-6  # of the root mean square of a height map [m]
+    width: float = 50e-6  # of the width of a dent: a pixel's pitch that is 2 % off [m]
     slip: float = 10e-6  # of the mean of a flow [m]
 
 

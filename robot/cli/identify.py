@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from robot.cli.errors import UNUSABLE, complain
-from robot.cli.options import Out, Overrides, length, quantities, quantity
+from robot.cli.options import Out, Overrides, grouped, length, quantities, quantity
 from robot.cli.output import busy, new_directory, notes, one_bar, results, say_files, show_table, warn, writing
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from tacsim.models.scene import Scene
 
 UR_NOISE, OTHER_NOISE = 1.0, 0.02  # [N]
+SIZE_TOLD = 0.1  # of an indenter, as a share: a standard deviation beyond tells nothing that a calliper does not
 OUTLOOK = (1.0, 0.1, 0.01)  # force sensors that the result is looked at with [N]
 
 identify = typer.Typer(no_args_is_help=True, help="What a gel or a body is made of, from recorded presses.")
@@ -28,34 +31,52 @@ Recorded = Annotated[
         help="Episodes (.mcap), tables (.csv: x, y, z, fx, fy, fz), or folders of them.", show_default=False
     ),
 ]
-Fitted = Annotated[
-    str | None, typer.Option("--fit", metavar="NAMES", help="Only these, with commas between.", show_default="all")
-]
-ForceNoise = Annotated[
-    Any,
+Balls = Annotated[
+    list[str] | None,
     typer.Option(
-        parser=quantity("force", 1e-6, 1e3), metavar="FORCE", help="Standard deviation of a reading of force.",
-        show_default="1 N recorded by a UR's own, else 0.02 N",
-    ),
-]  # fmt: skip
-ZeroError = Annotated[
-    Any,
-    typer.Option(
-        parser=quantity("force", 1e-6, 1e3), metavar="FORCE", help="How far the zero of the force may be off.",
-        show_default="ten times the noise",
-    ),
-]  # fmt: skip
-PlaceError = Annotated[Any, length("How far the place of the contact may be off along the press.", 1e-9, 1e-2)]
-Preset = Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution of the finest mesh.")]
-Moments = Annotated[int, typer.Option(min=4, max=1000, help="Of a press, that are simulated.")]
-Motions = Annotated[
-    Path | None,
-    typer.Option(
-        help="Only write motions that tell all, for `tacsim run RIG --policy FILE.csv`, into this new folder."
+        "--ball", metavar="NAME=RADIUS", show_default="the scene's", help="The ball of one recording; may be repeated."
     ),
 ]
+FORCE = quantity("force", 1e-6, 1e3)
 
 
+@dataclass(frozen=True)
+class Fitting:
+    """The options that both commands have."""
+
+    fit: Annotated[str | None, typer.Option(metavar="NAMES", help="Only these, with commas between.")] = None
+    force_noise: Annotated[
+        Any,
+        typer.Option(
+            parser=FORCE, metavar="FORCE", help="Standard deviation of a reading of force.",
+            show_default="1 N recorded by a UR's own, else 0.02 N",
+        ),
+    ] = None  # fmt: skip
+    zero_error: Annotated[
+        Any,
+        typer.Option(
+            parser=FORCE, metavar="FORCE", help="How far the zero of the force may be off.",
+            show_default="ten times the noise",
+        ),
+    ] = None  # fmt: skip
+    place_error: Annotated[Any, length("How far the place of the contact may be off along the press.", 1e-9, 1e-2)] = (
+        "0.02 mm"
+    )
+    preset: Annotated[Literal["learn", "draft", "standard"], typer.Option(help="Resolution of the finest mesh.")] = (
+        "standard"
+    )
+    moments: Annotated[int, typer.Option(min=4, max=1000, help="Of a press, that are simulated.")] = 16
+    motions: Annotated[
+        Path | None,
+        typer.Option(
+            help="Only write motions that tell all, for `tacsim run RIG --policy FILE.csv`, into this new folder."
+        ),
+    ] = None
+    set_: Overrides = None
+    out: Out = None
+
+
+@grouped
 def gel(
     presses: Recorded = None,
     scene: Annotated[str, typer.Option(help="What was pressed: a scene with an indenter.")] = "press",
@@ -66,15 +87,9 @@ def gel(
             help="Where the centre of the indenter lies in the rig's world.", show_default="where the scene puts it",
         ),
     ] = None,
-    fit: Fitted = None,
-    force_noise: ForceNoise = None,
-    zero_error: ZeroError = None,
-    place_error: PlaceError = "0.02 mm",
-    preset: Preset = "standard",
-    moments: Moments = 16,
-    motions: Motions = None,
-    set_: Overrides = None,
-    out: Out = None,
+    ball: Balls = None,
+    *,
+    options: Fitting,
 ) -> None:  # fmt: skip
     """A gel's stiffness, Poisson's ratio and friction: material.yaml, scene.yaml, identified.json, identified.png.
 
@@ -90,25 +105,18 @@ def gel(
         from tacsim.interface import Pose
 
         where = Pose(np.array(indenter))
-    task = _Task("gel", scene, [f"preset={preset}", *(set_ or [])], fit, moments)
-    task.run(presses or [], motions, (force_noise, zero_error, place_error), out, where)
+    _Task("gel", scene, options).run(presses or [], where, _balls(ball or []))
 
 
+@grouped
 def body(
     squeezes: Recorded = None,
     scene: Annotated[str, typer.Option(help="What was squeezed: a scene with a body.")] = "squeeze",
     gel_error: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Standard deviation of the gels' stiffness, as a share of it.")
     ] = 0.0,
-    fit: Fitted = None,
-    force_noise: ForceNoise = None,
-    zero_error: ZeroError = None,
-    place_error: PlaceError = "0.02 mm",
-    preset: Preset = "standard",
-    moments: Moments = 16,
-    motions: Motions = None,
-    set_: Overrides = None,
-    out: Out = None,
+    *,
+    options: Fitting,
 ) -> None:
     """A body's stiffness, yield, hardening and friction to each gel: the same files as of a gel.
 
@@ -117,62 +125,64 @@ def body(
 
     Example: tacsim identify body runs/squeezes --set gel.material=runs/my-gel/material.yaml --out runs/my-clay
     """
-    task = _Task("body", scene, [f"preset={preset}", *(set_ or [])], fit, moments, gel_error)
-    task.run(squeezes or [], motions, (force_noise, zero_error, place_error), out, None)
+    _Task("body", scene, options, gel_error).run(squeezes or [])
+
+
+def _balls(given: list[str]) -> dict[str, float]:
+    """Radius of the ball [m] by the name of its recording."""
+    found, radius = {}, quantity("length", 1e-4, 0.1)
+    for text in given:
+        name, equals, value = text.rpartition("=")
+        if not equals or not name:
+            raise typer.BadParameter(f"'{text}' is no NAME=RADIUS, such as press-2='6 mm'", param_hint="--ball")
+        found[name] = radius(value)
+    return found
 
 
 class _Task:
     """What both commands do."""
 
-    def __init__(
-        self, kind: Kind, scene: str, overrides: list[str], fit: str | None, moments: int, gel_error: float = 0.0
-    ) -> None:
+    def __init__(self, kind: Kind, scene: str, options: Fitting, gel_error: float = 0.0) -> None:
         from tacsim.config import load_scene
 
-        self.kind, self.moments, self.gel_error = kind, moments, gel_error
-        self.wanted = [] if fit is None else [name.strip() for name in fit.split(",")]
-        self.scene: Scene = load_scene(scene, overrides)
+        self.kind, self.options, self.gel_error = kind, options, gel_error
+        self.wanted = [] if options.fit is None else [name.strip() for name in options.fit.split(",")]
+        self.scene: Scene = load_scene(scene, [f"preset={options.preset}", *(options.set_ or [])])
         needs, has = ("an indenter", self.scene.indenter) if kind == "gel" else ("a body", self.scene.body)
         if has is None:
             raise typer.BadParameter(f"scene '{self.scene.name}' has not {needs}", param_hint="--scene")
         if self.scene.physics == "seed":
             raise typer.BadParameter("physics 'seed' cannot be identified; use 'hybrid'", param_hint="--set")
 
-    def run(
-        self,
-        sources: list[Path],
-        motions: Path | None,
-        errors: tuple[float | None, float | None, float],
-        out: Path | None,
-        indenter: Pose | None,
-    ) -> None:
-        if motions is not None:
-            self._write_motions(motions)
+    def run(self, sources: list[Path], indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
+        options = self.options
+        if options.motions is not None:
+            self._write_motions(options.motions)
             return
         if not sources:
             raise typer.BadParameter(
                 "name recordings, or --motions FOLDER for what to record", param_hint="PRESSES or SQUEEZES"
             )
-        folder = new_directory(out, f"identify-{self.kind}")
+        folder = new_directory(options.out, f"identify-{self.kind}")
         with busy("loading"):
             from calibration.materials.estimate import Priors
             from calibration.materials.presses import Noise
             from robot.studies.identify.identify import identify
             from robot.studies.identify.recordings import Recordings, find_recordings, read_all
             from tacsim.physics.failure.dump import dumps_in
-        force, zero, place = errors
         with one_bar("reading") as bar:
-            recordings = Recordings(self.scene, indenter)
+            recordings = Recordings(self.scene, indenter, balls)
             presses = read_all(recordings, find_recordings(sources), bar.count)
+            force = options.force_noise
             if force is None:
                 force = UR_NOISE if recordings.from_ur else OTHER_NOISE
                 notes.print(f"force noise taken as {force:g} N; give your sensor's by --force-noise")
             noise = Noise(force=force)
+            zero = 10 * force if options.zero_error is None else options.zero_error
             with dumps_in(folder.with_name(f"{folder.name}-diverged")):
                 found = identify(
-                    self.kind, self.scene, recordings, presses, noise,
-                    Priors(place, 10 * force if zero is None else zero),
-                    wanted=self.wanted, most_moments=self.moments, gel_error=self.gel_error,
+                    self.kind, self.scene, recordings, presses, noise, Priors(options.place_error, zero),
+                    wanted=self.wanted, most_moments=options.moments, gel_error=self.gel_error,
                     on_step=bar.say, on_run=bar.count,
                 )  # fmt: skip
         self._tell(found, folder, noise)
@@ -194,6 +204,11 @@ class _Task:
             warn(
                 f"{each.name} is not told by these recordings and stays as it was; '{motion}' would tell it: "
                 f"{WORDS[motion]} (tacsim identify {self.kind} --motions FOLDER writes it)"
+            )
+        if found.size_error is not None and found.size_error > SIZE_TOLD:
+            warn(
+                f"these recordings tell of the size of the indenter {_reach(2 * found.size_error)}: a wrong one would "
+                "not be noticed; measure it, or record heights (a calibrated sensor)"
             )
         say_files(*files)
         for finding in found.findings:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
+from dataclasses import fields
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -63,6 +66,29 @@ def quantities(kind: str, count: int) -> Callable[[str], tuple[float, ...]]:
 def length(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """An option that is a length, `low` to `high` [m]."""
     return typer.Option(parser=quantity("length", low, high), metavar="LENGTH", help=help_)
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose last parameter, `options`, is a dataclass: its fields become options of the command. So commands
+    can have a list of options in common."""
+    signature = inspect.signature(command, eval_str=True)
+    kind = signature.parameters["options"].annotation
+    own = [each for name, each in signature.parameters.items() if name != "options"]
+    hints = get_type_hints(kind, include_extras=True)
+    names = [field.name for field in fields(kind)]
+    shared = [
+        inspect.Parameter(field.name, own[0].kind, default=field.default, annotation=hints[field.name])
+        for field in fields(kind)
+    ]
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        command(**{name: given[name] for name in given if name not in names},
+                options=kind(**{name: given[name] for name in names}))  # fmt: skip
+
+    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in (*own, *shared)}
+    return run
 
 
 def angle(help_: str, low: float = -math.inf, high: float = math.inf) -> Any:

@@ -9,12 +9,13 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.materials.checks import Finding, findings
-from calibration.materials.estimate import COARSE_ERROR, Fit, Priors, Signals, estimate
+from calibration.materials.checks import Finding, findings, size_error
+from calibration.materials.estimate import COARSE_ERROR, Fit, Point, Priors, Signals, estimate
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.recordings import Recordings
 from robot.studies.identify.simulation import Simulation, coarser, scene_with
+from tacsim.interface import FloatArray
 from tacsim.models.scene import Scene, lame
 
 Kind = Literal["gel", "body"]
@@ -36,6 +37,12 @@ class Identified:
     signals: Signals
     findings: tuple[Finding, ...]
     noise: Noise
+    by_size: FloatArray | None = None  # (m,) derivative of the signals by the logarithm of the indenter's size
+
+    @property
+    def size_error(self) -> float | None:
+        """Standard deviation of the indenter's size by these presses alone, as a share of it."""
+        return None if self.by_size is None else size_error(self.fit, self.by_size)
 
 
 def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
@@ -114,8 +121,12 @@ def identify(
     if gel_error > 0 and kind == "body":
         fit = _with_gel_error(fit, signals, gel_error)
     found = scene_with(start, {each.name: fit.value(each.name) for each in fit.parameters})
-    against = findings(fit, signals, tuple(press.name for press in taken))
-    return Identified(kind, found, fit, taken, signals, tuple(against), noise)
+    by_size = None
+    if kind == "gel":
+        on_step("size of the indenter")
+        by_size = levels[0].by_size(Point(fit.free, fit.nuisances[: len(taken)]))
+    against = findings(fit, signals, tuple(press.name for press in taken), by_size)
+    return Identified(kind, found, fit, taken, signals, tuple(against), noise, by_size)
 
 
 def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,7 @@ from tacsim.record.sources import read_columns
 TABLE, EPISODE = ".csv", ".mcap"
 FORCES = ("fx", "fy", "fz")
 FEWEST = 3  # moments of a press
+SHALLOWEST = 0.2e-3  # dent whose width can be told from noise and mesh [m]
 
 
 class BadRecording(CalibrationError):
@@ -37,13 +40,21 @@ class Recordings:
     Args:
         scene: what is thought to have been pressed; nothing of it but shapes is used here.
         indenter: where its centre lies in the world, for rigs that carry the sensor to it; None: as the scene puts it.
+        balls: radius of the ball that was pressed in, by the name of the recording [m]; others: the scene's indenter.
     """
 
-    def __init__(self, scene: Scene, indenter: Pose | None = None) -> None:
-        self.scene, self._indenter = scene, indenter
+    def __init__(self, scene: Scene, indenter: Pose | None = None, balls: Mapping[str, float] | None = None) -> None:
+        self.scene, self._indenter, self._balls = scene, indenter, dict(balls or {})
         self.seen: dict[str, Seen] = {}
         self.from_ur = False  # at least one was recorded by a UR's own force sensor
         self.scene_sensors = scene.sensors
+
+    def require(self, names: Iterable[str]) -> None:
+        """Raises BadRecording for a ball that belongs to none of the recordings `names`."""
+        there = list(names)
+        for name in self._balls:
+            if name not in there:
+                raise BadRecording(f"no recording '{name}' that a ball belongs to; there are {', '.join(there)}")
 
     def read(self, path: Path) -> Press:
         """Raises BadRecording, EpisodeError."""
@@ -54,7 +65,12 @@ class Recordings:
             raise BadRecording(
                 f"{path}: no forces; give a recording with an arm that feels them, or columns fx, fy, fz"
             )
-        return press
+        return replace(press, ball=self._balls.get(press.name))
+
+    def _half_height(self, path: Path) -> float:
+        """From the lowest point of the indenter to its centre [m]."""
+        assert self.scene.indenter is not None
+        return self._balls.get(_name(path), float(extent(self.scene.indenter.geometry)[2]) / 2)
 
     # ------------------------------------------------------------------ tables
 
@@ -71,7 +87,7 @@ class Recordings:
         if (np.diff(time) < 0).any():
             raise BadRecording(f"{path}: column 'time' goes back; give the moments in their order")
         if self.scene.indenter is not None:
-            up = np.array([0.0, 0.0, float(extent(self.scene.indenter.geometry)[2]) / 2])
+            up = np.array([0.0, 0.0, self._half_height(path)])
             turned = se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, self.scene.indenter.yaw]).quaternion
             poses = {"indenter": tuple(Pose(row[:3] + up, turned) for row in rows)}
         else:
@@ -80,7 +96,7 @@ class Recordings:
                 "upper": tuple(Pose(row[:3], se3.HALF_TURN_X.quaternion) for row in rows),
             }
         readings = {f"lower.{name}": rows[:, 3 + len(timed) + k] for k, name in enumerate(forces)}
-        return Press(path.stem, poses, readings, time, np.ones(len(rows), np.int64))
+        return Press(_name(path), poses, readings, time, np.ones(len(rows), np.int64))
 
     # ------------------------------------------------------------------ episodes
 
@@ -109,7 +125,6 @@ class Recordings:
                     observations.append(rig.step(Action())[0])
                 except EndOfEpisode:
                     break
-        name = path.parent.name if path.stem == "episode" else path.stem
         readings: dict[str, list[float]] = {}
         for role, sensor in roles.items():
             arm = carriers[sensor]
@@ -120,7 +135,7 @@ class Recordings:
         whole = {key: np.array(values) for key, values in readings.items() if len(values) == len(observations)}
         poses = self._poses(path, roles, carriers, observations, original)
         time = np.array([each.time for each in observations])
-        return Press(name, poses, whole, time, np.ones(len(time), np.int64))
+        return Press(_name(path), poses, whole, time, np.ones(len(time), np.int64))
 
     def _roles(self, path: Path, sensors: Sequence[str]) -> dict[str, str]:
         """The recorded sensor of each gel of the scene."""
@@ -154,7 +169,9 @@ class Recordings:
         touch = now.tactile[sensor]
         if role in self.seen:
             flow = touch.flow if self.seen[role].markers is not None else None
-            felt |= shape_signals(role, touch.height, flow, touch.valid)
+            felt |= shape_signals(role, touch.height, flow, touch.valid, self.seen[role].grid.pitch)
+            if touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < SHALLOWEST:
+                felt[f"{role}.width"] = math.nan
         return felt
 
     def _poses(
@@ -193,11 +210,16 @@ class Recordings:
                 "rig; `tacsim calibrate touch` finds it)"
             )
         assert self.scene.indenter is not None
-        height = float(extent(self.scene.indenter.geometry)[2]) / 2 + CLEARANCE
+        height = self._half_height(path) + CLEARANCE
         return Pose(
             np.array([0.0, 0.0, height]),
             se3.from_rotation_vector(np.zeros(3), [0.0, 0.0, self.scene.indenter.yaw]).quaternion,
         )
+
+
+def _name(path: Path) -> str:
+    """Of a recording: of its file, or of the folder of a run."""
+    return path.parent.name if path.name == f"episode{EPISODE}" else path.stem
 
 
 def _header(path: Path) -> list[str]:
@@ -235,8 +257,9 @@ def find_recordings(sources: Sequence[Path]) -> list[Path]:
 def read_all(
     recordings: Recordings, paths: Sequence[Path], on_file: Callable[[int, int], None] = lambda done, total: None
 ) -> tuple[Press, ...]:
-    """Every press. Raises BadRecording, EpisodeError."""
+    """Every press. Raises BadRecording, also for a ball of a recording that is not there; EpisodeError."""
     presses = []
+    recordings.require(_name(path) for path in paths)
     for index, path in enumerate(paths):
         on_file(index, len(paths))
         presses.append(recordings.read(path))

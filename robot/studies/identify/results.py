@@ -89,6 +89,7 @@ def as_json(identified: Identified) -> dict[str, Any]:
         "noise": {"force": identified.noise.force, "dent": identified.noise.dent, "slip": identified.noise.slip},
         "presses": [press.name for press in identified.presses],
         "simulated": fit.runs,
+        "size_error": identified.size_error,
         "scatter": float(np.sqrt(np.mean(((identified.signals.values - fit.predicted) / fit.sigma) ** 2))),
     }
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,18 @@ from calibration.materials.estimate import CannotSimulate, Point
 from calibration.materials.parameters import Parameter
 from calibration.materials.presses import Press
 from tacsim import pose as se3
+from tacsim.geometry.shapes import extent
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.scene import Scene
+from tacsim.models.scene import Box, Scene, Shape, Sphere
 from tacsim.models.sensor import CanonicalGrid, Markers
 from tacsim.optics.surface import surface_map
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.batch import Batch
 
-Job = tuple[tuple[float, ...], float, int]  # values of the parameters, place [m], index of the press
+Job = tuple[tuple[float, ...], float, float, int]  # values of the parameters, place [m], size, index of the press
 AT_ONCE = 16  # presses in one batch
+COUNTS = 0.25  # of the deepest point: what is as deep counts as a dent's width
+SIZE_DIFFERENCE = 0.1  # step of the logarithm of the indenter's size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +52,7 @@ class Simulation:
 
     def __call__(self, points: Sequence[Point]) -> list[FloatArray]:
         """(m,) signals at each point, in the order of `signals_of`. Raises CannotSimulate."""
-        keys = [[self._key(point, place, index) for index, place in enumerate(point.places)] for point in points]
+        keys = [[self._key(point, index) for index in range(len(self.presses))] for point in points]
         jobs = list(dict.fromkeys(key for each in keys for key in each))
         ran: dict[Job, FloatArray] = {}
         for begin in range(0, len(jobs), AT_ONCE):
@@ -68,6 +72,12 @@ class Simulation:
             result.append(np.concatenate(rows))
         return result
 
+    def by_size(self, point: Point) -> FloatArray:
+        """(m,) derivative of the signals by the logarithm of the indenter's size. Raises CannotSimulate."""
+        base, larger = self([point, replace(point, size=SIZE_DIFFERENCE)])
+        found: FloatArray = (larger - base) / SIZE_DIFFERENCE
+        return found
+
     @property
     def _scaled(self) -> bool:
         return self.scene.indenter is not None
@@ -79,18 +89,20 @@ class Simulation:
     def _values(self, point: Point) -> dict[str, float]:
         return {each.name: each.value(float(free)) for each, free in zip(self.parameters, point.free, strict=True)}
 
-    def _key(self, point: Point, place: float, index: int) -> Job:
+    def _key(self, point: Point, index: int) -> Job:
         values = self._values(point)
         if self._scaled:
             values["youngs_modulus"] = self._stiffness
-        return tuple(values[each.name] for each in self.parameters), float(place), index
+        return tuple(values[each.name] for each in self.parameters), float(point.places[index]), point.size, index
 
     def _run(self, jobs: Sequence[Job]) -> list[FloatArray]:
         """(channels, moments) of each job."""
-        names = [each.name for each in self.parameters]
-        scenes = [scene_with(self.scene, dict(zip(names, values, strict=True))) for values, _, _ in jobs]
-        batch = Batch(scenes)
-        paths = [_path(self.presses[index], place) for _, place, index in jobs]
+        scenes = [self._scene(job) for job in jobs]
+        batch = Batch([scene for scene, _ in scenes])
+        paths = [
+            _path(self.presses[index], place - raised)
+            for (_, place, _, index), (_, raised) in zip(jobs, scenes, strict=True)
+        ]
         for world, path in zip(batch.worlds, paths, strict=True):
             first = {part: poses[0] for part, poses in path.items()}
             clear = {part: world.pose(part) for part in first}
@@ -99,7 +111,7 @@ class Simulation:
                 for part, pose in first.items()
             })  # fmt: skip
         found: list[list[list[float]]] = [[] for _ in jobs]
-        lengths = [len(self.presses[index].time) for _, _, index in jobs]
+        lengths = [len(self.presses[index].time) for *_, index in jobs]
         for moment in range(max(lengths)):
             targets = [
                 {part: poses[moment] for part, poses in path.items()} if moment < length else None
@@ -107,14 +119,30 @@ class Simulation:
             ]
             for member, ended in enumerate(batch.move(targets)):
                 if isinstance(ended, SimulationDiverged):
-                    values, _, index = jobs[member]
-                    told = ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
+                    values, *_, index = jobs[member]
+                    told = ", ".join(
+                        f"{each.name} {value:.4g}" for each, value in zip(self.parameters, values, strict=True)
+                    )
                     raise CannotSimulate(
                         f"{self.presses[index].name}, moment {moment + 1}, with {told}: {ended}"
                     ) from ended
                 if targets[member] is not None:
-                    found[member].append(self._signals(batch, member, self.presses[jobs[member][2]]))
+                    found[member].append(self._signals(batch, member, self.presses[jobs[member][-1]]))
         return [np.array(rows).T for rows in found]
+
+    def _scene(self, job: Job) -> tuple[Scene, float]:
+        """The scene of a job; how far the centre of its indenter lies higher than recorded: a larger one has its lowest
+        point where that of the stated one was [m]."""
+        values, _, size, index = job
+        named = {each.name: value for each, value in zip(self.parameters, values, strict=True)}
+        scene = scene_with(self.scene, named)
+        if scene.indenter is None:
+            return scene, 0.0
+        ball = self.presses[index].ball
+        stated = scene.indenter.geometry if ball is None else Sphere(radius=ball)
+        shape = resized(stated, math.exp(size)) if size else stated
+        indenter = scene.indenter.model_copy(update={"geometry": shape})
+        return scene.model_copy(update={"indenter": indenter}), float(extent(shape)[2] - extent(stated)[2]) / 2
 
     def _signals(self, batch: Batch, member: int, press: Press) -> list[float]:
         """One number for each channel of the press, as the world is now."""
@@ -126,17 +154,29 @@ class Simulation:
             if sensor in self.seen:
                 seen = self.seen[sensor]
                 surface = surface_map(world.surface(sensor), seen.grid, seen.markers)
-                felt |= shape_signals(sensor, surface.height, surface.flow, seen.valid)
+                felt |= shape_signals(sensor, surface.height, surface.flow, seen.valid, seen.grid.pitch)
         return [felt[name] for name in press.readings]
 
 
 def shape_signals(
-    sensor: str, height: NDArray[np.float32] | None, flow: NDArray[np.float32] | None, valid: NDArray[np.bool_]
+    sensor: str,
+    height: NDArray[np.float32] | None,
+    flow: NDArray[np.float32] | None,
+    valid: NDArray[np.bool_],
+    pitch: float,
 ) -> dict[str, float]:
-    """What is fitted of a sensor's height map and flow: root mean square height, mean flow [m]."""
+    """What is fitted of a sensor's height map (points `pitch` apart) and flow, all in metres: the root mean square of
+    the height; the width of the dent, which is the radius of a circle of the area (sum h^2)^2 / sum h^4; the mean flow.
+
+    The width hardly depends on the material; it goes with the root of a ball's radius.
+    """
     found = {}
     if height is not None:
-        found[f"{sensor}.dent"] = float(np.sqrt(np.mean(height[valid].astype(np.float64) ** 2)))
+        square = height[valid].astype(np.float64) ** 2
+        found[f"{sensor}.dent"] = float(np.sqrt(np.mean(square)))
+        deep = square[square > COUNTS**2 * square.max()]
+        share = float(deep.sum() ** 2 / (deep**2).sum()) if len(deep) else 0.0
+        found[f"{sensor}.width"] = pitch * math.sqrt(share / math.pi)
     if flow is not None:
         mean = flow.reshape(-1, 2).astype(np.float64).mean(axis=0)
         found |= {f"{sensor}.slip_x": float(mean[0]), f"{sensor}.slip_y": float(mean[1])}
@@ -153,6 +193,14 @@ def _path(press: Press, place: float) -> dict[str, list[Pose]]:
     else:
         path["upper"] = [se3.along_z(pose, place) for pose in path["upper"]]
     return path
+
+
+def resized(shape: Shape, factor: float) -> Shape:
+    """The shape with all its lengths times `factor`."""
+    lengths = {name: getattr(shape, name) * factor for name in ("radius", "height", "scale") if hasattr(shape, name)}
+    if isinstance(shape, Box):
+        lengths["size"] = tuple(each * factor for each in shape.size)
+    return shape.model_copy(update=lengths)
 
 
 def scene_with(scene: Scene, values: Mapping[str, float]) -> Scene:

@@ -34,6 +34,13 @@ def test_a_table_of_heights_and_forces(tmp_path: Path) -> None:
     assert squeeze.poses["upper"][0].quaternion == pytest.approx(HALF_TURN_X.quaternion)
 
 
+def test_a_table_of_another_ball(tmp_path: Path) -> None:
+    """Its z is the height of that ball's lowest point."""
+    (tmp_path / "big.csv").write_text(TABLE)
+    press = Recordings(load_scene("press"), balls={"big": 6e-3}).read(tmp_path / "big.csv")
+    assert press.ball == 6e-3 and press.poses["indenter"][2].position == pytest.approx([1e-3, 0, 6e-3 - 0.4e-3])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -25,7 +25,7 @@ from tacsim.interface import FloatArray
 DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
 PLACE_DIFFERENCE = 0.02e-3  # the same of places [m]
 LONGEST = 0.7  # a step changes no free number by more: a factor of two
-MOST_STEPS, MOST_FINE = 10, 4
+MOST_STEPS, MOST_FINE = 10, 2
 SMALL_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 SMALL_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
 SMALL_SPREAD = 0.3  # of their standard deviations, likewise

@@ -108,8 +108,13 @@ class Comparison:
     overall: dict[str, Overall]
     notes: tuple[str, ...]
     names: tuple[str, str] = ("A", "B")  # or "simulated", "real": see :func:`sides`
-    surfaces_a: tuple[SurfaceEstimate, ...] | None = None  # surfaces of the pairs, aligned; None: not known
-    surfaces_b: tuple[SurfaceEstimate, ...] | None = None
+    surfaces_a: tuple[SurfaceEstimate | None, ...] | None = None  # surfaces of the pairs, aligned; None: not known
+    surfaces_b: tuple[SurfaceEstimate | None, ...] | None = None
+
+    def surfaces(self, k: int) -> tuple[SurfaceEstimate, SurfaceEstimate] | None:
+        """Of pair `k`, of A and B; None where either is not known."""
+        a, b = (None if side is None else side[k] for side in (self.surfaces_a, self.surfaces_b))
+        return None if a is None or b is None else (a, b)
 
     def aligned(self, image: Image) -> Image:
         """A picture of A in the pixels of B."""
@@ -152,13 +157,16 @@ def compare_frames(
     found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b, grid)
     if found_a is not None and found_b is not None and calibration_b is not None:
         moved = np.array(alignment.shift) * calibration_b.geometry.pixel_pitch / grid.pitch
-        found_a = tuple(each.moved(moved) for each in found_a)
+        found_a = tuple(None if each is None else each.moved(moved) for each in found_a)
     elif found_a is not None and found_b is not None and max(map(abs, alignment.shift)) > 0.5:
         notes.append("surfaces are compared as they were recorded, without the shift: it is known in pixels only")
     if found_a is None or found_b is None:
         said = zip(names, (said_a, said_b), strict=True)
         notes += [f"no surfaces are compared: {side}: {why}" for side, why in said if why]
         found_a = found_b = None
+    else:
+        unknown = zip(names, (said_a, said_b), strict=True)
+        notes += [f"{side}: no surface where nothing can be measured: {why}" for side, why in unknown if why]
     scorer = Scorer(a, b, alignment, grid, names)
     pairs = []
     for k, (frame_a, frame_b) in enumerate(couples):
@@ -262,12 +270,14 @@ def _floor(
     found, _ = estimate_surfaces(b, frames, calibration, grid)
     pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration, grid)
     if found is not None and pressed is not None:
-        regions = [metrics.pressed_region(each.height, CONTACT_HEIGHT) & each.valid for each in pressed]
-        floor |= _means([
+        known = [each for each in pressed if each is not None]
+        regions = [metrics.pressed_region(each.height, CONTACT_HEIGHT) & each.valid for each in known]
+        scores = [
             surface_errors(still, flat_surface(still), where, each)
-            for still in found
-            for where, each in zip(regions, pressed, strict=True)
-        ])  # fmt: skip
+            for still in found if still is not None
+            for where, each in zip(regions, known, strict=True)
+        ]  # fmt: skip
+        floor |= _means(scores) if scores else {}
     return floor, [f"noise floor from {len(frames)} more frames of {scorer.names[1]} without contact"]
 
 

@@ -6,7 +6,7 @@ that it has not seen; 1/2 is chance. **Drift**: how much worse the gradient beco
 and with a stale reference.
 
 Distances are those of a patch of fixed size round the contact, in four views: the raw picture, its difference to the
-reference, gradient, height.
+reference without drift of the light (as a policy sees it), gradient, height.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.compare import BOOTSTRAP_DRAWS, GRID, Comparison
 from calibration.compare.surfaces import estimate_surfaces
+from calibration.drift import without_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Image
 from tacsim.control.contact_signal import CONTACT_HEIGHT
@@ -111,7 +112,11 @@ def invariance(
     Raises BadFrames for fewer than MIN_PRESSES with contact in B.
     """
     touched = [
-        {k: pair.contact_b for k, pair in enumerate(comparison.pairs) if pair.contact_b is not None}
+        {
+            k: pair.contact_b
+            for k, pair in enumerate(comparison.pairs)
+            if pair.contact_b is not None and (comparison.surfaces_a is None or comparison.surfaces(k) is not None)
+        }
         for comparison, _ in folds
     ]
     count = sum(map(len, touched))
@@ -184,6 +189,18 @@ def area_under_curve(low: Float64, high: Float64, weight: Float64 | None = None)
     return np.asarray(((times @ above) * times).sum(axis=-1) / times.sum(axis=-1) ** 2)
 
 
+def auc_interval(low: Float64, high: Float64, times: Float64) -> tuple[float, float]:
+    """95 % interval of :func:`area_under_curve` by bootstrap; `times` (draws, n): how often each press is drawn.
+
+    A press drawn twice meets its own partner twice as often as the estimate lets it, which moves all draws alike: they
+    are moved back to the estimate. Of scores with known area the interval then holds it in 92 to 97 % of draws.
+    """
+    areas = area_under_curve(low, high, times)
+    areas = np.clip(areas + area_under_curve(low, high) - areas.mean(), 0.0, 1.0)
+    below, above = np.percentile(areas, (2.5, 97.5))
+    return float(below), float(above)
+
+
 def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray[np.intp]) -> Invariance:
     rng = np.random.default_rng(0)
     count = len(of_a)
@@ -194,9 +211,8 @@ def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray
     below = np.median(steps[rng.integers(0, count - 1, (BOOTSTRAP_DRAWS, count - 1))], axis=1)
     rho_low, rho_high = np.percentile(np.median(to_partner[drawn], axis=1) / np.maximum(below, 1e-30), (2.5, 97.5))
     times = np.stack([(drawn == press).sum(axis=1) for press in range(count)], axis=1).astype(np.float64)
-    auc, areas = float(area_under_curve(score_a, score_b)), area_under_curve(score_a, score_b, times)
-    areas = np.clip(areas + auc - areas.mean(), 0.0, 1.0)  # pairs of a press with itself are drawn too often
-    auc_low, auc_high = np.percentile(areas, (2.5, 97.5))
+    auc = float(area_under_curve(score_a, score_b))
+    auc_low, auc_high = auc_interval(score_a, score_b, times)
     return Invariance(
         view=name,
         signal=signal,
@@ -206,8 +222,8 @@ def _view(name: str, of_a: Float64, of_b: Float64, signal: float, order: NDArray
         rho_low=float(rho_low),
         rho_high=float(rho_high),
         auc=auc,
-        auc_low=float(auc_low),
-        auc_high=float(auc_high),
+        auc_low=auc_low,
+        auc_high=auc_high,
     )
 
 
@@ -229,18 +245,21 @@ def _patches(
     """Of each view the patches (n, d) of A and of B, and the norms (n,) of B's change."""
     found: dict[str, tuple[list[Float64], list[Float64], list[float]]] = {view: ([], [], []) for view in VIEWS}
     a0, b0 = comparison.alignment(comparison.a.reference), comparison.b.reference.astype(np.float32)
+    level = b0.mean(axis=(0, 1))
     for k, patch in touched.items():
         pair, x, y = comparison.pairs[k], patch.x, patch.y
         seen_a, seen_b = comparison.alignment(pair.a.image), pair.b.image.astype(np.float32)
         still = _cut(b0, x, y, half)
-        for view, one, other in (("raw", seen_a, seen_b), ("difference", seen_a - a0, seen_b - b0)):
+        differences = without_drift(seen_a - a0, level), without_drift(seen_b - b0, level)
+        for view, one, other in (("raw", seen_a, seen_b), ("difference", *differences)):
             cut = _cut(other, x, y, half)
             zero = still if view == "raw" else 0.0
             _add(found[view], _cut(one, x, y, half), cut, cut - zero)
-        if comparison.surfaces_a is None or comparison.surfaces_b is None:
+        surfaces = comparison.surfaces(k)
+        if surfaces is None:
             continue
         at_x, at_y, reach = _in_cells(comparison, k, calibration, grid, x, y)
-        surface_a, surface_b = comparison.surfaces_a[k], comparison.surfaces_b[k]
+        surface_a, surface_b = surfaces
         for view, one, other in (
             ("gradient", surface_a.gradient, surface_b.gradient),
             ("height", surface_a.height, surface_b.height),
@@ -266,8 +285,9 @@ def _in_cells(
     """Centre of the patch of pair k on the canonical grid, and half its side [cells]."""
     reach = PATCH_SIDE / 2 / grid.pitch
     if calibration is None:  # both surfaces were recorded
-        assert comparison.surfaces_b is not None
-        patch = metrics.patch_of(metrics.pressed_region(comparison.surfaces_b[k].height, CONTACT_HEIGHT))
+        surfaces = comparison.surfaces(k)
+        assert surfaces is not None
+        patch = metrics.patch_of(metrics.pressed_region(surfaces[1].height, CONTACT_HEIGHT))
         return (patch.x, patch.y, reach) if patch is not None else (grid.columns / 2, grid.rows / 2, reach)
     u0, v0 = calibration.geometry.principal
     scale = calibration.geometry.pixel_pitch / grid.pitch
@@ -310,5 +330,6 @@ def _angle(
                 seen.gradient, other.gradient, metrics.pressed_region(seen.height, CONTACT_HEIGHT) & other.valid
             )
             for seen, other in zip(truth, found, strict=True)
+            if seen is not None and other is not None
         ]
     return float(np.nanmean(angles))

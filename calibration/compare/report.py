@@ -181,8 +181,9 @@ def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
         (f"|{name_a} − {name_b}|, 0 to 64 grey; contact outlined",
          _outlined(_coloured(error, 64.0), pair.region)[near]),
     ]  # fmt: skip
-    if comparison.surfaces_a is not None and comparison.surfaces_b is not None:
-        height_a, height_b = comparison.surfaces_a[k].height, comparison.surfaces_b[k].height
+    surfaces = comparison.surfaces(k)
+    if surfaces is not None:
+        height_a, height_b = (surface.height for surface in surfaces)
         deepest = max(float(height_a.max()), float(height_b.max()), 1e-6)
         found += [(f"height of {side}, 0 to {deepest * 1e3:.2f} mm", _coloured(height, deepest))
                   for side, height in ((name_a, height_a), (name_b, height_b))]  # fmt: skip

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from calibration.bundle import Calibration
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
+from calibration.markers.flow import MarkersLost
 from calibration.normaliser import normaliser_for_calibration
-from calibration.reference import UnusableReference
+from calibration.reference import StaleReference, UnusableReference
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 
@@ -50,8 +51,9 @@ def estimate_surfaces(
     frames: Sequence[Frame],
     calibration: Calibration | None,
     grid: CanonicalGrid,
-) -> tuple[tuple[SurfaceEstimate, ...] | None, str]:
-    """The surfaces of some of the frames; or None, and why not.
+) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
+    """The surfaces of some of the frames; or None, and why not. None also in place of a frame in which nothing can be
+    measured, and which these are.
 
     With a calibration they are found in the pictures, also where a simulation knows them, so that both sources are
     treated alike. Raises BadFrames for a reference that cannot be used.
@@ -61,16 +63,22 @@ def estimate_surfaces(
     normaliser = normaliser_for_calibration(calibration, grid)
     try:
         normaliser.take_reference(TactileFrame(side.reference, 0.0, 0))
-        found = []
+        found: list[SurfaceEstimate | None] = []
+        lost = []
         for frame in frames:
-            seen = normaliser(TactileFrame(frame.image, 0.0, 0), 0.0)
+            try:
+                seen = normaliser(TactileFrame(frame.image, 0.0, 0), 0.0)
+            except (StaleReference, MarkersLost) as why:
+                found.append(None)
+                lost.append(f"{frame.name}: {why}")
+                continue
             assert seen.height is not None and seen.gradient is not None
             found.append(SurfaceEstimate(seen.height, seen.gradient, seen.flow, seen.valid))
     except UnusableReference as error:
         raise BadFrames(f"{side.name}: {side.reference_from}: {error}") from None
     except ValueError as error:
         raise BadFrames(f"{side.name}: {error}") from None
-    return tuple(found), ""
+    return tuple(found), "; ".join(lost)
 
 
 def flat_surface(like: SurfaceEstimate) -> SurfaceEstimate:
@@ -79,9 +87,9 @@ def flat_surface(like: SurfaceEstimate) -> SurfaceEstimate:
     return SurfaceEstimate(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
 
 
-def _recorded(frames: Sequence[Frame], grid: CanonicalGrid) -> tuple[tuple[SurfaceEstimate, ...] | None, str]:
+def _recorded(frames: Sequence[Frame], grid: CanonicalGrid) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
     shape = (grid.rows, grid.columns)
-    found = []
+    found: list[SurfaceEstimate | None] = []
     for frame in frames:
         if frame.surface is None:
             return None, "pictures alone have no height; give the sensor's calibration"

@@ -16,15 +16,16 @@ from calibration.compare.invariance import (
     VIEWS,
     Report,
     area_under_curve,
+    auc_interval,
     classifier_scores,
     distances,
     invariance,
 )
 from calibration.compare.report import as_json, figures, names, write
 from calibration.errors import BadFrames
-from calibration.frame_set import FrameSet
+from calibration.frame_set import Frame, FrameSet
 from tests.calibration.presses import HiddenSensor
-from tests.calibration.sources import calibrated, side
+from tests.calibration.sources import calibrated, changed, side
 
 RNG = np.random.default_rng(0)
 
@@ -161,3 +162,48 @@ def test_the_report_is_in_all_files(good: Comparison, report: Report, tmp_path: 
     page = write(tmp_path, good, report)[2].read_text(encoding="utf-8")
     assert "gain −30 %" in page and f"{report.views[2].rho:.2f}" in page
     assert page.count("data:image/jpeg;base64,") == 8 * len(good.pairs)  # heights too
+
+
+def test_drift_of_the_light_does_not_give_the_source_away(real: FrameSet, calibration: Calibration) -> None:
+    """A policy sees differences without drift; the classifier must too."""
+    v, u = np.mgrid[-1:1:200j, -1:1:260j]
+    drift = (5.0 + 4.0 * u - 3.0 * v)[..., None] * np.array([1.0, 0.5, -0.5])
+
+    def drifted(image: np.ndarray) -> np.ndarray:
+        return np.clip(np.rint(image + drift), 0, 255).astype(np.uint8)
+
+    sensor = HiddenSensor(3)
+    sensor.empty()
+    good = replace(side(sensor, 6, name="good"), reference=real.reference, untouched=())
+    plain, changed_light = (
+        {view.view: view for view in invariance([(compare_frames(good, each), None)]).views}["difference"]
+        for each in (real, changed(real, drifted))
+    )
+    assert changed_light.distance < 1.2 * plain.distance
+    assert changed_light.auc < 0.85
+
+
+def test_the_interval_holds_the_true_area() -> None:
+    """Partners that are alike, sources half a deviation apart: the area is 0.638 (normal distributions)."""
+    held = 0
+    for rng in map(np.random.default_rng, range(100)):
+        common = rng.normal(0, 0.7, 15)
+        low, high = common + rng.normal(0, 0.714, 15), 0.5 + common + rng.normal(0, 0.714, 15)
+        drawn = rng.integers(0, 15, (500, 15))
+        times = np.stack([(drawn == press).sum(axis=1) for press in range(15)], axis=1).astype(np.float64)
+        below, above = auc_interval(low, high, times)
+        assert below <= area_under_curve(low, high) <= above
+        held += below <= 0.638 <= above
+    assert 88 <= held <= 100
+
+
+def test_a_frame_in_which_nothing_can_be_measured_does_not_end_the_others(
+    good: Comparison, real: FrameSet, calibration: Calibration
+) -> None:
+    dark = Frame(real.frames[1].name, (0.45 * real.frames[1].image).astype(np.uint8))
+    spoilt = replace(real, frames=(real.frames[0], dark, *real.frames[2:]))
+    result = compare_frames(good.a, spoilt, calibration, calibration)
+    assert result.surfaces(1) is None and result.surfaces(0) is not None
+    assert math.isnan(result.pairs[1].numbers.get("gradient_angle", math.nan))
+    assert result.overall["gradient_angle"].mean < 4
+    assert any("press_1.png" in note and "lamp out" in note for note in result.notes)

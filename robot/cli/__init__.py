@@ -15,6 +15,8 @@ from robot.cli.calibrate.sensor import calibrate
 from robot.cli.compare import compare
 from robot.cli.debug import debug
 from robot.cli.doctor import doctor, schema
+from robot.cli.episode.collect import collect, episodes
+from robot.cli.episode.collect import press as press_set
 from robot.cli.episode.lerobot import lerobot
 from robot.cli.episode.recover import recover
 from robot.cli.episode.view import view
@@ -40,6 +42,7 @@ app = typer.Typer(
     "· [bold]--debug[/], anywhere on the line, shows tracebacks.",
 )
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(collect, name="collect")
 app.add_typer(export, name="export")
 app.add_typer(identify, name="identify")
 COMMANDS = {
@@ -62,6 +65,7 @@ COMMANDS = {
         transfer,
     ),
     calibrate: (latency, lens, touch, hand_eye),
+    collect: (press_set, episodes),
     export: (policy, lerobot),
     identify: (gel, body),
 }

@@ -43,6 +43,7 @@ class Guarded(TyperGroup):
 def explain(error: Exception) -> tuple[str, int]:
     """What to tell a person about `error`, and the exit code."""
     from calibration.errors import CalibrationError
+    from robot.collect.job import SetError
     from robot.deploy.policy import PolicyNotFound
     from robot.open import CannotOpen, CodeNotFound
     from robot.train.run_folder import RunError
@@ -61,6 +62,7 @@ def explain(error: Exception) -> tuple[str, int]:
         CalibrationError,
         DumpError,
         RunError,
+        SetError,
     )
     if isinstance(error, unusable):
         return str(error), UNUSABLE

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.export.lerobot_files import Column, DataSet, write_json
+from robot.export.arrow import Column
+from robot.export.lerobot_files import DataSet, write_json
 from robot.export.lerobot_mapping import (
     IMAGE,
     Feature,

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from robot.export.arrow import Column, arrow_table
 from robot.export.lerobot_mapping import Feature
 from robot.export.statistics import Statistics, column_statistics, merged
 
@@ -27,7 +27,6 @@ FILE_SIZE = 100  # [MB] at which a file is followed by another
 EPISODES_AT_ONCE = 100  # rows that meta/episodes gathers into one row group
 COUNTERS = {name: Feature("int64", (1,), None) for name in ("frame_index", "episode_index", "index", "task_index")}
 OWN = {"timestamp": Feature("float32", (1,), None), **COUNTERS}  # columns that every data set has
-Column = NDArray[Any] | Sequence[bytes]  # (frames, ...), or PNG pictures
 
 
 class DataSet:
@@ -77,7 +76,7 @@ class DataSet:
             name: images[name] if feature.dtype == "image" else column_statistics(np.asarray(whole[name]))
             for name, feature in self._features.items()
         }
-        chunk, file = self._data.write(_table(self._features, whole), count)
+        chunk, file = self._data.write(arrow_table(self._features, whole), count)
         self._rows.append(
             {
                 "episode_index": self._episodes,
@@ -177,48 +176,6 @@ class _Files:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-
-
-def _table(features: Mapping[str, Feature], columns: Mapping[str, Column]) -> pa.Table:
-    """With the types that Hugging Face's `datasets` expects, and what tells it of them."""
-    import pyarrow as pa
-
-    arrays = [_array(feature, columns[name]) for name, feature in features.items()]
-    told = {"info": {"features": {name: _told(feature) for name, feature in features.items()}}}
-    schema = pa.schema(
-        [pa.field(name, array.type) for name, array in zip(features, arrays, strict=True)],
-        metadata={"huggingface": json.dumps(told)},
-    )
-    return pa.Table.from_arrays(arrays, schema=schema)
-
-
-def _array(feature: Feature, column: Column) -> pa.Array:
-    import pyarrow as pa
-
-    if feature.dtype == "image":
-        data = pa.array(column, pa.binary())
-        return pa.StructArray.from_arrays([data, pa.nulls(len(data), pa.string())], ["bytes", "path"])
-    numbers = np.ascontiguousarray(column)
-    array = pa.array(numbers.ravel())
-    if feature.shape == (1,):
-        return array
-    if len(feature.shape) == 1:
-        return pa.FixedSizeListArray.from_arrays(array, feature.shape[0])
-    for side in reversed(feature.shape):  # `datasets` keeps maps as lists of lists
-        array = pa.ListArray.from_arrays(np.arange(0, len(array) + 1, side, dtype=np.int32), array)
-    return array
-
-
-def _told(feature: Feature) -> dict[str, Any]:
-    """The feature in the words of `datasets`."""
-    if feature.dtype == "image":
-        return {"_type": "Image"}
-    number = {"dtype": feature.dtype, "_type": "Value"}
-    if feature.shape == (1,):
-        return number
-    if len(feature.shape) == 1:
-        return {"feature": number, "length": feature.shape[0], "_type": "List"}
-    return {"shape": list(feature.shape), "dtype": feature.dtype, "_type": f"Array{len(feature.shape)}D"}
 
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim import pose as se3
-from tacsim.geometry.shapes import distance, extent
+from tacsim.geometry.shapes import DistanceGrid, distance, extent, farthest, sample
+from tacsim.geometry.tiles import TILE, tiled_distance
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.scene import Box, Cylinder, Gel, Scene, Shape
+from tacsim.models.scene import Box, Cylinder, Gel, GelSurface, Indenter, Mesh, Scene
 from tacsim.models.sensor import SensorModel
 from tacsim.optics.grid import image_grid
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import SurfaceSample, SurfaceTable, sample_surface
 from tacsim.physics.move import MoveStats
-from tacsim.physics.worlds.press import PressWorld
+from tacsim.physics.worlds.press import CLEARANCE, GRID_SPACING, PressWorld
 from tacsim.report.height_picture import write_height_picture
 
 QUARTER_TURN = math.pi / 2  # a twist is cut into pieces of at most this: each motion takes the shorter rotation [rad]
@@ -36,6 +37,8 @@ class PressMotion:
     depth: float = 0.5e-3  # of its lowest point below the undeformed surface [m]
     slide: tuple[float, float] = (0.0, 0.0)  # then sideways, world x, y [m]
     twist: float = 0.0  # then about the vertical axis [rad]
+    at: tuple[float, float] = (0.0, 0.0)  # where its centre comes down, world x, y [m]
+    turn: FloatArray | None = None  # (4,) how it is turned, instead of the scene's yaw: quaternion x, y, z, w
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,35 +51,47 @@ class PressResult:
     wrench: FloatArray  # (6,) what the indenter does to the sensor, sensor axes [N, N m]
     contact_radius: float  # of the circle with the area of contact [m]
     moves: tuple[MoveStats, ...]
+    surface: GelSurface
+    pose: Pose  # of the indenter in the sensor's frame: the centre of its bounding box
 
 
-def press(scene: Scene, sensor: SensorModel, motion: PressMotion) -> PressResult:
+def press(scene: Scene, sensor: SensorModel, motion: PressMotion, render: Renderer | None = None) -> PressResult:
     """Presses the scene's indenter, then slides and twists it.
+
+    render: of this sensor on this gel, for who presses often.
 
     Raises ValueError for a scene without indenter, a depth that is not within the gel, or a slide or twist beyond its
     limit; SimulationDiverged.
     """
     if scene.indenter is None:
         raise ValueError(f"scene '{scene.name}' has no indenter; press needs one, and no body")
-    _require_reachable(scene.gel, motion)
+    require_reachable(scene.gel, motion)
     world = PressWorld(scene)
-    targets = _targets(world.pose("indenter"), scene.indenter.geometry, motion)
+    start = world.pose("indenter")
+    turn = start.quaternion if motion.turn is None else motion.turn
+    below = _below(scene, turn)
+    if any(motion.at) or motion.turn is not None:
+        world.place({"indenter": Pose(np.array([*motion.at, below + CLEARANCE]), turn)})
+    targets = _targets(world.pose("indenter"), below - motion.depth, motion)
     moves = tuple(world.move({"indenter": target}) for target in targets)
     surface = world.surface("lower")
     seen = sample_surface(surface, image_grid(sensor.geometry))
     contact = _contact(world, scene, seen, sensor)
     area = float(contact.sum()) * sensor.geometry.pixel_pitch**2
     return PressResult(
-        image=Renderer(sensor, scene.gel.size[:2])(surface),
+        image=(render or Renderer(sensor, scene.gel.size[:2]))(surface),
         height=seen.height,
         contact=contact,
         wrench=world.wrench("lower"),
         contact_radius=math.sqrt(area / math.pi),
         moves=moves,
+        surface=surface,
+        pose=se3.relative(world.pose("lower"), world.pose("indenter")),
     )
 
 
-def _require_reachable(gel: Gel, motion: PressMotion) -> None:
+def require_reachable(gel: Gel, motion: PressMotion) -> None:
+    """Raises ValueError for a depth that is not within the gel, or a slide or twist beyond its limit."""
     thickness, farthest, slide = gel.size[2], MAX_SLIDE * max(gel.size[:2]), math.hypot(*motion.slide)
     if not 0 < motion.depth < thickness:
         raise ValueError(f"depth is {motion.depth:.4g} m; it must be above 0 and below the gel's {thickness:.4g} m")
@@ -87,9 +102,21 @@ def _require_reachable(gel: Gel, motion: PressMotion) -> None:
         raise ValueError(f"twist is {math.degrees(motion.twist):.4g} deg; at most {most:g} deg either way")
 
 
-def _targets(start: Pose, geometry: Shape, motion: PressMotion) -> list[Pose]:
-    """Poses of the indenter, in order. The origin of its frame is the centre of its bounding box."""
-    down = np.array([start.position[0], start.position[1], float(extent(geometry)[2]) / 2 - motion.depth])
+def _below(scene: Scene, turn: FloatArray) -> float:
+    """How far the indenter's lowest point is below its origin, the centre of its bounding box [m]."""
+    assert scene.indenter is not None
+    geometry, upright = scene.indenter.geometry, not turn[:2].any()
+    if upright:
+        return float(extent(geometry)[2]) / 2
+    down = se3.rotate(se3.inverse(Pose(np.zeros(3), turn)), [0.0, 0.0, -1.0])
+    if isinstance(geometry, Mesh):
+        return float((tiled_distance(geometry, GRID_SPACING).vertices @ down).max())
+    return float(farthest(geometry, down, scene.indenter.rounding(scene.element)) @ down)
+
+
+def _targets(start: Pose, height: float, motion: PressMotion) -> list[Pose]:
+    """Poses of the indenter, in order; height: of its origin, pressed [m]."""
+    down = np.array([start.position[0], start.position[1], height])
     targets = [Pose(down, start.quaternion)]
     if any(motion.slide):
         targets.append(Pose(down + np.append(motion.slide, 0.0), start.quaternion))
@@ -103,19 +130,37 @@ def _targets(start: Pose, geometry: Shape, motion: PressMotion) -> list[Pose]:
 def _contact(world: PressWorld, scene: Scene, seen: SurfaceSample, sensor: SensorModel) -> NDArray[np.bool_]:
     """(H, W) True where the indenter presses on the surface seen by a pixel."""
     assert scene.indenter is not None
-    geometry = scene.indenter.geometry
-    grid = image_grid(sensor.geometry)
-    gel = np.concatenate([grid.points(), -seen.height[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
-    sensor_pose, indenter = world.pose("lower"), world.pose("indenter")
-    at = se3.transform(se3.relative(indenter, sensor_pose), gel)
-    near = (np.abs(at) <= extent(geometry) / 2 + NEAR * scene.element).all(axis=1) & seen.valid.ravel()
-    gaps = np.full(len(at), np.inf)
+    grid, margin = image_grid(sensor.geometry), NEAR * scene.element
+    from_sensor = se3.relative(world.pose("indenter"), world.pose("lower"))
+    half = extent(scene.indenter.geometry) / 2 + margin
+    corners = se3.transform(se3.inverse(from_sensor), half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0))
+    rows, columns = (
+        slice(*np.searchsorted(places, (corners[:, axis].min(), corners[:, axis].max())))
+        for places, axis in ((grid.y, 1), (grid.x, 0))
+    )
+    gel = np.concatenate([grid.points()[rows, columns], -seen.height[rows, columns, None].astype(np.float64)], axis=-1)
+    valid = seen.valid[rows, columns]
+    at = se3.transform(from_sensor, gel.reshape(-1, 3))
+    near = (np.abs(at) <= half).all(axis=1) & valid.ravel()
+    gaps = np.full(seen.valid.shape, np.inf)
     if near.any():
-        gaps[near] = distance(geometry, at[near], scene.indenter.rounding(scene.element))
+        inner = np.full(len(at), np.inf)
+        inner[near] = _gaps(scene.indenter, at[near], scene.element)
+        gaps[rows, columns] = inner.reshape(valid.shape)
     table = SurfaceTable(world.surface("lower"))
     reach, _ = table.seen(table.of_nodes(world.reach().astype(np.float32)), grid)
-    pressed: NDArray[np.bool_] = gaps.reshape(seen.valid.shape) < reach.reshape(seen.valid.shape)
-    return _filled(pressed, int(scene.element / sensor.geometry.pixel_pitch))
+    return _filled(gaps < reach.reshape(gaps.shape), int(scene.element / sensor.geometry.pixel_pitch))
+
+
+def _gaps(indenter: Indenter, points: FloatArray, element: float) -> FloatArray:
+    """(n,) distance of points (n, 3) from the indenter, in its frame; of a mesh, as physics has it [m]."""
+    geometry = indenter.geometry
+    if not isinstance(geometry, Mesh):
+        return distance(geometry, points, indenter.rounding(element))
+    tiles = tiled_distance(geometry, GRID_SPACING)
+    first, end = tiles.around(points.min(axis=0), points.max(axis=0) + GRID_SPACING)
+    origin = tiles.origin + TILE * GRID_SPACING * first
+    return sample(DistanceGrid(tiles.values(first, end), origin, GRID_SPACING), points)[0]
 
 
 def _filled(mask: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:

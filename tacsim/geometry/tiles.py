@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.geometry.mesh import FloatArray, fingerprint, make_surface, signed_distance_on_grid
-from tacsim.geometry.shapes import BAND, MAX_NODES, REMEMBERED, centred
+from tacsim.geometry.shapes import BAND, MAX_NODES, centred
 from tacsim.models.scene import Mesh
 
 Index = NDArray[np.int64]
 
 TILE = 32  # nodes along an edge
+SURFACES = 64  # meshes remembered in one process, the latest used; most have 1 to 4 MB
 KEPT = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
 PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
 PIECES = (4_000, 100_000)  # at least, about at most
@@ -82,4 +83,4 @@ def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:
     return _remembered(geometry, fingerprint(geometry.path), spacing)
 
 
-_remembered = lru_cache(maxsize=REMEMBERED)(TiledDistance)
+_remembered = lru_cache(maxsize=SURFACES)(TiledDistance)

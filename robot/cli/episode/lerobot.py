@@ -11,7 +11,9 @@ from robot.cli.output import busy, counted, new_directory, notes, say_files
 
 
 def lerobot(
-    episodes: Annotated[list[Path], typer.Argument(help="Recordings (episode.mcap), in the order they shall have.")],
+    episodes: Annotated[
+        list[Path], typer.Argument(help="Recordings (episode.mcap), in their order, or folders of them.")
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder of the data set.")],
     task: Annotated[
         str | None,
@@ -33,6 +35,17 @@ def lerobot(
         from robot.export.lerobot import export_lerobot
 
     with counted("exporting") as on_step:
-        export_lerobot(episodes, folder, task=task, maps=maps, cut=cut, on_step=on_step)
+        export_lerobot(_recordings(episodes), folder, task=task, maps=maps, cut=cut, on_step=on_step)
     notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")', markup=False)
     say_files(folder)
+
+
+def _recordings(given: list[Path]) -> list[Path]:
+    """The files, and those in the folders by name. Raises typer.BadParameter for a folder without any."""
+    found: list[Path] = []
+    for path in given:
+        inside = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        if not inside:
+            raise typer.BadParameter(f"{path} holds no recording (*.mcap)", param_hint="EPISODES")
+        found += inside
+    return found

@@ -1,0 +1,155 @@
+"""The card of a set, README.md: what is in it, in which units, and how it was made. `datasets` reads its head."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from robot.collect.folder import FAILURES, SetFolder
+from robot.collect.presses import PressSet
+from robot.collect.table import WORDS, features
+from tacsim.models.scene import Mesh, Shape
+from tacsim.models.text import printable
+
+QUANTITIES = {"depth": (1e3, "mm"), "normal_force": (1.0, "N"), "shear": (1e3, "mm"), "shear_force": (1.0, "N"),
+              "contact_area": (1e6, "mm²")}  # fmt: skip
+
+
+def press_card(settings: PressSet, command: str, versions: Mapping[str, str], statistics: str = "") -> str:
+    """Markdown. statistics: as `press_statistics` gives them, where the set is whole."""
+    geometry, lattice, scene = settings.sensor.geometry, settings.lattice, settings.scene
+    material = scene.gel.material
+    columns = "\n".join(f"| `{name}` | {_kind(each)} | {WORDS[name]} |" for name, each in features(settings).items())
+    objects = "\n".join(f"| `{_cell(name)}` | {_object(each)} |" for name, each in settings.objects.items())
+    (u0, v0), pitch = geometry.principal, 1e3 * geometry.pixel_pitch
+    dots = ", where the sensor's dots are printed," if settings.sensor.markers else ""
+    made_with = ", ".join(f"{name} {number}" for name, number in versions.items())
+    x, y, thickness = (1e3 * side for side in scene.gel.size)
+    pose = "anywhere in the picture, turned any way about the vertical" if settings.pose == "random" else "the middle"
+    ranges = [f"depth {_range(settings.depth, 1e3, 'mm')}", f"pose {pose}"]
+    ranges += [
+        f"{name} {_range(getattr(settings, name), scale, unit)}"
+        for name, scale, unit in (("tilt", 180 / math.pi, "°"), ("shear", 1e3, "mm"), ("twist", 180 / math.pi, "°"))
+        if any(getattr(settings, name))
+    ]
+    return f"""---
+configs:
+- config_name: default
+  data_files:
+  - split: train
+    path: data/train-*.parquet
+tags:
+- tactile
+- simulation
+---
+
+# Presses of {len(settings.objects)} objects on a gel
+
+Simulated by tacsim. Each row is one press: the sensor's picture, and the truth that the simulation knows.
+
+```python
+from datasets import load_dataset
+
+presses = load_dataset("FOLDER", split="train").with_format("numpy")
+```
+
+| column | type | what |
+|---|---|---|
+{columns}
+
+Frame: the middle of the gel's rest surface; x along image columns (right), y along image rows (down), z out of the gel
+towards the object. Pixel (u, v) is centred at x = (u - {u0:g}) p, y = (v - {v0:g}) p with p = {pitch:g} mm. `flow` is
+told at {lattice.rows} x {lattice.columns} points (rows along y) {lattice.pitch * 1e3:g} mm apart{dots} round the
+sensor's axis. `reference.png` is the picture of the untouched gel, without the camera's noise.
+
+Sensor: {_cell(settings.sensor.name)}, {geometry.width} x {geometry.height} px. {_cell(settings.sensor.source)}
+
+Gel: {x:g} x {y:g} x {thickness:g} mm, Young's modulus {material.youngs_modulus * 1e-3:g} kPa, Poisson's ratio
+{material.poisson_ratio:g}; friction {scene.indenter.friction if scene.indenter else 0:g}; elements of
+{scene.element * 1e3:g} mm (preset {scene.preset}). Edges of boxes and cylinders are rounded by
+{scene.element * 500:g} mm or a quarter of their shortest side, unless `collect.json` says otherwise.
+
+Drawn evenly by seed {settings.seed}: {"; ".join(ranges)}.
+Press i is of object i mod {len(settings.objects)}; it depends on the seed and i alone.
+
+| object | geometry |
+|---|---|
+{objects}
+
+Made by
+
+```bash
+{command}
+```
+
+with {made_with}.
+All settings are in `collect.json`. Presses that failed, with the reason, are in `{FAILURES}`; without it none did.
+{statistics}"""
+
+
+def press_statistics(folder: SetFolder, settings: PressSet) -> str:
+    """Of all rows, and by object (Markdown)."""
+    from pyarrow import parquet
+
+    names = ["object", "depth", "normal_force", "shear", "shear_force", "contact_area", "settled"]
+    columns: dict[str, list[Any]] = {name: [] for name in names}
+    for path in folder.files:
+        for name, values in parquet.read_table(path, columns=names).to_pydict().items():
+            columns[name] += values
+    of = {name: np.array(values) for name, values in columns.items()}
+    if not len(of["object"]):
+        return ""
+    for name in ("shear", "shear_force"):
+        of[name] = np.linalg.norm(of[name], axis=1)
+    shown = [name for name in QUANTITIES if name in of and (name != "shear" or any(settings.shear))]
+    head = [f"{name} [{QUANTITIES[name][1]}]" for name in shown]
+    lines = [
+        f"\n## Statistics\n\n{len(of['object'])} presses, {len(folder.failures)} failed, "
+        f"{int((~of['settled']).sum())} not settled.\n",
+        _row(["", "presses", *head]),
+        _row(["---"] * (2 + len(head))),
+    ]
+    for number, name in [(None, "all"), *enumerate(settings.objects)]:
+        mine = slice(None) if number is None else of["object"] == number
+        cells = [_spread(QUANTITIES[each][0] * of[each][mine]) for each in shown]
+        lines.append(_row([_cell(name), str(len(of["object"][mine])), *cells]))
+    return "\n".join([*lines, "\nEach: 5 %, median, 95 %.\n"])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _spread(values: Any) -> str:
+    return "–" if not len(values) else ", ".join(f"{each:.3g}" for each in np.quantile(values, [0.05, 0.5, 0.95]))
+
+
+def _kind(feature: Any) -> str:
+    if feature.dtype == "image":
+        return f"PNG, {feature.shape[1]} x {feature.shape[0]}"
+    shape = "" if feature.shape == (1,) else f" {feature.shape if len(feature.shape) > 1 else f'({feature.shape[0]},)'}"
+    return f"{'class' if feature.dtype == 'label' else feature.dtype}{shape}"
+
+
+def _object(geometry: Shape) -> str:
+    if isinstance(geometry, Mesh):
+        return f"`{_cell(geometry.path)}`, {geometry.scale:g} m per unit"
+    sizes = geometry.model_dump(mode="json")
+    return ", ".join([sizes.pop("shape"), *(f"{key} {_millimetres(value)}" for key, value in sizes.items())])
+
+
+def _millimetres(value: Any) -> str:
+    each = value if isinstance(value, list | tuple) else [value]
+    return f"{' x '.join(f'{1e3 * side:g}' for side in each)} mm"
+
+
+def _range(between: tuple[float, float], scale: float, unit: str) -> str:
+    low, high = (f"{scale * each:.4g}" for each in between)
+    return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
+
+
+def _cell(text: str) -> str:
+    return printable(text).replace("|", "\\|").replace("`", "'")

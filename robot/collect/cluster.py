@@ -1,0 +1,81 @@
+"""Pieces of a set made on a Ray cluster. Nodes make, this process alone writes."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+from robot.collect.folder import write_whole
+from robot.collect.job import Job, Piece, SetError, Worker
+from robot.collect.workers import AHEAD, CollectFailed, Stop, Stopped, piece_or_error, result_of
+from robot.deploy.control_loop import versions
+
+LOOK = 0.5  # for pieces that are done, and for a wish to stop [s]
+
+
+def on_cluster(
+    address: str, job: Job, files: Mapping[str, bytes], numbers: Sequence[int], stop: Stop
+) -> Iterator[Piece]:
+    """Makes the pieces as tasks of one CPU each, and gives them as they are done.
+
+    A task whose node dies is made again on another, by Ray; so is one whose result died with its node.
+
+    address: of a cluster ("HOST:6379", "ray://..."), "auto" for the one that this machine belongs to, "local" for one
+    of this machine alone. files: what the workers need, by place. Raises SetError, CollectFailed, Stopped.
+    """
+    if util.find_spec("ray") is None:
+        raise SetError("--ray needs ray, which is not installed: pip install 'tacsim[cluster]'")
+    import ray
+
+    try:
+        ray.init(address=address, log_to_driver=False, configure_logging=False)
+    except (ConnectionError, ValueError, RuntimeError) as failure:
+        raise SetError(f"--ray {address}: no Ray cluster answers there: {failure}") from None
+    try:
+        kit = [ray.put((job, dict(files), versions().get("tacsim", "")))]  # in a list: fetched where it is needed
+        make: Any = ray.remote(num_cpus=1, max_retries=-1)(_make)
+        waiting, running = deque(numbers), list[Any]()
+        while waiting or running:
+            if stop():
+                raise Stopped
+            most = AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            while waiting and len(running) < most:
+                running.append(make.remote(kit, waiting.popleft()))
+            done, running = ray.wait(running, timeout=LOOK)
+            for each in done:
+                yield result_of(ray.get(each))
+    except ray.exceptions.RayError as failure:
+        words = f"{type(failure).__name__}: {failure}".splitlines()
+        raise CollectFailed(
+            f"Ray: {words[0]} {words[-1] if len(words) > 1 else ''}\nIs tacsim installed on all nodes, in one version?"
+        ) from failure
+    finally:
+        ray.shutdown()
+
+
+_workers: dict[str, tuple[Any, Worker]] = {}  # of this process of a node, with the folder that each needs
+
+
+def _make(kit: Sequence[Any], number: int) -> Piece | str:
+    """A piece, in a process of a node."""
+    os.environ.setdefault("TACSIM_THREADS", "1")
+    return piece_or_error(lambda: _worker(kit[0]), number)
+
+
+def _worker(kit: Any) -> Worker:
+    if (name := kit.hex()) not in _workers:
+        import ray
+
+        job, files, version = ray.get(kit)
+        if (here := versions().get("tacsim", "")) != version:
+            raise SetError(f"a node has tacsim {here or 'unknown'}, the command was given to {version or 'unknown'}")
+        folder = tempfile.TemporaryDirectory(prefix="tacsim-collect-")
+        for place, data in files.items():
+            write_whole(Path(folder.name) / place, data)
+        _workers[name] = folder, job.worker(Path(folder.name))
+    return _workers[name][1]

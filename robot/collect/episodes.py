@@ -1,0 +1,168 @@
+"""A set of episodes on a simulated rig: the same policy, another seed and other draws each time."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from robot.collect.job import Piece, Seconds, SetError
+from robot.common.code import CodeNotFound
+from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
+from robot.deploy.policy import load_policy, require_fit
+from robot.open import CannotOpen, load_with_task, open_rig
+from tacsim.config import ConfigError, LoadedRig
+from tacsim.interface import Action, IncompatibleRig, Needs, Observation, Policy, RigSpec
+from tacsim.models.quantity import Config
+from tacsim.models.randomisation import Randomisation
+from tacsim.physics.failure.health import SimulationDiverged
+from tacsim.record.episode import EpisodeMeta, Step
+from tacsim.record.writer import Recorder
+from tacsim.tasks import GoalOutOfReach, Task, make_task
+from tacsim.tasks.action import action_from
+
+RANDOM = "random"
+STEPS = 40  # of an episode without a task
+
+
+class EpisodeSet(Config):
+    """All that episodes are a function of, besides their numbers."""
+
+    kind: Literal["episodes"] = "episodes"
+    rig: str
+    task: str | None = None
+    overrides: tuple[str, ...] = ()
+    policy: str = "scripted"
+    steps: Annotated[int, Field(ge=1)] | None = None  # None: the task's
+    seed: Annotated[int, Field(ge=0)] = 0  # of the first; each has one more than the one before
+    randomise: Randomisation | None = None
+
+    def loaded(self, index: int) -> LoadedRig:
+        """The rig of an episode, with what is drawn for it."""
+        more: list[str] = []
+        if self.randomise is not None:
+            more = self.randomise.model_copy(update={"draws": index + 1}).drawn()[index]
+        return load_with_task(self.rig, self.task, [*self.overrides, *more])
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeJob:
+    """Makes the recordings of an episode set."""
+
+    settings: EpisodeSet
+    count: int
+
+    @property
+    def pieces(self) -> int:
+        return self.count
+
+    def name(self, piece: int) -> str:
+        return f"episode-{piece:05d}.mcap"
+
+    def numbers(self, piece: int) -> range:
+        return range(piece, piece + 1)
+
+    def worker(self, folder: Path) -> EpisodeWorker:
+        return EpisodeWorker(self)
+
+    def check(self) -> None:
+        """Raises what can be known before anything is simulated: SetError, ConfigError, PolicyNotFound,
+        IncompatibleRig."""
+        loaded = self.settings.loaded(0)
+        if loaded.config.clock != "sim":
+            raise SetError(
+                f"rig '{loaded.config.name}' is not simulated, so nobody can play it many times at once; "
+                "record its episodes with tacsim run"
+            )
+        with open_rig(loaded) as rig:
+            _policy(self.settings, loaded, rig.spec, rig.name, 0)
+
+
+class EpisodeWorker:
+    """Plays one episode after the other."""
+
+    def __init__(self, job: EpisodeJob) -> None:
+        self._settings = job.settings
+
+    def piece(self, number: int) -> Piece:
+        """The recording of an episode. One that fails leaves none."""
+        seconds = Seconds()
+        began = time.perf_counter()
+        failures: dict[int, str] = {}
+        data = None
+        try:
+            data = self._played(number)
+        except (EpisodeFailed, GoalOutOfReach, SimulationDiverged, ConfigError, CodeNotFound, CannotOpen) as failure:
+            failures[number] = f"{type(failure).__name__}: {failure}"
+        seconds.add("episode", time.perf_counter() - began)
+        return Piece(number, data, failures, int(data is not None), seconds.by_part)
+
+    def _played(self, number: int) -> bytes:
+        settings, loaded = self._settings, self._settings.loaded(number)
+        seed = settings.seed + number
+        with tempfile.TemporaryDirectory(prefix="tacsim-collect-") as folder, ExitStack() as stack:
+            path = Path(folder) / "episode.mcap"
+            rig = stack.enter_context(open_rig(loaded))
+            policy, task = _policy(settings, loaded, rig.spec, rig.name, number)
+            canonical = loaded.config.canonical
+            setup = EpisodeSetup(settings.policy, seed, {"rig.yaml": loaded.text.encode()}, canonical)
+            recorders: list[Recorder] = []
+
+            def record(meta: EpisodeMeta) -> Recorder:
+                recorders.append(stack.enter_context(Recorder(path, meta, pitch=canonical.pitch)))
+                return recorders[0]
+
+            def wait(step: Step) -> None:
+                recorders[0].flush()  # a simulation may be faster than the disk, and no step shall be dropped
+
+            steps = settings.steps or (STEPS if task is None else task.config.steps)
+            episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=wait)
+            recorders[0].close()
+            if recorders[0].error is not None:
+                raise OSError(f"episode {number} could not be recorded: {recorders[0].error}")
+            if len(episode.steps) <= steps:
+                raise KeyboardInterrupt  # which a run takes for its end: that is no result
+            return path.read_bytes()
+
+
+class RandomPolicy:
+    """Each free axis of the task moves by up to its largest step, either way, anew at each step."""
+
+    needs = Needs()
+
+    def __init__(self, task: Task, seed: int) -> None:
+        self._task, self._seed = task, seed
+        self.reset()
+
+    def reset(self) -> None:
+        self._random = np.random.default_rng(self._seed)
+
+    def __call__(self, observation: Observation) -> Action:
+        vector: Any = self._random.uniform(-1.0, 1.0, len(self._task.axes))
+        poses = {name: arm.pose for name, arm in observation.arms.items()}
+        return action_from(vector, self._task.axes, self._task.config.max_step, poses)
+
+
+def _policy(
+    settings: EpisodeSet, loaded: LoadedRig, spec: RigSpec, rig: str, number: int
+) -> tuple[Policy, Task | None]:
+    """The policy of an episode, and its task. Raises SetError, PolicyNotFound, IncompatibleRig."""
+    config = loaded.config
+    task = None if config.task is None else make_task(config.task)
+    if settings.policy == RANDOM:
+        if task is None:
+            raise SetError(f"policy 'random' moves along a task's axes, and rig '{rig}' has no task: give one (--task)")
+        policy: Policy = RandomPolicy(task, settings.seed + number)
+    else:
+        policy = load_policy(settings.policy, task, spec, config.canonical)
+    try:
+        require_fit(rig, spec, policy, settings.policy, task)
+    except IncompatibleRig as unfit:
+        raise SetError(str(unfit)) from None
+    return policy, task

@@ -1,0 +1,59 @@
+"""What a set presses, by name: the shapes that come with tacsim, or the STL files of a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from robot.collect.shapes import CLOSED_FORMS, meshes
+from tacsim.geometry.mesh import load_mesh
+from tacsim.models.scene import Mesh, Shape
+from tacsim.models.text import printable
+
+SHAPES = "shapes"  # the word for those that come with tacsim
+FOLDER = "objects"  # of a set: its STL files
+
+
+def find_objects(source: str, scale: float) -> tuple[dict[str, Shape], dict[str, bytes]]:
+    """Objects by name, in the order of their names, and their STL files; a mesh's path is that in the set's folder.
+
+    source: "shapes", or a folder of STL files. scale: metres per unit of those. Raises ValueError for a folder that is
+    none, without STL files, or with broken ones: all of them are named.
+    """
+    if source == SHAPES:
+        made: dict[str, Any] = {name: mesh.export(file_type="stl") for name, mesh in meshes().items()}
+        found: dict[str, Shape] = {**CLOSED_FORMS, **{name: _mesh(name, 1e-3) for name in made}}
+        return {name: found[name] for name in sorted(found)}, {_path(name): data for name, data in made.items()}
+    folder = Path(source)
+    if not folder.is_dir():
+        raise ValueError(f"--objects {source}: is no folder; give a folder of STL files, or 'shapes'")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".stl" and path.is_file())
+    if not paths:
+        raise ValueError(f"{folder} holds no STL file (folders in it are not searched); give another, or 'shapes'")
+    problems = []
+    for path in paths:
+        try:
+            load_mesh(path, scale)
+        except (ValueError, OSError) as failure:
+            problems.append(str(failure))
+    stems = [path.stem for path in paths]
+    problems += [f"{folder}: two files are called {stem}" for stem in sorted({s for s in stems if stems.count(s) > 1})]
+    problems += [
+        f"{printable(str(path))}: the name of an object must be readable; rename the file"
+        for path in paths
+        if not path.stem.isprintable() or not path.stem.strip()
+    ]
+    if problems:
+        raise ValueError("\n".join(problems))
+    return (
+        {path.stem: _mesh(path.stem, scale) for path in paths},
+        {_path(path.stem): path.read_bytes() for path in paths},
+    )
+
+
+def _path(name: str) -> str:
+    return f"{FOLDER}/{name}.stl"
+
+
+def _mesh(name: str, scale: float) -> Mesh:
+    return Mesh(path=_path(name), scale=scale)

@@ -31,6 +31,7 @@ from tacsim.config.bundle import (
     require_unchanged,
 )
 from tacsim.models.darkness import DarknessModel
+from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import Placement
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.quantity import Config, Length, Time
@@ -90,6 +91,7 @@ class Calibration(Config):
     skirt_length: Positive | None = None
     skirt_fraction: Annotated[float, Field(gt=0)] | None = None
     view: GelView | None = None  # where the gel lies in the native picture; None: the native picture is metric
+    region: PictureRegion | None = None  # what of the camera's picture shows gel; None: all of it, or of the view
     markers: Markers | None = None  # None: no dots are printed on the gel
     noise: CameraNoise | None = None  # of the picture that the models are for; None: not measured
     tool_from_sensor: Placement | None = None  # None: not measured

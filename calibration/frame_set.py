@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
-from calibration.lens.rectification import from_corners, to_metric
+from calibration.lens.rectification import from_corners, region_mask, to_metric
 from calibration.lens.view import BadCorners, Corners, GelView
 from calibration.reference import SATURATED
 from tacsim.interface import SurfaceMap
+from tacsim.models.geometry import PictureRegion
 from tacsim.optics.grid import PixelGrid
 from tacsim.record.episode import EpisodeError
 from tacsim.record.images import read_image, reference_image
@@ -165,6 +166,22 @@ def rectified_by_view(frame_set: FrameSet, view: GelView) -> FrameSet:
     """The same as metric pictures of the gel. Raises BadFrames for pictures of another size than the view's."""
     require_view_size(frame_set.shape, view)
     return _mapped(frame_set, metric_picture(view))
+
+
+def within_region(frame_set: FrameSet, region: PictureRegion) -> FrameSet:
+    """The same where only the polygon `region` [px] counts: beyond it all pictures are even, and none differs from the
+    reference by more than the gel does in the median. Raises BadCorners."""
+    shown = region_mask(region, frame_set.shape)
+    reference = frame_set.reference
+    level = reference[shown].mean(axis=0)
+
+    def even(image: Image) -> Image:
+        drift = np.median(image[shown].astype(np.int16) - reference[shown], axis=0)
+        filled = image.copy()
+        filled[~shown] = np.rint(np.clip(level + drift, 0, 255))
+        return filled
+
+    return _mapped(frame_set, even)
 
 
 def rectified_by_corners(frame_set: FrameSet, corners: Corners, shape: tuple[int, int]) -> FrameSet:

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,15 @@ from calibration.height.colour_table import GradientModel, from_model
 from calibration.height.darkness import DarknessSlopes
 from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
-from calibration.lens.rectification import Rectification, from_corners, from_geometry, from_view, seen_box
-from calibration.lens.view import GelView
-from calibration.markers.flow import MarkerFlow, find_markers, marker_grid, require_no_markers
-from calibration.markers.lattice import NoLattice
+from calibration.lens.rectification import (
+    Rectification,
+    from_corners,
+    from_geometry,
+    from_view,
+    seen_box,
+)
+from calibration.markers.flow import MarkerFlow, NoMarkers, require_no_markers
+from calibration.markers.of_sensor import marker_flow, seen_by_dots
 from calibration.reference import (
     LOST_COLOUR,
     LOST_SLOPE,
@@ -35,9 +42,10 @@ from calibration.reference import (
 )
 from tacsim.control.contact_signal import CONTACT_DIFFERENCE, CONTACT_HEIGHT
 from tacsim.interface import SurfaceMap, TactileFrame, TactileObservation
+from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig
-from tacsim.models.sensor import CanonicalGrid, Markers, SensorGeometry, SensorModel
+from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_cells, canonical_image
 
 
@@ -61,25 +69,21 @@ class FrameNormaliser:
         *,
         drifts: bool = False,
         untouched: NDArray[np.float32] | None = None,
+        dots: Callable[[NDArray[np.uint8]], tuple[Rectification, MarkerFlow]] | None = None,
     ) -> None:
         """`rectify` gives the canonical image, or for a `find` its wider view. drifts: the light is real and may
         drift from its reference; a `find` measures that itself. untouched: what `rectify` gives of the picture without
-        contact that belongs to the calibration."""
-        shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
-        spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
-        if min(spare) < 0 or any(extra % (2 * grid.image_scale) for extra in spare) or (find is None and any(spare)):
-            raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
-        self._rectify, self._grid, self._find, self._markers = rectify, grid, find, markers
-        self._on_image: NDArray[np.bool_] = canonical_part(rectify.valid, grid)
-        self._off_image = np.nonzero(~self._on_image)
-        self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
-        self._valid.flags.writeable = False
-        self._find_drift = DriftFinder(shape) if drifts and find is None else None
+        contact that belongs to the calibration. dots: what takes the place of `rectify` and `markers` once it is given
+        the native picture (rows, columns, 3) of the first reference, whose dots say how large the gel is; it raises
+        UnusableReference where there are none."""
+        self._grid, self._find, self._dots = grid, find, dots
+        self._see_by(rectify, markers)
+        self._find_drift = DriftFinder(self._on_image.shape) if drifts and find is None else None
         self._untouched = untouched
         self._sought = False  # the last observation was found in a picture
         self.reference: Reference | None = None  # the present one; None before the first
         # Height and gradient, or flow, are found in pictures of sources that don't know their surface
-        self.finds_height, self.finds_flow = find is not None, markers is not None
+        self.finds_height, self.finds_flow = find is not None, markers is not None or dots is not None
         # Share of the pixels of the last picture whose colour lies beyond the calibrated slopes: they get the nearest
         # calibrated slope. 0 where nothing had to be found
         self.beyond_range = 0.0
@@ -87,6 +91,19 @@ class FrameNormaliser:
         # and the mean slope [degrees] that this drift looks like. None before such a picture; no slope without height
         self.drift: float | None = None
         self.drift_slope: float | None = None
+
+    def _see_by(self, rectify: Rectification, markers: MarkerFlow | None) -> None:
+        grid = self._grid
+        shape = (grid.rows * grid.image_scale, grid.columns * grid.image_scale)
+        spare = [there - wanted for there, wanted in zip(rectify.valid.shape, shape, strict=True)]
+        odd = any(extra % (2 * grid.image_scale) for extra in spare)
+        if min(spare) < 0 or odd or (self._find is None and any(spare)):
+            raise ValueError(f"rectification gives {rectify.valid.shape} px, the canonical image has {shape}")
+        self._rectify, self._markers = rectify, markers
+        self._on_image: NDArray[np.bool_] = canonical_part(rectify.valid, grid)
+        self._off_image = np.nonzero(~self._on_image)
+        self._valid: NDArray[np.bool_] = np.asarray(_cells(self._on_image, grid).all(axis=(1, 3)), dtype=np.bool_)
+        self._valid.flags.writeable = False
 
     @property
     def stale(self) -> bool:
@@ -107,6 +124,8 @@ class FrameNormaliser:
     def take_reference(self, frame: TactileFrame) -> None:
         """Makes `frame`, taken without contact, the reference I0, and its markers' places their rest. Raises
         UnusableReference (the old one then stays), or ValueError for a frame of another shape."""
+        if self._dots is not None and self._markers is None:
+            self._see_by(*self._dots(frame.image))
         rectified = self._rectify(frame.image)
         # The mean is that of the canonical image's pixels, so that what a policy sees does not depend on whether height
         # is found.
@@ -232,7 +251,9 @@ def normaliser_for_simulation(
     return FrameNormaliser(_of_model(model, gel_size, canonical_image(grid)), grid)
 
 
-def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid) -> FrameNormaliser:
+def normaliser_for_pictures(
+    model: SensorModel, gel_size: tuple[float, float], grid: CanonicalGrid, region: PictureRegion | None = None
+) -> FrameNormaliser:
     """The normaliser of a simulated sensor of which only pictures are at hand: a camera's, or recorded ones. Height and
     gradient are found by the inverse of the model's own light, flow by its markers. Raises ValueError for a light
     without inverse, a calibrated one (its inverse is in its bundle), or markers too small for the image."""
@@ -241,7 +262,7 @@ def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], g
             f"the light of model '{model.name}' is a calibrated one, whose inverse stands in its bundle: give the "
             "camera `calibration: BUNDLE` in place of `model`"
         )
-    rectify = _of_model(model, gel_size, extended_view(grid, gel_size))
+    rectify = _of_model(model, gel_size, extended_view(grid, gel_size)).within(region)
     slopes: GradientModel
     if model.darkness is not None:
         shape = rectify.valid[seen_box(rectify.valid)].shape
@@ -249,7 +270,9 @@ def normaliser_for_pictures(model: SensorModel, gel_size: tuple[float, float], g
     else:
         slopes = from_model(model)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=model.markers is not None)
-    return FrameNormaliser(rectify, grid, find, _marker_flow(model.markers, model.geometry, gel_size, model.view))
+    return FrameNormaliser(
+        rectify, grid, find, marker_flow(model.markers, model.geometry, gel_size, model.view, region)
+    )
 
 
 def _of_model(model: SensorModel, gel_size: tuple[float, float], grid: PixelGrid) -> Rectification:
@@ -269,6 +292,7 @@ def normaliser_for_calibration(
         rectify = from_geometry(geometry, calibration.gel_size, wide)
     else:
         rectify = from_view(calibration.view, wide)
+    rectify = rectify.within(calibration.region)
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
     x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
     slopes: GradientModel
@@ -278,7 +302,7 @@ def normaliser_for_calibration(
         assert calibration.inverse is not None
         slopes = PolynomialSlopes(calibration.inverse, x, y)
     find = SurfaceFinder(slopes, rectify.valid, grid, dots=calibration.markers is not None, drifts=True)
-    flow = _marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view)
+    flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)
     known = None
     if untouched is not None:  # it is metric by itself, whatever the camera's picture is
         known = from_geometry(geometry, calibration.gel_size, wide)(untouched)
@@ -297,33 +321,30 @@ def normaliser_for_recording(
     Raises calibration.lens.view.BadCorners, calibration.bundle.BadBundle, calibration.errors.BadFrames.
     """
     if config.marker_pitch is not None and untouched is not None:
-        return normaliser_for_dots(config.marker_pitch, untouched, grid)
+        return normaliser_for_dots(config.marker_pitch, untouched, grid, config.region)
     if config.calibration is not None:
         return _of_bundle(config.calibration, image_shape, grid)
     seen = from_corners(config.corners, config.size, image_shape, canonical_image(grid))
-    return FrameNormaliser(seen, grid, drifts=True)
+    return FrameNormaliser(seen.within(config.region), grid, drifts=True)
 
 
-def normaliser_for_dots(pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid) -> FrameNormaliser:
+def normaliser_for_dots(
+    pitch: float, untouched: NDArray[np.uint8], grid: CanonicalGrid, region: PictureRegion | None = None
+) -> FrameNormaliser:
     """The normaliser of a sensor of which nothing is known but the distance of its printed dots, `pitch` [m], and its
     picture without contact: flow, no height. The camera looks straight on. Raises BadFrames where no dots are seen."""
     try:
-        lattice, radius = find_markers(untouched)
-    except NoLattice as nothing:
-        raise BadFrames(f"{nothing}: marker_pitch needs the dots of the picture without contact") from None
-    scale = pitch / lattice.pitch
-    (rows, columns), (high, wide) = lattice.present.shape, untouched.shape[:2]
-    geometry, size = SensorGeometry(width=wide, height=high, pixel_pitch=scale), (wide * scale, high * scale)
-    markers = Markers(rows=rows, columns=columns, pitch=pitch, radius=radius * scale)
-    rectify = from_geometry(geometry, size, canonical_image(grid))
-    return FrameNormaliser(rectify, grid, markers=_marker_flow(markers, geometry, size), drifts=True)
+        rectify, flow = seen_by_dots(pitch, untouched, grid, region)
+    except NoMarkers as nothing:
+        raise BadFrames(str(nothing)) from None
+    return FrameNormaliser(rectify, grid, markers=flow, drifts=True)
 
 
 def normaliser_for_camera(
     config: CameraSensorConfig, gel_size: tuple[float, float], grid: CanonicalGrid
 ) -> FrameNormaliser:
-    """The normaliser of a sensor that a camera sees: by its calibration, by its model, or through the four corners of
-    the gel. Only the last finds no height. `gel_size`: x, y of a model's gel [m].
+    """The normaliser of a sensor that a camera sees: by its calibration, by its model, by the distance of its dots,
+    or through the four corners of the gel. The last two find no height. `gel_size`: x, y of a model's gel [m].
 
     Raises calibration.bundle.BadBundle, ValueError for a model without inverse,
     calibration.lens.view.BadCorners.
@@ -331,9 +352,14 @@ def normaliser_for_camera(
     if config.calibration is not None:
         return _of_bundle(config.calibration, (config.height, config.width), grid)
     if config.model is not None:
-        return normaliser_for_pictures(config.model, gel_size, grid)
+        return normaliser_for_pictures(config.model, gel_size, grid, config.region)
     shape = (config.height, config.width)
-    return FrameNormaliser(from_corners(config.corners, config.size, shape, canonical_image(grid)), grid, drifts=True)
+    if config.marker_pitch is not None:
+        dots = partial(seen_by_dots, config.marker_pitch, grid=grid, region=config.region)
+        first = from_corners(None, config.size, shape, canonical_image(grid))
+        return FrameNormaliser(first, grid, drifts=True, dots=dots)
+    seen = from_corners(config.corners, config.size, shape, canonical_image(grid))
+    return FrameNormaliser(seen.within(config.region), grid, drifts=True)
 
 
 def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> FrameNormaliser:
@@ -346,17 +372,6 @@ def _of_bundle(path: str, image_shape: tuple[int, int], grid: CanonicalGrid) -> 
             "width and height of the sensor to those of the calibration, or calibrate again at this setting"
         )
     return normaliser_for_calibration(calibration, grid, untouched)
-
-
-def _marker_flow(
-    markers: Markers | None, geometry: SensorGeometry, gel_size: tuple[float, float], seen: GelView | None = None
-) -> MarkerFlow | None:
-    """`seen`: the gel through lens and perspective; None: the picture is metric by itself."""
-    if markers is None:
-        return None
-    fine = marker_grid(markers, gel_size)
-    rectify = from_geometry(geometry, gel_size, fine) if seen is None else from_view(seen, fine)
-    return MarkerFlow(markers, rectify, fine, geometry.camera_distance)
 
 
 def _byte_image(change: NDArray[np.float32]) -> NDArray[np.uint8]:

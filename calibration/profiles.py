@@ -7,6 +7,10 @@ measured, and against one that was.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from calibration.lens.view import Corners
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +26,7 @@ class SensorProfile:
     crop: float = 0.0  # share of a native picture that does not show the gel, at each border
     light: str = "coloured lights from the side"
 
-    def corners(self, shape: tuple[int, int]) -> tuple[tuple[float, float], ...] | None:
+    def corners(self, shape: tuple[int, int]) -> Corners | None:
         """The gel's corners in a picture of so many rows and columns: top left, top right, bottom right, bottom left
         [px]; None for a picture that is no native one, which is taken to be cropped already."""
         rows, columns = shape

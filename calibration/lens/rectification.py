@@ -8,16 +8,18 @@ Where the camera sees finer than the canonical grid, each canonical pixel is the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.view import Corners, GelView, check_corners
+from calibration.lens.view import BadCorners, Corners, GelView, check_corners
+from tacsim.models.geometry import PictureRegion
 from tacsim.models.sensor import SensorGeometry
 from tacsim.optics.grid import PixelGrid, image_grid
 
+MIN_REGION = 0.02  # of a picture, that a region must enclose
 MAX_FACTOR = 16  # look-ups along each side of one canonical pixel
 
 
@@ -57,6 +59,17 @@ class Rectification:
         found[box] = seen
         return found
 
+    def within(self, region: PictureRegion | None) -> Rectification:
+        """The same where only a polygon of the native image shows gel; None: all of it does. Raises BadCorners."""
+        if region is None:
+            return self
+        shown = region_mask(region, self.image_shape)
+        column, row = np.rint(np.moveaxis(self.pixels, -1, 0)).astype(np.intp)
+        seen = shown[row.clip(0, len(shown) - 1), column.clip(0, shown.shape[1] - 1)]
+        rows, columns = self.valid.shape
+        whole = seen.reshape(rows, self.factor, columns, self.factor).all(axis=(1, 3))
+        return replace(self, valid=self.valid & whole)
+
     @cached_property
     def _box(
         self,
@@ -71,6 +84,21 @@ class Rectification:
         hidden = ~self.valid[box]
         parted = np.asarray(fraction if fraction.any() else fraction[:0], dtype=np.uint16)
         return box, np.asarray(look_ups, dtype=np.int16), parted, hidden if hidden.any() else None
+
+
+def region_mask(region: PictureRegion, image_shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """(rows, columns) pixels inside a polygon. Raises BadCorners for one that encloses hardly any."""
+    import cv2
+
+    shown = np.zeros(image_shape, dtype=np.uint8)
+    cv2.fillPoly(shown, [np.rint(np.array(region, dtype=np.float64)).astype(np.int32)], 1)
+    if np.count_nonzero(shown) < MIN_REGION * shown.size:
+        rows, columns = image_shape
+        raise BadCorners(
+            f"region {region!r} encloses {np.count_nonzero(shown)} of the picture's {columns} x {rows} px; give its "
+            "corners one after the other [px, u to the right, v down]"
+        )
+    return np.asarray(shown, dtype=np.bool_)
 
 
 def from_corners(

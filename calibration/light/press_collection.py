@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.light.circle import NoCircle
+from calibration.light.darkness import find_dark_press, tells_no_direction
 from calibration.light.dent import ContactCircle
 from calibration.light.press import find_press, untouched_mean
 
@@ -44,8 +45,11 @@ class PressCollection:
 
     def offer(self, image: Image) -> ContactCircle:
         """Takes a native picture and returns its contact; raises BadFrames with why it is refused."""
+        seen = self._rectify(image)
+        dark = tells_no_direction([(seen - np.float64(self._reference)) / self._mean])
+        find = find_dark_press if dark else find_press
         try:
-            circle = find_press("press", self._rectify(image), self._reference, self._mean, self._ball).circle
+            circle = find("press", seen, self._reference, self._mean, self._ball).circle
         except NoCircle as none:
             raise BadFrames(str(none)) from none
         height, width = self._reference.shape[:2]

@@ -13,6 +13,8 @@ from tacsim.models.quantity import Config, Length
 PixelCount = Annotated[int, Field(ge=16, le=8192)]
 Positive = Annotated[Length, Field(gt=0)]
 Pair = tuple[float, float]
+# Corners u, v [px] of the polygon of a camera's picture that shows gel, one after the other
+PictureRegion = Annotated[tuple[Pair, ...], Field(min_length=3, max_length=64)]
 
 
 class SensorGeometry(Config):

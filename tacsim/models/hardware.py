@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.limits import Region, region
+from tacsim.models.geometry import PictureRegion
 from tacsim.models.quantity import Acceleration, Angle, Config, Force, Length, Speed, Time
 from tacsim.models.sensor import SensorModel
 
@@ -182,12 +183,15 @@ class CameraSensorConfig(Config):
     # http://... (MJPEG), a device by its serial path (/dev/v4l/by-id/...), a video file, or a folder of images.
     source: Annotated[str, Field(min_length=1, max_length=4096)]
     arm: Name | None = None
-    # What the picture shows, one of three: `model` (its geometry; of a mock also what is rendered), gel `corners`, or
-    # `calibration` (path of a bundle that `tacsim calibrate sensor` wrote; only it gives a real sensor's height).
+    # What the picture shows, one of four: `model` (its geometry; of a mock also what is rendered), gel `corners`,
+    # `calibration` (path of a bundle that `tacsim calibrate sensor` wrote; only it gives a real sensor's height), or
+    # `marker_pitch` (distance of the dots printed on the gel: the first reference shows them; flow, but no height).
     model: SensorModel | None = None
     corners: tuple[Corner, Corner, Corner, Corner] | None = None  # top left, top right, bottom right, bottom left [px]
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
     calibration: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    marker_pitch: Annotated[Length, Field(gt=0)] | None = None  # [m]
+    region: PictureRegion | None = None  # what of the picture shows gel; None: all of it between the corners
     width: Annotated[int, Field(ge=16, le=8192)] = 640  # of the frames that are expected; others are refused [px]
     height: Annotated[int, Field(ge=16, le=8192)] = 480
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0  # asked of the camera; of a folder: how fast it is played
@@ -202,8 +206,12 @@ class CameraSensorConfig(Config):
 
     @model_validator(mode="after")
     def _one_geometry(self) -> Self:
-        if sum(each is not None for each in (self.model, self.corners, self.calibration)) > 1:
-            raise ValueError("give one of model, corners, calibration: each says where the gel lies in the picture")
+        if sum(each is not None for each in (self.model, self.corners, self.calibration, self.marker_pitch)) > 1:
+            raise ValueError(
+                "give one of model, corners, calibration, marker_pitch: each says where the gel lies in the picture"
+            )
+        if self.region is not None and self.calibration is not None:
+            raise ValueError("a calibration brings its own region: give it to `tacsim calibrate sensor --region`")
         if self.mock is not None and self.model is None and self.calibration is None:
             raise ValueError("a mock camera needs a model or a calibration: it says what is rendered")
         return self

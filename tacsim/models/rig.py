@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self, Union, get_args
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from tacsim.models.geometry import PictureRegion
 from tacsim.models.hardware import (
     ArmLimits,
     CameraSensorConfig,
@@ -63,6 +64,7 @@ class ReplaySensorConfig(Config):
     # Gel corners in the image (u, v) [px]: top left, top right, bottom right, bottom left; None: the whole image.
     corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
     size: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] = (16e-3, 16e-3)  # between them [m]
+    region: PictureRegion | None = None  # what of the picture shows gel; None: all of it between the corners
     reference: str | None = None  # picture without contact; None: the first frame
     calibration: str | None = None  # bundle of `tacsim calibrate sensor`, instead of corners: height is found by it
     # Distance of the dots printed on the gel [m], instead of corners or calibration: they are found in the reference,
@@ -73,6 +75,8 @@ class ReplaySensorConfig(Config):
     def _one_geometry(self) -> Self:
         if sum(each is not None for each in (self.corners, self.calibration, self.marker_pitch)) > 1:
             raise ValueError("give one of corners, calibration, marker_pitch: each says where the gel lies")
+        if self.region is not None and self.calibration is not None:
+            raise ValueError("a calibration brings its own region: give it to `tacsim calibrate sensor --region`")
         return self
 
 

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from robot.cli.calibrate.bundle_output import UNKNOWN, write_calibration
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
 from robot.cli.errors import UNTRUSTED
 from robot.cli.options import Out, Overrides, length, quantity
-from robot.cli.output import busy, new_directory, notes, results, say_files, show_table, warn, writing
+from robot.cli.output import busy, new_directory, notes, results, warn
 
 if TYPE_CHECKING:
     from calibration.frame_set import FrameSet
-    from calibration.lens.view import GelView
+    from calibration.lens.view import Corners, GelView
     from calibration.light.fit import LightFit
-    from calibration.light.verdict import KnownScale
     from calibration.profiles import SensorProfile
+    from tacsim.models.geometry import PictureRegion
     from tacsim.models.hardware import CameraSensorConfig
-    from tacsim.models.sensor import CameraNoise, Markers
+    from tacsim.models.sensor import Markers
 
-UNKNOWN = "unknown"  # serial number of a sensor that nobody named
 MAX_PRESSES = 200  # 5 to 8 are enough
 
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate what stands behind a rig.")
@@ -69,6 +70,13 @@ def sensor(
         Path | None,
         typer.Option(help="view.yaml of `tacsim calibrate lens`: frames are rectified by it.", show_default=False),
     ] = None,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            metavar="U,V U,V U,V ...",
+            help="Corners of the polygon of the picture that shows gel [px]; beyond it nothing counts.",
+        ),
+    ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(
@@ -101,61 +109,131 @@ def sensor(
     With --camera it leads you through it: the gel without contact, then press after press, each judged at once. The
     pictures are kept in frames/ beside the bundle, to calibrate from them again; Ctrl-C keeps what was taken.
     """
-    from calibration.profiles import PROFILES
-
     if (frames is None) == (camera is None):
         raise typer.BadParameter("give either a folder of frames, or --camera to press now")
-    if (ball_radius is None) == (ball_diameter is None):
+    asked = _asked(
+        ball_diameter, ball_radius, kind, pixel_pitch, view, region, known_depth, serial, out, markers=markers
+    )
+    if camera is not None:
+        config, name = named_camera(camera, set_ or [], asked.profile.native)
+        seen, pitch = _geometry(asked, (config.height, config.width))
+        read = _take_presses(camera, config, name, asked, presses, seen, pitch)
+    else:
+        assert frames is not None
+        read = _read(frames, reference)
+        seen, pitch = _geometry(asked, read.shape)
+    read = _straightened(read, asked.region, seen)
+    found = _markers(read, pitch) if asked.markers else None
+    fit = _fitted(read, asked.ball / pitch, None if found is None else found.radius / pitch)
+    from calibration.light.verdict import KnownScale
+
+    scale = KnownScale(pitch, asked.ball, asked.profile.gel_size, asked.profile.gel_thickness, asked.depths)
+    write_calibration(asked.folder, fit, read, serial, scale, found, asked.profile, view=seen, region=asked.region)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What the command line says of sensor and ball."""
+
+    ball: float  # its radius [m]
+    profile: SensorProfile
+    pitch: float | None  # of pixels on the gel [m]
+    view: GelView | None
+    region: PictureRegion | None
+    depths: tuple[tuple[str, float], ...]
+    markers: bool
+    serial: str
+    folder: Path
+
+
+def _asked(
+    diameter: float | None,
+    radius: float | None,
+    kind: str | None,
+    pitch: float | None,
+    view: Path | None,
+    region: str | None,
+    known_depth: list[str] | None,
+    serial: str,
+    out: Path | None,
+    *,
+    markers: bool,
+) -> _Asked:
+    """Checked, before anything slow is loaded; the folder is made."""
+    from calibration.profiles import PROFILES
+
+    if (radius is None) == (diameter is None):
         what = "give the ball's diameter (or its radius, not both): without it no slope is known"
         raise typer.BadParameter(what, param_hint="--ball-diameter")
     if kind is not None and kind not in PROFILES:
         raise typer.BadParameter(f"'{kind}'; known: {', '.join(PROFILES)}", param_hint="--kind")
     profile = PROFILES["other" if kind is None else kind]
-    if pixel_pitch is not None and view is not None:
+    if pitch is not None and view is not None:
         raise typer.BadParameter("give either --pixel-pitch or --view")
-    if pixel_pitch is None and view is None and profile.gel_size is None:
+    if pitch is None and view is None and profile.gel_size is None:
         raise typer.BadParameter("give --pixel-pitch or --view: nothing is known beforehand of this sensor's")
     if out is None and Path(serial).name != serial:
         raise typer.BadParameter(f"'{serial}' cannot be a folder's name; name one by --out", param_hint="--serial")
     from calibration.lens.view import GelView
     from tacsim.config import load
 
-    depths = tuple(_known_depth(text) for text in known_depth or ())
-    seen = None if view is None else load(GelView, view)
-    ball = ball_radius if ball_diameter is None else ball_diameter / 2
-    folder = new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration")
+    return _Asked(
+        ball=(radius or 0.0) + (diameter or 0.0) / 2,  # one of them is not there
+        profile=profile,
+        pitch=pitch,
+        view=None if view is None else load(GelView, view),
+        region=None if region is None else _region(region),
+        depths=tuple(_known_depth(text) for text in known_depth or ()),
+        markers=markers or profile.markers,
+        serial=serial,
+        folder=new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration"),
+    )
+
+
+def _region(text: str) -> PictureRegion:
+    try:
+        points = [tuple(float(number) for number in point.split(",")) for point in text.split()]
+    except ValueError:
+        points = []
+    if len(points) < 3 or any(len(point) != 2 for point in points):
+        raise typer.BadParameter(
+            f"'{text}' is no polygon of three points or more; for example \"67,68 465,113 475,383 73,437\"",
+            param_hint="--region",
+        )
+    return tuple((u, v) for u, v in points)
+
+
+def _read(frames: Path, reference: Path | None) -> FrameSet:
     with busy("loading"):
-        from calibration.frame_set import read_folder, rectified_by_view
-        from calibration.light.calibrator import NoDirection, calibrate_light
-        from calibration.light.verdict import KnownScale
-        from calibration.markers.dots import DotEraser
-    markers = markers or profile.markers
-    if camera is not None:
-        config, sensor_name = named_camera(camera, set_ or [], profile.native)
-        seen = _view_of(profile, seen, pixel_pitch, (config.height, config.width))
-        pitch = _pitch(profile, seen, pixel_pitch, config.width)
-        read = _take_presses(camera, config, sensor_name, folder, ball / pitch, presses, seen, serial, markers=markers)
-    else:
-        assert frames is not None
-        read = read_folder(frames, reference, MAX_PRESSES)
-        seen = _view_of(profile, seen, pixel_pitch, read.shape)
-        pitch = _pitch(profile, seen, pixel_pitch, read.shape[1])
-    if seen is not None:
-        read = rectified_by_view(read, seen)
+        from calibration.frame_set import read_folder
+    read = read_folder(frames, reference, MAX_PRESSES)
     if read.estimated:
         notes.print("no picture without contact: the median of all presses stands for it")
-    found = _markers(read, pitch) if markers else None
-    erase = None if found is None else DotEraser(found.radius / pitch)
+    return read
+
+
+def _straightened(read: FrameSet, region: PictureRegion | None, view: GelView | None) -> FrameSet:
+    """Native pictures as they are calibrated: even beyond the region, and metric."""
+    from calibration.frame_set import rectified_by_view, within_region
+
+    if region is not None:
+        read = within_region(read, region)
+    return read if view is None else rectified_by_view(read, view)
+
+
+def _fitted(read: FrameSet, ball: float, dot: float | None) -> LightFit:
+    """`ball`, `dot`: radii [px]. Exits with UNTRUSTED where the light tells nothing."""
+    with busy("loading"):
+        from calibration.light.calibrator import NoDirection, calibrate_light
+        from calibration.markers.dots import DotEraser
+    named = [(frame.name, frame.image) for frame in read.frames]
     try:
-        with busy(f"calibrating from {len(read.frames)} presses"):
-            named = [(frame.name, frame.image) for frame in read.frames]
-            fit = calibrate_light(read.reference, named, ball / pitch, erase)
+        with busy(f"calibrating from {len(named)} press{'es' * (len(named) > 1)}"):
+            return calibrate_light(read.reference, named, ball, None if dot is None else DotEraser(dot))
     except NoDirection as why:
         notes.print(str(why), markup=False)
         results.print("verdict: do not trust; no bundle is written")
         raise typer.Exit(UNTRUSTED) from None
-    scale = KnownScale(pitch, ball, profile.gel_size, profile.gel_thickness, depths)
-    _write(folder, fit, read, serial, scale, found, profile, view=seen)
 
 
 def _known_depth(text: str) -> tuple[str, float]:
@@ -166,46 +244,52 @@ def _known_depth(text: str) -> tuple[str, float]:
     return name, value
 
 
-def _view_of(
-    profile: SensorProfile, view: GelView | None, pitch: float | None, shape: tuple[int, int]
-) -> GelView | None:
-    """The view that was given, or the profile's crop of its sensor's native pictures of `shape` (rows, columns)."""
+def _geometry(asked: _Asked, shape: tuple[int, int]) -> tuple[GelView | None, float]:
+    """The view that was given, or that of the region, or the profile's crop of its sensor's native pictures of `shape`
+    (rows, columns); and the distance of two pixels on the gel [m]. That of the profile is said to be a first one."""
     from calibration.lens.view import view_of_corners
 
-    corners = profile.corners(shape)
-    if view is not None or pitch is not None or corners is None or profile.gel_size is None:
-        return view
-    return view_of_corners(corners, profile.gel_size, shape)
+    if asked.view is not None:
+        return asked.view, asked.view.pixel_pitch
+    corners = asked.profile.corners(shape) if asked.pitch is None else None
+    if asked.region is not None:
+        corners = _box(asked.region, shape)
+    size, columns = asked.profile.gel_size, shape[1]
+    if corners is not None:
+        wide, high = corners[2][0] - corners[0][0], corners[2][1] - corners[0][1]
+        size = (wide * asked.pitch, high * asked.pitch) if asked.pitch is not None else size
+    if asked.pitch is None:
+        assert size is not None
+        view = None if corners is None else view_of_corners(corners, size, shape)
+        found = size[0] / columns if view is None else view.pixel_pitch
+        profile = asked.profile
+        warn(f"{found * 1e3:.4g} mm a pixel, as published of a {profile.title} ({profile.source}); measure yours")
+        return view, found
+    if corners is None:
+        return None, asked.pitch
+    assert size is not None
+    view = view_of_corners(corners, size, shape)
+    return view, view.pixel_pitch
 
 
-def _pitch(profile: SensorProfile, view: GelView | None, pitch: float | None, columns: int) -> float:
-    """Distance of two pixels on the gel [m]; that of the profile is only a first one, and said to be."""
-    if pitch is not None:
-        return pitch
-    if view is not None and view.board != "four corners":
-        return view.pixel_pitch
-    if view is not None:
-        found = view.pixel_pitch
-    else:
-        assert profile.gel_size is not None
-        found = profile.gel_size[0] / columns
-    warn(f"{found * 1e3:.4g} mm a pixel, as published of a {profile.title} ({profile.source}); measure yours")
-    return found
+def _box(region: PictureRegion, shape: tuple[int, int]) -> Corners:
+    """Corners of the pixels round a polygon, in a picture of `shape` (rows, columns)."""
+    u, v = zip(*region, strict=True)
+    left, right = max(min(u), 0.0) - 0.5, min(max(u), shape[1] - 1.0) + 0.5
+    top, bottom = max(min(v), 0.0) - 0.5, min(max(v), shape[0] - 1.0) + 0.5
+    return ((left, top), (right, top), (right, bottom), (left, bottom))
 
 
 def _take_presses(
     camera: str,
     config: CameraSensorConfig,
     sensor: str,
-    folder: Path,
-    ball: float,
+    asked: _Asked,
     presses: int,
     view: GelView | None,
-    serial: str,
-    *,
-    markers: bool,
+    pitch: float,
 ) -> FrameSet:
-    """Frames taken now, native, and kept in `folder`/frames. camera: its name; ball: its radius [px].
+    """Frames taken now, native, and kept in frames/ of the folder. camera: its name.
 
     A signal ends the command; what was taken is kept then, too. Raises CannotCalibrate, BadFrames, DeviceError.
     """
@@ -216,9 +300,10 @@ def _take_presses(
 
     if view is not None:
         require_view_size((config.height, config.width), view)
-    plan = BallPressPlan(ball, presses, rectify=None if view is None else metric_picture(view), markers=markers)
-    frames = folder / "frames"
-    again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(serial)} ..."
+    rectify = None if view is None else metric_picture(view)
+    plan = BallPressPlan(asked.ball / pitch, presses, rectify=rectify, markers=asked.markers)
+    frames = asked.folder / "frames"
+    again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(asked.serial)} ..."
     with Camera(config, sensor) as source:
         confirm_free_gel()
         note = f"frames kept in {frames}; to calibrate from them again: {again}"
@@ -230,50 +315,6 @@ def _take_presses(
     taken = tuple(Frame(name, image) for name, image in session.taken)
     more = tuple(Frame(f"background_{k}.png", image) for k, image in enumerate(untouched[:-1], start=1))
     return FrameSet(camera, untouched[-1], "background.png", taken, more)
-
-
-def _write(
-    folder: Path,
-    fit: LightFit,
-    read: FrameSet,
-    serial: str,
-    scale: KnownScale,
-    found: Markers | None,
-    profile: SensorProfile,
-    *,
-    view: GelView | None,
-) -> None:
-    """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED where it must."""
-    from calibration.bundle import write_bundle
-    from calibration.light import page
-    from calibration.light.residual_picture import draw
-    from calibration.light.verdict import judge
-
-    verdict = judge(fit, scale)
-    _show(fit, scale.pixel_pitch, found)
-    noise = _noise(read)
-    bundle = fit.to_calibration(serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise)
-    warnings = (f"verdict: {verdict}", *bundle.provenance.warnings)
-    bundle = bundle.model_copy(update={"provenance": bundle.provenance.model_copy(update={"warnings": warnings})})
-    facts = [f"{profile.title}: {profile.source}; {profile.light}"]
-    if noise is not None:
-        facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
-    with writing(folder):
-        written = [write_bundle(folder, bundle, fit.reference)]
-        residuals = folder / "residuals.png" if fit.predictions else None
-        if residuals is not None:
-            draw(fit, residuals)
-            written.append(residuals)
-        written.append(folder / page.FILE)
-        page.write_page(
-            written[-1], folder.name if serial == UNKNOWN else serial, fit, scale, verdict, residuals, facts
-        )
-    for finding in verdict.findings:
-        notes.print(f"{finding.word}: {finding.what}. {finding.todo}", markup=False)
-    results.print(f"verdict: {verdict.word}")
-    say_files(*written)
-    if verdict.word == "do not trust":
-        raise typer.Exit(UNTRUSTED)
 
 
 def _markers(read: FrameSet, pitch: float) -> Markers:
@@ -291,68 +332,3 @@ def _markers(read: FrameSet, pitch: float) -> Markers:
     rows, columns = lattice.present.shape
     places = tuple(tuple((float(x), float(y)) for x, y in row) for row in lattice.positions * pitch)
     return Markers(rows=rows, columns=columns, pitch=lattice.pitch * pitch, radius=radius * pitch, places=places)
-
-
-def _noise(read: FrameSet) -> CameraNoise | None:
-    """The camera's noise, measured and printed."""
-    from calibration.light.noise import NoiseUnknown, measure_noise
-
-    try:
-        noise = measure_noise(read.untouched_images)
-    except NoiseUnknown as why:
-        notes.print(f"camera's noise not measured: {why}", markup=False)
-        return None
-    spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
-    notes.print(
-        f"camera's noise, from {len(read.untouched_images)} pictures without contact: R, G, B {spread} grey levels; "
-        f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
-    )
-    return noise
-
-
-def _look_for_dots(fit: LightFit) -> None:
-    """Warns of dots on the gel where --markers is not given."""
-    from calibration.markers.flow import require_no_markers
-    from calibration.reference import UnusableReference
-
-    try:
-        require_no_markers(fit.reference)
-    except UnusableReference:
-        warn("dots seem to be printed on the gel; give --markers, or each will pass for a dent")
-
-
-def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
-    if fit.predictions:
-        rows = (
-            (
-                press.name, f"{press.circle.radius * pitch * 1e3:.3f}", f"{press.error:.1f}",
-                f"{press.null_error:.1f}", f"{press.correlation:.3f}", f"{press.angle:.1f}",
-            )
-            for press in fit.predictions
-        )  # fmt: skip
-        columns = ("frame", "contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]")
-        show_table("Each press predicted by all the others", columns, rows, left={0})
-    if fit.darkness is not None:
-        results.print(
-            f"this light tells no direction: darkness tells depth, up to {fit.darkness.depths[-1] * pitch * 1e3:.2f} "
-            f"mm beyond {fit.darkness.share:.0%} of the mean depth round it"
-        )
-    elif fit.size is not None and fit.forward is not None:
-        results.print(
-            f"model: degree {fit.size.degree} in the normal, {fit.size.position} in the place; calibrated up to a "
-            f"slope of {fit.forward.steepest:.2f}"
-        )
-    if fit.predictions:
-        results.print(
-            f"contact radii ± {fit.radius_uncertainty:.1%}; gel {fit.thickness * pitch * 1e3:.1f} mm thick by the "
-            "slopes round the contacts"
-        )
-    for name, why in fit.left_out:
-        notes.print(f"left out: {name}: {why}", markup=False)
-    if found is None:
-        _look_for_dots(fit)
-    else:
-        notes.print(
-            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
-            f"{found.radius * 1e3:.2g} mm"
-        )

@@ -1,0 +1,133 @@
+"""What `tacsim calibrate sensor` ends in: figures on the screen, the bundle, and the page of its verdict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from robot.cli.errors import UNTRUSTED
+from robot.cli.output import notes, results, say_files, show_table, warn, writing
+
+if TYPE_CHECKING:
+    from calibration.frame_set import FrameSet
+    from calibration.lens.view import GelView
+    from calibration.light.fit import LightFit
+    from calibration.light.verdict import KnownScale
+    from calibration.profiles import SensorProfile
+    from tacsim.models.geometry import PictureRegion
+    from tacsim.models.sensor import CameraNoise, Markers
+
+UNKNOWN = "unknown"  # serial number of a sensor that nobody named
+
+
+def write_calibration(
+    folder: Path,
+    fit: LightFit,
+    read: FrameSet,
+    serial: str,
+    scale: KnownScale,
+    found: Markers | None,
+    profile: SensorProfile,
+    *,
+    view: GelView | None,
+    region: PictureRegion | None,
+) -> None:
+    """Shows the calibration, writes its bundle and the page of its verdict; exits with UNTRUSTED where it must."""
+    from calibration.bundle import write_bundle
+    from calibration.light import page
+    from calibration.light.residual_picture import draw
+    from calibration.light.verdict import judge
+
+    verdict = judge(fit, scale)
+    _show(fit, scale.pixel_pitch, found)
+    noise = _noise(read)
+    bundle = fit.to_calibration(serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise)
+    warnings = (f"verdict: {verdict}", *bundle.provenance.warnings)
+    provenance = bundle.provenance.model_copy(update={"warnings": warnings})
+    bundle = bundle.model_copy(update={"provenance": provenance, "region": region})
+    facts = [f"{profile.title}: {profile.source}; {profile.light}"]
+    if noise is not None:
+        facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
+    with writing(folder):
+        written = [write_bundle(folder, bundle, fit.reference)]
+        residuals = folder / "residuals.png" if fit.predictions else None
+        if residuals is not None:
+            draw(fit, residuals)
+            written.append(residuals)
+        written.append(folder / page.FILE)
+        page.write_page(
+            written[-1], folder.name if serial == UNKNOWN else serial, fit, scale, verdict, residuals, facts
+        )
+    for finding in verdict.findings:
+        notes.print(f"{finding.word}: {finding.what}. {finding.todo}", markup=False)
+    results.print(f"verdict: {verdict.word}")
+    say_files(*written)
+    if verdict.word == "do not trust":
+        raise typer.Exit(UNTRUSTED)
+
+
+def _noise(read: FrameSet) -> CameraNoise | None:
+    """The camera's noise, measured and printed."""
+    from calibration.light.noise import NoiseUnknown, measure_noise
+
+    try:
+        noise = measure_noise(read.untouched_images)
+    except NoiseUnknown as why:
+        notes.print(f"camera's noise not measured: {why}", markup=False)
+        return None
+    spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
+    notes.print(
+        f"camera's noise, from {len(read.untouched_images)} pictures without contact: R, G, B {spread} grey levels; "
+        f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
+    )
+    return noise
+
+
+def _look_for_dots(fit: LightFit) -> None:
+    """Warns of dots on the gel where --markers is not given."""
+    from calibration.markers.flow import require_no_markers
+    from calibration.reference import UnusableReference
+
+    try:
+        require_no_markers(fit.reference)
+    except UnusableReference:
+        warn("dots seem to be printed on the gel; give --markers, or each will pass for a dent")
+
+
+def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
+    if fit.predictions:
+        rows = (
+            (
+                press.name, f"{press.circle.radius * pitch * 1e3:.3f}", f"{press.error:.1f}",
+                f"{press.null_error:.1f}", f"{press.correlation:.3f}", f"{press.angle:.1f}",
+            )
+            for press in fit.predictions
+        )  # fmt: skip
+        columns = ("frame", "contact radius [mm]", "error", "of [grey levels]", "correlation", "normal [deg]")
+        show_table("Each press predicted by all the others", columns, rows, left={0})
+    if fit.darkness is not None:
+        results.print(
+            f"this light tells no direction: darkness tells depth, up to {fit.darkness.depths[-1] * pitch * 1e3:.2f} "
+            f"mm beyond {fit.darkness.share:.0%} of the mean depth round it"
+        )
+    elif fit.size is not None and fit.forward is not None:
+        results.print(
+            f"model: degree {fit.size.degree} in the normal, {fit.size.position} in the place; calibrated up to a "
+            f"slope of {fit.forward.steepest:.2f}"
+        )
+    if fit.predictions:
+        results.print(
+            f"contact radii ± {fit.radius_uncertainty:.1%}; gel {fit.thickness * pitch * 1e3:.1f} mm thick by the "
+            "slopes round the contacts"
+        )
+    for name, why in fit.left_out:
+        notes.print(f"left out: {name}: {why}", markup=False)
+    if found is None:
+        _look_for_dots(fit)
+    else:
+        notes.print(
+            f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
+            f"{found.radius * 1e3:.2g} mm"
+        )

@@ -41,10 +41,10 @@ from tacsim.record.images import decode_image, encode_png
 
 FORMAT = FORMATS[-1]
 NOT_YET = {
-    1: {"view", "noise", "darkness"},
-    2: {"noise", "darkness"},
-    3: {"darkness"},
-    4: {"darkness"},
+    1: {"view", "noise", "darkness", "region"},
+    2: {"noise", "darkness", "region"},
+    3: {"darkness", "region"},
+    4: {"darkness", "region"},
 }  # by format: the fields it lacks
 
 Positive = Annotated[Length, Field(gt=0)]

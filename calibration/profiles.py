@@ -7,10 +7,8 @@ measured, and against one that was.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from calibration.lens.view import Corners
+from tacsim.models.geometry import Pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +24,7 @@ class SensorProfile:
     crop: float = 0.0  # share of a native picture that does not show the gel, at each border
     light: str = "coloured lights from the side"
 
-    def corners(self, shape: tuple[int, int]) -> Corners | None:
+    def corners(self, shape: tuple[int, int]) -> tuple[Pair, Pair, Pair, Pair] | None:
         """The gel's corners in a picture of so many rows and columns: top left, top right, bottom right, bottom left
         [px]; None for a picture that is no native one, which is taken to be cropped already."""
         rows, columns = shape

@@ -182,7 +182,8 @@ def test_a_camera_with_a_calibration_finds_height(bundle: Path) -> None:
 
 # What older formats wrote, before there was a view (1) or noise (2); their checksum is of that content.
 @pytest.mark.parametrize(
-    ("old", "without"), [(1, {"view", "noise", "darkness"}), (2, {"noise", "region"}), (4, {"darkness", "region"})]
+    ("old", "without"),
+    [(1, {"view", "noise", "darkness", "region"}), (2, {"noise", "darkness", "region"}), (4, {"darkness", "region"})],
 )
 def test_a_bundle_of_an_older_format_still_loads(tmp_path: Path, old: int, without: set[str]) -> None:
     path = write_bundle(tmp_path, calibration().model_copy(update={"format": old}), PICTURE)

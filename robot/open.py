@@ -116,6 +116,26 @@ def open_rig(
     return opened
 
 
+def rig_spec(config: RigConfig) -> RigSpec:
+    """What the rig will deliver, before anything of it is opened; of a replay its recording is read.
+
+    Raises what open_rig raises for a wrong file, a calibration and a recording.
+    """
+    _check_parts(config)
+    if config.clock == "wall":
+        from robot.rig.hardware_rig import hardware_spec
+
+        return hardware_spec(config)
+    if config.clock == "sim":
+        from robot.rig.sim_rig import simulate
+
+        return simulate(config).rig.spec
+    from robot.rig.replay_rig import open_replay
+
+    with open_replay(config) as opened:
+        return opened.spec
+
+
 def make_env(
     task: str | TaskConfig = "squeeze",
     rig: str | Path = "sim",

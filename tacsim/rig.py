@@ -161,6 +161,11 @@ class Rig:
         """The second part of a step: lets the clock run one period. Raises SimulationDiverged."""
         self._clock.tick()
 
+    @property
+    def clock(self) -> Clock:
+        """What `tick` lets run; for inspection only."""
+        return self._clock
+
     def now(self) -> float:
         """The time on the rig's clock [s]."""
         return self._clock.now()

@@ -124,7 +124,7 @@ def _write(
             write_json(folder / "meta" / "tacsim.json", _about(episodes, mapping))
         elif found != features:
             raise ValueError(f"{episodes[0].path} and {each.path} do not fit together: {_difference(features, found)}")
-        data.add(columns, images, task_in_words(meta) if task is None else task)
+        data.add(columns, images, task_in_words(meta.task, meta.goal) if task is None else task)
     assert data is not None
     data.close()
 

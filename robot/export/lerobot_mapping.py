@@ -13,6 +13,10 @@
 Numbers of `observation.state` and `action` are those of `tacsim.FeatureEncoder`: SI values over the scale of their
 quantity (`tacsim.gym.features.SCALES`). A pose is (9,): position, and what the first two columns of its rotation differ
 from those of no rotation. Policies such as ACT read the state, the images and the action, and leave the rest.
+
+LeRobot's rollout hands on to a policy only numbers whose names end in `.pos` or `.vel`, and at its end drives the robot
+back by all that end in `.pos`. So the numbers of an action have names in `.pos`, in the state, too, and all others of
+the state, velocities or not, in `.vel`.
 """
 
 from __future__ import annotations
@@ -24,11 +28,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, moved
+from tacsim.gym.features import PARTS, SCALES, FeatureEncoder, moved, unmoved
 from tacsim.interface import Action, IncompatibleRig, Observation, Pose, RigSpec
+from tacsim.limits import ActionError
 from tacsim.models.features import Features, Numbers, Quantity
 from tacsim.models.sensor import CanonicalGrid
-from tacsim.record.episode import EpisodeMeta, Step
+from tacsim.record.episode import Step
 
 Row = dict[str, NDArray[Any]]
 
@@ -36,6 +41,7 @@ STATE, ACTION, REWARD, DONE = "observation.state", "action", "next.reward", "nex
 IMAGE = "observation.images."
 MAPS = {"height": "observation.height.", "gradient": "observation.gradient.", "flow": "observation.flow."}
 MAP_AXES = ("rows", "columns", "xy")
+DRIVEN, OTHER = ".pos", ".vel"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +77,14 @@ class LeRobotMapping:
     @property
     def state(self) -> Numbers:
         """What the numbers of `observation.state` are."""
-        return self._encoder.inputs["touch"]
+        found, asked = self._encoder.inputs["touch"], set(self.action.names)
+        names = (name + DRIVEN if name + DRIVEN in asked else name + OTHER for name in found.names)
+        return Numbers(names=tuple(names), scales=found.scales)
 
     @property
     def action(self) -> Numbers:
         """What the numbers of `action` are."""
-        parts = [(f"{part}_{arm}", SCALES[kind]) for arm in self._encoder.features.arms for part, kind in _POSE]
+        parts = [(f"{part}_{arm}{DRIVEN}", SCALES[kind]) for arm in self._encoder.features.arms for part, kind in _POSE]
         return Numbers(names=tuple(name for name, _ in parts), scales=tuple(scale for _, scale in parts))
 
     def begin(self, observation: Observation) -> Row:
@@ -95,8 +103,23 @@ class LeRobotMapping:
             target = action.tool.get(arm)
             if target is not None:
                 self._asked[arm] = target
-        poses = [moved(self._start[arm], pose) for arm, pose in self._asked.items()]
-        return np.concatenate(poses).astype(np.float32)
+        return self.encoded(self._asked)
+
+    def encoded(self, poses: Mapping[str, Pose]) -> NDArray[np.float32]:
+        """(9 arms,) of the pose of each arm."""
+        each = [moved(start, poses[arm]) for arm, start in self._start.items()]
+        return np.concatenate(each).astype(np.float32)
+
+    def decoded(self, numbers: NDArray[np.floating[Any]]) -> Action:
+        """The action that (9 arms,) numbers stand for. Raises ActionError for numbers that stand for none."""
+        each = np.asarray(numbers, np.float64).reshape(len(self._start), -1)
+        tool: dict[str, Pose | None] = {}
+        for (arm, start), values in zip(self._start.items(), each, strict=True):
+            try:
+                tool[arm] = unmoved(start, values)
+            except ValueError as failure:
+                raise ActionError(f"the action of arm '{arm}', {values.tolist()}, is no pose: {failure}") from None
+        return Action(tool)
 
     def features(self, row: Mapping[str, NDArray[Any]]) -> dict[str, Feature]:
         """Of the columns of `row`, one of this rig's."""
@@ -143,14 +166,14 @@ def frames_per_second(period: float) -> int | float:
     return round(rate) if abs(rate - round(rate)) <= 1e-3 * rate else rate
 
 
-def task_in_words(meta: EpisodeMeta) -> str:
-    """What policies that read language are told."""
-    goal = () if meta.goal is None else meta.goal if isinstance(meta.goal, tuple) else (meta.goal,)
+def task_in_words(kind: str | None, goal: float | tuple[float, ...] | None) -> str:
+    """What policies that read language are told of a task with this goal [m]."""
+    goal = () if goal is None else goal if isinstance(goal, tuple) else (goal,)
     sizes = [f"{1e3 * size:g} mm" for size in goal]
-    if meta.task == "squeeze" and len(sizes) == 1:
+    if kind == "squeeze" and len(sizes) == 1:
         return f"squeeze the body to a height of {sizes[0]}"
-    if meta.task == "reposition" and len(sizes) == 2:
+    if kind == "reposition" and len(sizes) == 2:
         return f"move the body by {sizes[0]} in x and {sizes[1]} in y"
-    if meta.task == "knead" and len(sizes) == 3:
+    if kind == "knead" and len(sizes) == 3:
         return f"knead the body to a size of {sizes[0]} by {sizes[1]} by {sizes[2]}"
-    return meta.task or "touch the body"
+    return kind or "touch the body"

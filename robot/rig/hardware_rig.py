@@ -165,6 +165,11 @@ def _diagnostics(
     return values
 
 
+def hardware_spec(config: RigConfig) -> RigSpec:
+    """What a rig of hardware will deliver; nothing is opened. Raises CalibrationError, ValueError."""
+    return _spec(config, {name: _normaliser(name, sensor, config) for name, sensor in config.sensors.items()})
+
+
 def _spec(config: RigConfig, normalisers: Mapping[str, FrameNormaliser]) -> RigSpec:
     """What the rig will deliver; for cameras also what the normaliser finds in the picture."""
     sensors = {}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.plugin import register_envs
-from tacsim.interface import Needs, Policy, Pose, Truth
+from tacsim.interface import Needs, Observation, Policy, Pose, Truth
 from tacsim.limits import LimitExceeded
 from tacsim.models.rig import RigConfig, TaskConfig
 from tacsim.models.scene import Scene
@@ -100,6 +100,11 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._sent: Mapping[str, Pose | None] = {}  # by the last begin_step
         self._failure: LimitExceeded | SimulationDiverged | None = None
         self._done: Result | None = None  # a step that is done, but not taken yet
+
+    @property
+    def observation(self) -> Observation:
+        """The last one, as policies see it that are not learned."""
+        return self._observation
 
     @property
     def scene(self) -> Scene | None:

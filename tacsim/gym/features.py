@@ -309,3 +309,11 @@ def moved(start: Pose, pose: Pose) -> FloatArray:
     """(9,) where an arm is, seen from where it was at reset, encoded: position, and two columns of the rotation."""
     away = se3.relative(start, pose)
     return np.concatenate([away.position / SCALES["moved"], (se3.two_columns(away) - _UNTURNED) / SCALES["turn"]])
+
+
+def unmoved(start: Pose, numbers: NDArray[np.floating[Any]]) -> Pose:
+    """The pose that `moved` makes these numbers of (9,). Raises ValueError for columns that span no plane, and for
+    numbers that are not finite."""
+    values = np.asarray(numbers, np.float64)
+    away = se3.from_two_columns(values[:3] * SCALES["moved"], values[3:] * SCALES["turn"] + _UNTURNED)
+    return se3.compose(start, away)

@@ -73,7 +73,10 @@ def test_state_and_action_mean_what_their_names_and_scales_say(tmp_path: Path) -
         """In SI units."""
         names = info["features"][key]["names"]
         assert names == list(about["scales"][key])
-        return {name: about["scales"][key][name] * columns[key][row][at] for at, name in enumerate(names)}
+        values = {name: about["scales"][key][name] * columns[key][row][at] for at, name in enumerate(names)}
+        driven = [name for name in names if name.endswith(".pos")]
+        assert driven == info["features"]["action"]["names"]  # what LeRobot's rollout drives back to its start by
+        return {name.removesuffix(".pos").removesuffix(".vel"): value for name, value in values.items()}
 
     asked = {name: steps[0].arms[name].pose for name in NAMES}
     for row, (step, after) in enumerate(itertools.pairwise(steps)):

@@ -1,0 +1,105 @@
+"""A task on a rig as LeRobot's environments are: pictures, the state's numbers, and actions as they are recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from robot.export.lerobot_mapping import IMAGE, STATE, LeRobotMapping, Row, task_in_words
+from robot.export.lerobot_rig import picture_shape
+from robot.open import Randomised, load_with_task, make_env
+from tacsim.interface import Action, Needs, Observation
+from tacsim.limits import ActionError
+from tacsim.models.rig import TaskConfig
+
+
+class LeRobotEnv(gymnasium.Env[dict[str, Any], NDArray[np.floating[Any]]]):
+    """`robot.make_env` in the numbers of a data set, so that a policy of `lerobot-train` fits it.
+
+    Observation: `pixels`, the canonical picture of each sensor by name, and `agent_pos`, `observation.state`. Action:
+    where each arm shall be, relative to reset, `action` of a data set. Of it is done what the task leaves free, at most
+    its max_step. info: as of `TacsimEnv`, with `is_success` at reset and at each step.
+
+    Raises what `make_env` raises, and IncompatibleRig as `LeRobotMapping`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        task: str | TaskConfig = "squeeze",
+        rig: str | Path = "sim",
+        overrides: Sequence[str] = (),
+        render_mode: str | None = None,
+        randomise: Randomised = None,
+    ) -> None:
+        canonical = load_with_task(rig, task, overrides).config.canonical
+        self._env = make_env(task, rig, overrides, render_mode, randomise=randomise)
+        spec, config = self._env.rig.spec, self._env.task.config
+        self._mapping = LeRobotMapping(spec, canonical, maps=False)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / spec.period)}
+        self.render_mode = render_mode
+        picture = spaces.Box(0, 255, picture_shape(canonical), np.uint8)
+        state, action = ((len(each.names),) for each in (self._mapping.state, self._mapping.action))
+        self.observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Dict(dict.fromkeys(spec.sensors, picture)),
+                "agent_pos": spaces.Box(-np.inf, np.inf, state, np.float32),
+            }
+        )
+        self.action_space = spaces.Box(-np.inf, np.inf, action, np.float32)
+        self.task = config.kind
+        self._max_episode_steps = config.steps  # LeRobot asks for it by this name
+
+    @property
+    def task_description(self) -> str:
+        """The task in words, with the goal of this episode."""
+        return task_in_words(self.task, self._env.task.goal)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The same seed gives the same episode. options: for LeRobot's own, which concern nothing here."""
+        super().reset(seed=seed)
+        _, info = self._env.reset(seed=seed)
+        return _observed(self._mapping.begin(self._env.observation)), info
+
+    def step(self, action: NDArray[np.floating[Any]]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control period. Raises ActionError for what stands for no pose, ResetNeeded after the end."""
+        if np.shape(action) != self.action_space.shape:
+            raise ActionError(f"an action has shape {self.action_space.shape}, got {np.shape(action)}")
+        asked = self._env.ask(_Fixed(self._mapping.decoded(action)))
+        _, reward, terminated, truncated, info = self._env.step(asked)
+        return _observed(self._mapping.observed(self._env.observation)), reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The pictures of all sensors as they come, side by side, (H, W, 3); None without a render_mode."""
+        return self._env.render()
+
+    def close(self) -> None:
+        self._env.close()
+
+
+class _Fixed:
+    """A policy that asks for one action, whatever is observed."""
+
+    needs = Needs()
+
+    def __init__(self, action: Action) -> None:
+        self._action = action
+
+    def reset(self) -> None: ...
+
+    def __call__(self, observation: Observation) -> Action:
+        return self._action
+
+
+def _observed(row: Row) -> dict[str, Any]:
+    pictures = {name.removeprefix(IMAGE): value for name, value in row.items() if name.startswith(IMAGE)}
+    return {"pixels": pictures, "agent_pos": row[STATE]}

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,6 +18,7 @@ from robot.cli.question import ask, require_person
 
 if TYPE_CHECKING:
     from robot.deploy.control_loop import EpisodeSetup
+    from robot.export.rerun_live import LiveView
     from tacsim.config import LoadedRig
     from tacsim.interface import Policy, RigSpec
     from tacsim.record.episode import Episode, EpisodeMeta, Step
@@ -56,6 +57,11 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Hardware: connect, look, time and record, but send no motion.")
     ] = False,
+    view: Annotated[bool, typer.Option("--view", help="Look at it live in Rerun (extra 'viz').")] = False,
+    save_view: Annotated[
+        Path | None,
+        typer.Option("--save-view", metavar="FILE.rrd", help="Write a file for Rerun's viewer while it runs."),
+    ] = None,
     set_: Overrides = None,
     out: Out = None,
 ) -> None:
@@ -67,6 +73,8 @@ def run(
     """
     from robot.open import load_with_task
 
+    if save_view is not None and save_view.suffix != ".rrd":
+        raise typer.BadParameter(f"{save_view} must end in .rrd, as the viewer's files do", param_hint="--save-view")
     sys.path.append(str(Path.cwd()))  # --policy mine:act finds mine.py here, as `python -m` would; after all else
     loaded = load_with_task(rig, task, set_ or [])
     for words in loaded.notes:
@@ -80,7 +88,8 @@ def run(
         steps = endless if own_task is None else own_task.steps
     name = policy if policy is not None else ("grip" if own_task is None else "scripted")
     with Interrupt() as interrupt:
-        failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run)
+        views = [None] * view + [save_view] * (save_view is not None)
+        failed = _run(loaded, name, steps, seed, folder, interrupt, dry_run, views)
         if interrupt():
             complain("stopped by a signal before the last step; what was done is saved")
             raise typer.Exit(interrupt.exit_code)
@@ -89,7 +98,14 @@ def run(
 
 
 def _run(
-    loaded: LoadedRig, policy: str, steps: int, seed: int, folder: Path, interrupt: Interrupt, dry_run: bool
+    loaded: LoadedRig,
+    policy: str,
+    steps: int,
+    seed: int,
+    folder: Path,
+    interrupt: Interrupt,
+    dry_run: bool,
+    views: Sequence[Path | None],
 ) -> bool:
     """Runs and reports the episode; True when it or its recording failed. The folder is made when the episode starts: a
     run that cannot start leaves none."""
@@ -126,7 +142,8 @@ def _run(
                 recorder = stack.enter_context(file)
             return recorder
 
-        episode, failure = _drive(rig, fitting[0], task, steps, setup, record, interrupt, bar)
+        watched = _views(rig.spec, loaded, views, stack)
+        episode, failure = _drive(rig, fitting[0], task, steps, setup, record, interrupt, bar, watched)
     lost = ""
     if recorder is not None and (recorder.error or recorder.dropped):
         why = recorder.error or "the disk was too slow"
@@ -140,6 +157,26 @@ def _run(
     return bool(failure or lost)
 
 
+def _views(spec: RigSpec, loaded: LoadedRig, files: Sequence[Path | None], stack: ExitStack) -> list[LiveView]:
+    """A viewer for None, a file for each path; closed with the stack, which says what they did not show."""
+    if not files:
+        return []
+    from robot.export.rerun_live import LiveView
+
+    def close(view: LiveView, name: str) -> None:
+        view.close()
+        if view.ended:
+            notes.print(f"{name} ended before the episode did")
+        elif view.left_out:
+            notes.print(f"{name} left {view.left_out} steps out, which came too fast for it")
+
+    views = []
+    for file in files:
+        views.append(LiveView(spec, loaded.config, file))
+        stack.callback(close, views[-1], "the viewer" if file is None else str(file))
+    return views
+
+
 def _drive(
     rig: Rig,
     policy: Policy,
@@ -149,6 +186,7 @@ def _drive(
     record: Callable[[EpisodeMeta], Recorder],
     interrupt: Interrupt,
     bar: Bar,
+    views: Sequence[LiveView],
 ) -> tuple[Episode, str]:
     """The episode, shown by the bar, and what ended it too early ("" when nothing did)."""
     from robot.deploy.control_loop import EpisodeFailed, run_episode
@@ -157,8 +195,14 @@ def _drive(
         bar.say(task.config.kind if task else rig.name)
         bar.count(step.index, None if steps == NO_END else steps)
 
+    def watch(*seen: Any) -> None:
+        for each in views:
+            each(*seen)
+
     try:
-        episode = run_episode(rig, policy, task, steps, setup=setup, recorder=record, on_step=show, stop=interrupt)
+        episode = run_episode(
+            rig, policy, task, steps, setup=setup, recorder=record, on_step=show, watch=watch, stop=interrupt
+        )
     except EpisodeFailed as failed:
         return failed.episode, str(failed)
     return episode, ""

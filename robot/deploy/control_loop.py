@@ -74,6 +74,7 @@ def run_episode(
     setup: EpisodeSetup = EpisodeSetup(),
     recorder: Callable[[EpisodeMeta], StepRecorder] | None = None,
     on_step: Callable[[Step], None] | None = None,
+    watch: Callable[[Step, Observation, Truth | None], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Episode:
     """Resets rig and policy, then runs exactly `steps` control steps; fewer only when a recording is over, `stop` says
@@ -86,6 +87,7 @@ def run_episode(
     Args:
         recorder: opens the recording, once the references without contact are there (they are attached).
         on_step: called after each step, e.g. for a progress bar.
+        watch: the same, with what was observed and what only a simulation knows, e.g. for a viewer.
         stop: asked before each step.
 
     Raises:
@@ -113,7 +115,8 @@ def run_episode(
     def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
         nonlocal count
         seconds = time.perf_counter() - started
-        step = _step(count, rig, task, start, feel, observation, action, sent, seconds)
+        truth = rig.truth()
+        step = _step(count, rig, task, truth, start, feel, observation, action, sent, seconds)
         count += 1
         if sink is None:
             kept.append(step)
@@ -123,6 +126,8 @@ def run_episode(
                 raise RecordingFailed(f"the recording ended early: {sink.error}")
         if on_step is not None:
             on_step(step)
+        if watch is not None:
+            watch(step, observation, truth)
 
     try:
         policy.reset()
@@ -200,6 +205,7 @@ def _step(
     index: int,
     rig: Rig,
     task: Task | None,
+    truth: Truth | None,
     start: Truth | None,
     feel: Estimator | None,
     observation: Observation,
@@ -216,7 +222,7 @@ def _step(
     distance = None if feel is None else feel(observation)
     if distance is not None:
         info[FELT] = distance
-    truth, outcome = rig.truth(), None
+    outcome = None
     if truth is not None and start is not None:
         moved = truth.position - start.position
         info |= {"body_height": truth.height, "body_x": float(moved[0]), "body_y": float(moved[1])}

@@ -6,6 +6,7 @@
 | `/world/{sensor}/flow`              | displacement of its markers                                            |
 | `/world/{arm}`                      | pose of the sensor that the arm carries                                |
 | `/world/{arm}/force`                | what the object does to it, 1 mm a newton                              |
+| `/world/body`                       | particles of the plasticine; of a simulation that is looked at live    |
 | `/world/asked/{arm}`                | where the arm was asked to be                                          |
 | `/camera/{sensor}`                  | the picture as it came                                                 |
 | `/canonical/{sensor}`               | the picture as a policy sees it                                        |
@@ -27,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.arm.status import ArmStatus
-from tacsim.interface import ArmState, Observation, Pose, RigSpec, TactileObservation
+from tacsim.interface import ArmState, Observation, Pose, RigSpec, TactileObservation, Truth
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
 from tacsim.record.episode import ArmPackages, Step
@@ -64,7 +65,7 @@ class EpisodeLog:
         self._status: dict[str, int] = {}
         self._meshed: set[str] = set()
 
-    def step(self, step: Step, observation: Observation) -> None:
+    def step(self, step: Step, observation: Observation, truth: Truth | None = None) -> None:
         """All that is known of one step."""
         import rerun as rr
 
@@ -81,6 +82,9 @@ class EpisodeLog:
         for name, asked in ({} if step.action is None else step.action.tool).items():
             if asked is not None:
                 self._points(f"world/asked/{name}", asked)
+        if truth is not None:
+            grains = rr.Points3D(truth.points, radii=[ARROW / 2], colors=[(200, 150, 110)])
+            self._recording.log("world/body", grains)
         self._numbers(step)
         for name, packages in step.packages.items():
             self._statuses(name, packages)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from calibration.bundle import read_bundle
 from robot.export.rerun_log import EpisodeLog, blueprint
-from robot.rig.recorded import ObservedEpisode, observe_episode
+from robot.rig.recorded import observe_episode
 from tacsim.models.hardware import CameraSensorConfig
-from tacsim.models.rig import SimSensorConfig
+from tacsim.models.rig import RigConfig, SimSensorConfig
 from tacsim.optics.markers import rest_positions
 
 if TYPE_CHECKING:
@@ -34,8 +34,7 @@ def view_episode(path: Path, file: Path | None, on_step: Callable[[int, int], No
     Raises ValueError without rerun-sdk or for an empty episode, EpisodeError, FileExistsError, OSError, RuntimeError of
     a viewer that cannot be started, and what normalising raises.
     """
-    if util.find_spec("rerun") is None:
-        raise ValueError("views are made by rerun-sdk, which is not installed: pip install 'tacsim[viz]'")
+    require_rerun()
     import rerun as rr
 
     observed = observe_episode(path)
@@ -43,8 +42,8 @@ def view_episode(path: Path, file: Path | None, on_step: Callable[[int, int], No
     if not steps:
         raise ValueError(f"{path}: no step can be read, there is nothing to show")
     recording = rr.RecordingStream(APPLICATION)
-    log = EpisodeLog(recording, spec, observed.canonical, _lattices(observed))
-    with _shown(recording) if file is None else _written(recording, file) as check:
+    log = EpisodeLog(recording, spec, observed.canonical, lattices(observed.rig))
+    with shown(recording) if file is None else written(recording, file) as check:
         recording.send_blueprint(blueprint(spec))
         for done, (step, observation) in enumerate(observed.steps(), start=1):
             log.step(step, observation)
@@ -52,15 +51,22 @@ def view_episode(path: Path, file: Path | None, on_step: Callable[[int, int], No
             on_step(done, len(steps))
 
 
+def require_rerun() -> None:
+    """Raises ValueError without rerun-sdk."""
+    if util.find_spec("rerun") is None:
+        raise ValueError("views are made by rerun-sdk, which is not installed: pip install 'tacsim[viz]'")
+
+
 @contextmanager
-def _shown(recording: rr.RecordingStream) -> Iterator[Callable[[], None]]:
+def shown(recording: rr.RecordingStream) -> Iterator[Callable[[], None]]:
+    """In a viewer that it starts."""
     recording.spawn()
     yield lambda: None
     recording.disconnect()
 
 
 @contextmanager
-def _written(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], None]]:
+def written(recording: rr.RecordingStream, file: Path) -> Iterator[Callable[[], None]]:
     """Whole, or not at all. Gives what raises the OSError that has ended the writing."""
     if file.exists():
         raise FileExistsError(EEXIST, "exists already; name a new file, nothing is overwritten", str(file))
@@ -109,10 +115,10 @@ class _Copy(threading.Thread):
             raise self._error
 
 
-def _lattices(observed: ObservedEpisode) -> Mapping[str, NDArray[np.float64]]:
-    """Where the markers of each sensor rest, of those that the recording knows."""
+def lattices(rig: RigConfig | None) -> Mapping[str, NDArray[np.float64]]:
+    """Where the markers of each sensor rest, of those that the rig knows."""
     found: dict[str, NDArray[np.float64]] = {}
-    for name, sensor in ({} if observed.rig is None else observed.rig.sensors).items():
+    for name, sensor in ({} if rig is None else rig.sensors).items():
         markers = None
         if isinstance(sensor, CameraSensorConfig) and sensor.calibration is not None:
             markers = read_bundle(Path(sensor.calibration))[0].markers

@@ -62,7 +62,9 @@ def test_the_picture_is_the_canonical_one(mock: MockCamera, file: Path) -> None:
         red, green, blue = pressed[16, 24].astype(int) - 128  # without what looks like a lamp that changed
         assert red > 5 and abs(green) <= 1 and blue < -5
         assert camera.age() < 20.0
-        with pytest.raises(StaleFrame):  # nothing new is pushed: the frame repeats
+        mock.close()
+        camera.read()
+        with pytest.raises(StaleFrame, match=r"sensor 'finger': no new picture within 0.05 s"):
             camera.read_new(0.05)
     finally:
         camera.close()

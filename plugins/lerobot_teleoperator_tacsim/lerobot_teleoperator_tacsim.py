@@ -14,10 +14,11 @@ STROKES = ("delta_x", "delta_y", "delta_z")
 @TeleoperatorConfig.register_subclass("tacsim")
 @dataclass(kw_only=True)
 class TacsimTeleoperatorConfig(TeleoperatorConfig):
-    """device: gives delta_x, delta_y and delta_z, as LeRobot's gamepad and keyboard_ee do. rig, task, overrides: as for
-    the robot. step: of a full stroke [m]. arms: that move, each along its own sensor's axes; none named: all."""
+    """device: type of a teleoperator that gives delta_x, delta_y and delta_z, as gamepad and keyboard_ee do. rig, task,
+    overrides: as for the robot. step: of a full stroke [m]. arms: that move, each along its own sensor's axes; none
+    named: all."""
 
-    device: TeleoperatorConfig
+    device: str = "gamepad"  # not a configuration: one of its own kind inside would let LeRobot's parser run for ever
     rig: str
     task: str | None = None
     overrides: list[str] = field(default_factory=list)
@@ -34,7 +35,10 @@ class TacsimTeleoperator(Teleoperator):
     def __init__(self, config: TacsimTeleoperatorConfig) -> None:
         super().__init__(config)
         self._jog = Jog(LeRobotRig(config.rig, task=config.task, overrides=config.overrides), config.step, config.arms)
-        self._device = make_teleoperator_from_config(config.device)
+        known = TeleoperatorConfig.get_known_choices()
+        if config.device not in known:
+            raise ValueError(f"no teleoperator '{config.device}'; there are {', '.join(sorted(known))}")
+        self._device = make_teleoperator_from_config(known[config.device]())
 
     @property
     def action_features(self) -> dict[str, type]:

@@ -1,6 +1,7 @@
-"""A device that gives the same strokes again and again, in the place of a gamepad: `--teleop.device.type=script`."""
+"""A device that gives the same strokes again and again, in the place of a gamepad: `--teleop.device=script`."""
 
-from dataclasses import dataclass, field
+import os
+from dataclasses import dataclass
 from typing import Any
 
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
@@ -9,7 +10,7 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 @TeleoperatorConfig.register_subclass("script")
 @dataclass(kw_only=True)
 class ScriptConfig(TeleoperatorConfig):
-    strokes: list[float] = field(default_factory=lambda: [0.0, 0.0, 1.0])  # x, y, z of each step
+    """Strokes of each step by SCRIPTED_STROKES: x,y,z."""
 
 
 class Script(Teleoperator):
@@ -22,7 +23,7 @@ class Script(Teleoperator):
 
     def __init__(self, config: ScriptConfig) -> None:
         super().__init__(config)
-        self._strokes = config.strokes
+        self._strokes = [float(each) for each in os.environ.get("SCRIPTED_STROKES", "0,0,1").split(",")]
 
     def connect(self, calibrate: bool = True) -> None:
         self.is_connected = True

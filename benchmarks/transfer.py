@@ -41,6 +41,7 @@ MADE_OF = (
 )
 RECORDED = {"gel": ("press", "press", "slide"), "body": ("sim", "squeeze", "tilt")}  # rig, motions
 NOISE = "20 mN"  # of an external force sensor
+GOALS, STEPS = ["7 mm", "8.5 mm"], 30  # of an episode on the twin: near enough to be reached in so many steps
 ROUNDS = 8  # of the policies' training: 10,240 control steps
 
 
@@ -118,17 +119,17 @@ def train(folder: Path, cells: Sequence[tuple[str, str]]) -> None:
         go_on(RunFolder(run), say=lambda figures: typer.echo(str(figures)))
 
 
-def play(folder: Path, episodes: int, every: int, steps: int | None) -> None:
+def play(folder: Path, episodes: int, every: int, preset: str) -> None:
     """Needs the extra `policy`."""
     twins = load(Randomisation, "squeeze-twin")
-    hidden = {key: {"choice": [value]} for key, value in HIDDEN.items()}
+    hidden: dict[str, object] = {key: {"choice": [value]} for key, value in HIDDEN.items()}
+    hidden |= {"scene.preset": {"choice": [preset]}, "task.goal": {"uniform": GOALS}}
     drawn = {"draws": episodes, "values": {**twins.model_dump(mode="json", exclude_none=True)["values"], **hidden}}
     (folder / "twin.json").write_text(json.dumps(drawn, indent=1), encoding="utf-8")
     policies = [str(path) for sight in SIGHTS for each in MATERIALS if (path := policy(folder, sight, each)).exists()]
     words = [part for path in policies for part in ("--policy", path)]
     words += ["--twin", str(folder / "twin.json"), "--episodes", str(episodes), "--every", str(every)]
-    words += [] if steps is None else ["--steps", str(steps)]
-    tacsim("transfer", "squeeze", *words, "--out", str(folder / "transfer"))
+    tacsim("transfer", "squeeze", *words, "--steps", str(STEPS), "--out", str(folder / f"transfer-{preset}"))
 
 
 def policy(folder: Path, sight: str, materials: str) -> Path:
@@ -141,8 +142,7 @@ def main(
     cell: Annotated[list[str] | None, typer.Option(help="To be trained, SIGHT-MATERIALS; none: all.")] = None,
     episodes: int = 12,
     every: int = 3,
-    steps: int | None = None,
-    preset: Annotated[str, typer.Option(help="Mesh of the twin that is recorded.")] = "standard",
+    preset: Annotated[str, typer.Option(help="Mesh of the twin.")] = "standard",
     known: Annotated[str, typer.Option(help="Mesh on which it is identified.")] = "draft",
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
@@ -151,7 +151,7 @@ def main(
         "record": lambda: record(folder, preset),
         "identify": lambda: identify(folder, known),
         "train": lambda: train(folder, [each for each in cells if not cell or "-".join(each) in cell]),
-        "play": lambda: play(folder, episodes, every, steps),
+        "play": lambda: play(folder, episodes, every, preset),
     }
     for name, part in parts.items():
         if only in ("", name):

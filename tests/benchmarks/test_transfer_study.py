@@ -1,0 +1,42 @@
+"""What differs between the cells of the study of transfer, and only that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import transfer
+from tacsim.config import load_rig
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """With what `tacsim identify` writes."""
+    monkeypatch.chdir(tmp_path)
+    found = Path("study")
+    for kind, text in (("gel", "{youngs_modulus: 0.17 MPa, poisson_ratio: 0.48}"),
+                       ("body", "{youngs_modulus: 0.25 MPa, yield_stress: 15 kPa}")):  # fmt: skip
+        (found / f"my-{kind}").mkdir(parents=True)
+        (found / f"my-{kind}/material.yaml").write_text(text)
+    (found / "my-body/scene.yaml").write_text("{extends: squeeze, friction: {lower: 0.5, upper: 0.7}}")
+    return found
+
+
+@pytest.mark.parametrize("sight", transfer.SIGHTS)
+def test_cells_differ_in_their_materials_alone(sight: str, folder: Path) -> None:
+    guessed, identified, drawn = (transfer.training(sight, each, folder) for each in transfer.MATERIALS)
+    assert guessed.randomise is not None and drawn.randomise is not None
+    assert guessed.randomise == identified.randomise
+    assert {key for key in drawn.randomise.values if key not in guessed.randomise.values} >= {
+        "scene.body.material.yield_stress", "scene.gel.material.youngs_modulus", "scene.friction.lower"
+    }  # fmt: skip
+    assert not any("material" in key or "light" in key for key in guessed.randomise.values)
+    assert guessed.features == identified.features == drawn.features
+    assert ("picture" in drawn.features.maps) == (sight == "raw")
+    scene = load_rig(identified.rig, task=identified.task, overrides=identified.overrides).config.scene
+    assert scene is not None and scene.body is not None
+    assert (scene.gel.material.youngs_modulus, scene.body.material.youngs_modulus) == (0.17e6, 0.25e6)
+    assert scene.friction == {"lower": 0.5, "upper": 0.7}
+    usual = load_rig(guessed.rig, task=guessed.task, overrides=guessed.overrides).config.scene
+    assert usual is not None and usual.gel.material.youngs_modulus == 0.145e6

@@ -119,7 +119,7 @@ def train(folder: Path, cells: Sequence[tuple[str, str]]) -> None:
         go_on(RunFolder(run), say=lambda figures: typer.echo(str(figures)))
 
 
-def play(folder: Path, episodes: int, every: int, preset: str) -> None:
+def play(folder: Path, episodes: int, every: int, preset: str, workers: int) -> None:
     """Needs the extra `policy`."""
     twins = load(Randomisation, "squeeze-twin")
     hidden: dict[str, object] = {key: {"choice": [value]} for key, value in HIDDEN.items()}
@@ -129,6 +129,7 @@ def play(folder: Path, episodes: int, every: int, preset: str) -> None:
     policies = [str(path) for sight in SIGHTS for each in MATERIALS if (path := policy(folder, sight, each)).exists()]
     words = [part for path in policies for part in ("--policy", path)]
     words += ["--twin", str(folder / "twin.json"), "--episodes", str(episodes), "--every", str(every)]
+    words += ["--workers", str(workers)]
     tacsim("transfer", "squeeze", *words, "--steps", str(STEPS), "--out", str(folder / f"transfer-{preset}"))
 
 
@@ -142,6 +143,7 @@ def main(
     cell: Annotated[list[str] | None, typer.Option(help="To be trained, SIGHT-MATERIALS; none: all.")] = None,
     episodes: int = 12,
     every: int = 3,
+    workers: int = 1,
     preset: Annotated[str, typer.Option(help="Mesh of the twin.")] = "standard",
     known: Annotated[str, typer.Option(help="Mesh on which it is identified.")] = "draft",
 ) -> None:
@@ -151,7 +153,7 @@ def main(
         "record": lambda: record(folder, preset),
         "identify": lambda: identify(folder, known),
         "train": lambda: train(folder, [each for each in cells if not cell or "-".join(each) in cell]),
-        "play": lambda: play(folder, episodes, every, preset),
+        "play": lambda: play(folder, episodes, every, preset, workers),
     }
     for name, part in parts.items():
         if only in ("", name):

@@ -8,13 +8,16 @@ drawn to be.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from robot.common.loopback import loopback_host
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy
 from robot.deploy.policy import load_policy, require_fit
@@ -22,6 +25,7 @@ from robot.open import open_rig
 from robot.train.evaluate import UNSEEN, Interval, bootstrap, wilson
 from tacsim.config import LoadedRig, load_rig
 from tacsim.interface import RigSpec
+from tacsim.models.hardware import UrArmConfig
 from tacsim.models.randomisation import Randomisation
 from tacsim.models.training import Training
 from tacsim.record.episode import Episode
@@ -34,11 +38,12 @@ SIDES: tuple[Side, ...] = ("simulation", "twin")
 RIGS = {"simulation": "sim", "twin": "mock"}
 SEEN = ("task.", "scene.body.geometry")  # of a twin, by a person
 ROWS = "episodes.jsonl"
+ROOM = 77  # second number of the addresses of mocks in processes of their own
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What is compared; its folder goes on only with the same."""
+    """What is compared; its folder goes on only with the same, but for the policies."""
 
     task: str
     policies: tuple[str, ...]
@@ -51,6 +56,7 @@ class Study:
     @property
     def text(self) -> str:
         whole = asdict(self) | {"twins": self.twins.model_dump(mode="json")}
+        del whole["policies"]  # to which others may come later
         return json.dumps(whole, indent=1) + "\n"
 
 
@@ -68,9 +74,12 @@ class Played:
     error: str = ""  # what ended it early
 
 
-def play(study: Study, folder: Path, tell: Callable[[str, int, int], None]) -> list[Played]:
+def play(study: Study, folder: Path, tell: Callable[[str, int, int], None], workers: int = 1) -> list[Played]:
     """All episodes, those that the folder has already read from there; each is written to it as it ends. Raises
-    ValueError where the folder has another study, and what opening rigs and reading policies raises."""
+    ValueError where the folder has another study, and what opening rigs and reading policies raises.
+
+    workers: processes side by side, each with a rig of its own.
+    """
     rows, settings = folder / ROWS, folder / "study.json"
     if settings.exists():
         if settings.read_text(encoding="utf-8") != study.text:
@@ -81,19 +90,54 @@ def play(study: Study, folder: Path, tell: Callable[[str, int, int], None]) -> l
         settings.write_text(study.text, encoding="utf-8")
     done = {(each.policy, each.side, each.episode): each for each in _read(rows)}
     _write(rows, done.values())  # without a line that was cut off, which the next would be glued to
-    total = len(SIDES) * len(study.policies) * study.episodes
+    asked = [(p, side, n) for p in study.policies for side in SIDES for n in range(study.episodes)]
+    left = [each for each in asked if each not in done]
+    parts: dict[tuple[Side, int], list[tuple[str, int]]] = {}
+    for policy, side, number in sorted(left, key=lambda each: SIDES.index(each[1])):
+        parts.setdefault((side, number // study.changing), []).append((policy, number))
+    played = _one_by_one(study, parts) if workers == 1 else _side_by_side(study, parts, workers)
     with rows.open("a", encoding="utf-8") as file:
-        for side in SIDES:
-            for twin in range(-(-study.episodes // study.changing)):
-                first = twin * study.changing
-                numbers = range(first, min(first + study.changing, study.episodes))
-                left = [(p, n) for p in study.policies for n in numbers if (p, side, n) not in done]
-                for each in _on_twin(study, side, twin, left):
-                    done[each.policy, each.side, each.episode] = each
-                    file.write(_line(each))
-                    file.flush()
-                    tell(f"{each.policy}, {side}: {_ended(each)}", len(done), total)
-    return [done[p, side, n] for p in study.policies for side in SIDES for n in range(study.episodes)]
+        for each in played:
+            done[each.policy, each.side, each.episode] = each
+            file.write(_line(each))
+            file.flush()
+            ready = sum(each in done for each in asked)
+            tell(f"{each.policy}, {each.side}: {_ended(each)}", ready, len(asked))
+    return [done[each] for each in asked]
+
+
+Parts = Mapping[tuple[Side, int], Sequence[tuple[str, int]]]  # by side and twin: policies and episodes
+
+
+def _one_by_one(study: Study, parts: Parts) -> Iterator[Played]:
+    for (side, twin), left in parts.items():
+        yield from _on_twin(study, side, twin, left)
+
+
+def _side_by_side(study: Study, parts: Parts, workers: int) -> Iterator[Played]:
+    context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
+    with ProcessPoolExecutor(workers, context) as pool:
+        futures = [
+            pool.submit(_apart, study, side, twin, [each for each in left if each[0] == policy])
+            for (side, twin), left in parts.items()
+            for policy in dict.fromkeys(name for name, _ in left)
+        ]
+        try:
+            for future in as_completed(futures):
+                yield from future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _apart(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> list[Played]:
+    """In a process of its own, whose mocks have addresses of their own."""
+    words: list[str] = []
+    if side == "twin":
+        for number, (name, arm) in enumerate(load_rig(RIGS[side]).config.arms.items(), start=1):
+            assert isinstance(arm, UrArmConfig)
+            host = loopback_host(number, ROOM)
+            words += [f"arms.{name}.host={host}", f"sensors.{name}.source=http://{host}:8081/?action=stream"]
+    return list(_on_twin(replace(study, overrides=(*study.overrides, *words)), side, twin, left))
 
 
 def _ended(played: Played) -> str:

@@ -31,13 +31,15 @@ def transfer(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Control steps of an episode.", show_default="the task's")
     ] = None,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Rigs side by side, each in a process of its own.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder; one that was begun goes on.")] = Path("runs/transfer"),
     set_: Overrides = None,
 ) -> None:
     """Compare what policies reach in simulation and, over the real wire, on mock hardware whose hidden twin differs.
 
     Each episode is played on both sides; the simulation has of the twin only the goal and the body's size. Killed
-    anywhere, the same command goes on. Writes transfer.json, transfer.png and how each episode ended.
+    anywhere, the same command goes on, with further policies too. Writes transfer.json, transfer.png and how each
+    episode ended.
 
     Example: tacsim transfer squeeze --policy learned --policy scripted --episodes 20
     """
@@ -61,7 +63,7 @@ def transfer(
             if not notes.is_terminal:
                 notes.print(f"{done} of {of}: {words}", markup=False)
 
-        rows = summary(play(study, out, tell))
+        rows = summary(play(study, out, tell, workers))
     with writing(out):
         (out / "transfer.json").write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
         picture(rows, out / "transfer.png")

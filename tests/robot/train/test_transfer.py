@@ -138,6 +138,9 @@ def test_a_study_that_is_killed_goes_on_where_it_was(tmp_path: Path, monkeypatch
     assert len(asked) == 13
     assert play(study(), tmp_path, lambda *_: None) == whole
     assert len(asked) == 13  # what was mended is whole now
+    more = play(study(policies=("third", "grip")), tmp_path, lambda *_: None)
+    assert [each for each in more if each.policy == "grip"] == whole[10:] and len(more) == 20
+    assert len(asked) == 23 and all(policy == "third" for policy, _ in asked[13:])
     with pytest.raises(ValueError, match="has a study of other settings; name another folder"):
         play(study(steps=3), tmp_path, lambda *_: None)
 
@@ -193,8 +196,8 @@ def test_the_command_makes_table_picture_and_rows(tmp_path: Path, monkeypatch: p
     (tmp_path / "twin.yaml").write_text(json.dumps({"draws": 2, "values": TWIN}))
     sets = [part for word in (*TINY, "scene.preset=learn") for part in ("--set", word)]
     words = ("transfer", "squeeze", "--policy", "scripted", "--twin", "twin.yaml", "--episodes", "2", "--steps", "2")
-    for _ in range(2):  # the second time it reads
-        result = tacsim(*words, "--out", "t", *sets)
+    for workers in ("2", "1"):  # the second time it reads
+        result = tacsim(*words, "--workers", workers, "--out", "t", *sets)
         assert result.exit_code == 0, result.output
     assert "scripted" in result.stdout and "twin" in result.stdout
     rows = json.loads((tmp_path / "t" / "transfer.json").read_text())

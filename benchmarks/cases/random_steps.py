@@ -14,7 +14,6 @@ from benchmarks.harness.cache import cached
 from benchmarks.harness.measure import Measurement, Timing, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import FloatArray, Pose
-from tacsim.models.scene import Settling
 from tacsim.physics.world import World, make_world
 
 START, ACTIONS, LARGEST = 1.5e-3, 20, 0.2e-3  # squeezed so far from touch; steps; of one sensor, as in the squeeze task
@@ -25,7 +24,7 @@ def random_steps(preset: str, repeat: int) -> list[Measurement]:
     """Twenty steps in a row, each sensor along its z by up to 0.2 mm either way, at random: force after each against
     the slow limit through the same poses, as a share of the mean force; settled, and flowing, draft at three speeds."""
     begin, truth = _slow(preset)
-    usual = Settling().flow_mach
+    usual = squeeze_scene(preset, "hybrid").flow_mach
     rows = [_row(preset, begin, truth, "settled", flow=False)]
     for share in FLOW_MACHS.get(preset, (1.0,)):
         what = f"flowing at Mach {share * usual:g}" + (", the default" if share == 1.0 else "")

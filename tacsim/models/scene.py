@@ -29,6 +29,8 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 # (docs/decisions/0002).
 MACH_BY_TOLERANCE, MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH = 3.0, 4.0, 0.001, 0.03
 MACH_BY_SHEAR = 0.1
+LIGHTER = 1.5  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
+FLOW_MACH = 0.01  # of motions that flow into one another, where nothing is lighter; else twice that
 CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
@@ -191,7 +193,7 @@ class Settling(Config):
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance and change of force per check, relative
     mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # peak speed / wave speed; None: see Scene.peak_mach
     max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
-    flow_mach: Annotated[float, Field(gt=0, le=0.3)] = 0.01  # speed of motions that flow into one another / wave speed
+    flow_mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # speed of motions that flow; None: Scene.flow_mach
 
 
 class Scene(Config):
@@ -283,7 +285,16 @@ class Scene(Config):
         if not math.isfinite(by_stress):
             mu, lam = lame(self.gel.material)
             return min(FASTEST_MACH, MACH_BY_SHEAR * math.sqrt(mu / (lam + 2 * mu)))
-        return min(max(MACH_BY_TOLERANCE * settling.tolerance, SLOWEST_MACH), by_stress, FASTEST_MACH)
+        lighter = LIGHTER if self.physics == "hybrid" else 1.0
+        by_tolerance = max(lighter * MACH_BY_TOLERANCE * settling.tolerance, SLOWEST_MACH)
+        return min(by_tolerance, by_stress, lighter * FASTEST_MACH)
+
+    @property
+    def flow_mach(self) -> float:
+        """Speed of motions that flow into one another, over the wave speed."""
+        if self.settling.flow_mach is not None:
+            return self.settling.flow_mach
+        return FLOW_MACH if self.body is None else 2.0 * FLOW_MACH
 
     @property
     def spacing(self) -> float:

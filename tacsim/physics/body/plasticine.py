@@ -66,7 +66,8 @@ class BodyState:
 
     rows: (E, PARTICLE_ROWS, W) one number of all particles a row (tacsim.physics.exec.layout), zeros behind the last
     particle; masses: (E, COPIES, strips, 4 NODES) momentum and mass of NODES neighbours along z, one copy a part;
-    velocities: (E, strips, 4 NODES). Lines of the grid have an even number of nodes where NODES is 2.
+    velocities: (E, strips, 4 NODES); changes: (E, 3, strips, 4 NODES), of tacsim.physics.body.mass.
+    Lines of the grid have an even number of nodes where NODES is 2.
     """
 
     def __init__(self, points: Sequence[np.ndarray], planes: Sequence[np.ndarray] | None = None) -> None:
@@ -79,6 +80,7 @@ class BodyState:
                 self.plane(index)[...] = planes[index]
         self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
         self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
+        self.changes = aligned_zeros(len(points), 3, 1, 4 * NODES)
 
     def place(self, environment: int, points: np.ndarray, planes: np.ndarray) -> None:
         """Another body in one environment, at rest, see __init__. Rows of all grow if this one has more particles."""
@@ -195,6 +197,7 @@ class BodyState:
             room = max(strips, min(strips * 5 // 4, self.most // NODES))
             masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
             self.masses, self.velocities = masses, aligned_zeros(len(masses), room, 4 * NODES)
+            self.changes = aligned_zeros(len(masses), 3, room, 4 * NODES)
         counts[:, layout.STRIDE], counts[:, layout.CAPACITY] = self.rows.shape[2], self.masses.shape[2]
 
     def arguments(self) -> tuple[np.ndarray, ...]:

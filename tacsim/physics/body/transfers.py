@@ -79,6 +79,7 @@ class Body(NamedTuple):
     particles: Any
     masses: Any
     velocities: Any
+    changes: Any = None  # see tacsim.physics.body.mass
 
 
 class Slab(NamedTuple):
@@ -258,21 +259,15 @@ def particles_to_grid(env: ti.template(), part, body: ti.template()):
 
 @ti.func
 def node_sum(env: ti.template(), i, at, body: ti.template()):
-    """Momentum and mass of a strip of nodes in plane i: the copies of all parts, in their order.
-
-    They are added up where the velocities will be: stores to neighbours make it sums of whole vectors.
-    """
+    """Momentum and mass of a strip of nodes in plane i: the copies of all parts, in their order."""
     if ti.static(ON_DEVICE):
         return body.masses[env.index * env.count(layout.CAPACITY) + at]
     else:
-        zero = env.count(layout.ZERO)
-        here = opaque(zero, env.index * env.count(layout.CAPACITY) + at)
-        body.velocities[here] = overwrite(zero, body.velocities[here], strip(0.0))
+        total, zero = strip(0.0), env.count(layout.ZERO)
         for part in ti.static(range(COPIES)):
             if i >= env.count(layout.SLAB + 2 * part) and i < env.count(layout.SLAB + 2 * part + 1):
-                copy = opaque(zero, (env.index * COPIES + part) * env.count(layout.CAPACITY) + at)
-                body.velocities[here] = body.velocities[here] + body.masses[copy]
-        return body.velocities[here]
+                total += body.masses[opaque(zero, (env.index * COPIES + part) * env.count(layout.CAPACITY) + at)]
+        return total
 
 
 @ti.func

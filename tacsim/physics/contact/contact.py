@@ -97,6 +97,12 @@ def newton_step(t1, t2, miss):
 
 
 @ti.func
+def even_mobility(env: ti.template()):
+    """Of an even push on a surface, times its mass: by how much the filter makes it lighter."""
+    return 3.0 * env.param(layout.FILTERED) + env.param(layout.OWN)
+
+
+@ti.func
 def normal_force(spring, memory, drag):
     """Normal force of a contact and its new memory, which carries the force at rest.
 
@@ -181,7 +187,7 @@ def particle_contact(env: ti.template(), part, g, x, v, history, radius, gels: t
     moved = vec2(0.0)
     overlap = 0.0
     reach = 2.2 * 0.5 * h
-    c_n = CONTACT_DAMPING * k_n * dt
+    c_n = CONTACT_DAMPING * k_n * dt / even_mobility(env)
     if x[2] > -1.2 * h * layers and ti.abs(x[0]) < reach * nx and ti.abs(x[1]) < reach * ny:
         start = vec2(x[0] / h + 0.5 * nx, x[1] / h + 0.5 * ny)  # lattice coordinates, were the surface unmoved
         last = start - vec2(history[4], history[5]) / h

@@ -30,7 +30,9 @@ INVERSE_INERTIA = 36  # inverse moment of inertia of the particles then: xx, yy,
 REFERENCE_CENTRE = 42  # of the particles in the reference of the body's grid x, y, z [mm]
 CARRIED = 45  # mean displacement gradient of the particles since then, row by row
 EDGE_RADIUS = 54  # of an indenter [mm]
-PARAMS = 55
+OWN = 55  # weight of a node's own acceleration, force over mass, in how it moves; 1 is true inertia
+FILTERED = 56  # weight of that filtered by its neighbours' (tacsim.physics.gel.mass, tacsim.physics.body.mass)
+PARAMS = 57
 
 # counts (environments, COUNTS) int32
 ZERO = 0  # always 0: see tacsim.physics.exec.lanes.overwrite

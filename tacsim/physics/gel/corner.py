@@ -1,7 +1,8 @@
 """What keeps an element of the gel from turning inside out at a corner, where its one point of stress does not see it.
 
 A corner and its three neighbours span a tetrahedron; where its volume falls below a share of that at rest, it presses
-back like a fluid of the stiffness of the gel's pressure wave. Forces of a potential: they add up to none, nor turn.
+back like a fluid of the stiffness of the gel's pressure wave. Its forces lie along the
+gradients of that volume: they add up to none, nor turn.
 """
 
 from tacsim.compute.runtime import ti
@@ -11,6 +12,9 @@ from tacsim.physics.exec.lanes import LANES, vec3
 # The volume ratio of a corner at which it begins to press back, and its bulk modulus over lambda + 2 mu. A gel that is
 # dragged by much friction has corners of 0.2 by its own law: at 0.4 a ball at mu = 1.5 lost a quarter of its drag.
 NARROW, CORNER_STIFFNESS = 0.15, 24.0
+# The squared frequency of a narrow corner, of nodes as light as the surface's, times that of the step: at most this. A
+# corner between edges that are stretched is stiffer by the squares of its faces, and shook itself apart.
+BEARABLE = 1.5
 # Gradient of the hourglass modes in an element below which no corner is looked at: for an element that is not much
 # sheared besides, corners are above NARROW then.
 SKEW = 0.2
@@ -26,7 +30,8 @@ def displacement(gels: ti.template(), u, axis, layer, i, j, k):
 def hold_corners(env: ti.template(), gels: ti.template(), block, u, axis, layer, to, row):
     """Adds the forces of narrow corners to those of a block of elements; arguments as of `element_block`."""
     h, stiffness = env.param(layout.GEL_SPACING), env.param(layout.GEL_LAMBDA) + 2.0 * env.param(layout.GEL_MU)
-    share = CORNER_STIFFNESS * stiffness * h * h / 8.0
+    share, dt = CORNER_STIFFNESS * stiffness * h * h / 8.0, env.param(layout.STEP)
+    bearable = BEARABLE * env.param(layout.GEL_DENSITY) * (h * h / dt) ** 2 / 2.0
     for lane in range(LANES):
         if gels.lattice[block][lane] > 0.0:
             for corner in range(8):
@@ -40,7 +45,9 @@ def hold_corners(env: ti.template(), gels: ti.template(), block, u, axis, layer,
                 x, y, z = ey.cross(ez), ez.cross(ex), ex.cross(ey)
                 lacking = NARROW - ex.dot(x)
                 if lacking > 0.0:
-                    fx, fy, fz = share * lacking * sx * x, share * lacking * sy * y, share * lacking * sz * z
+                    square = x.norm_sqr() + y.norm_sqr() + z.norm_sqr() + (sx * x + sy * y + sz * z).norm_sqr()
+                    push = ti.min(share, bearable / square) * lacking
+                    fx, fy, fz = push * sx * x, push * sy * y, push * sz * z
                     for d in ti.static(range(3)):
                         at = to + lane + d * row
                         gels.corners[at + 3 * row * (4 * (1 - i) + 2 * j + k)] += fx[d]

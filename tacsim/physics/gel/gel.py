@@ -16,6 +16,9 @@ from tacsim.physics.exec.lanes import COPIES, LANES, ON_DEVICE, PARTS, aligned_z
 from tacsim.physics.exec.layout import GEL_DENSITY, GEL_LAMBDA, GEL_MU, GEL_SPACING
 from tacsim.physics.units import MM, MPA
 
+QUANTITIES = 6  # of a node
+LATTICE_ROWS = 6
+
 
 @dataclass(frozen=True)
 class GelParams:
@@ -88,14 +91,16 @@ def _lattice_words(gel: GelParams) -> str:
 class GelState:
     """Nodes of all gels of all environments, laid out for the kernels.
 
-    nodes: (E, gels, 3, 3, nz + 1, P) displacement, velocity, force; axis; layer; the nodes of a layer as one row, node
+    nodes: (E, gels, QUANTITIES, 3, nz + 1, P) displacement, velocity, force, and what their accelerations pass through
+    (tacsim/physics/gel/mass.py); axis; layer; the nodes of a layer as one row, node
     (i, j) at i (ny + 1) + j, zeros behind the last. One run of equal operations then covers a whole layer.
     surface: (E, gels, 2, nx + 3, ny + 3, 4) displacement and velocity of the surface, its rim repeated once outside;
     behind a displacement the pressure that the node carries [MPa], under an indenter.
     contact_force: (E, COPIES, gels, P, 4) on the surface nodes, one copy a part; zeros between substeps.
     corners: (E, PARTS, 2, 24, W) forces of the elements of two layers on their corners: corner, axis. On a device,
     which works on all layers at once, (E, gels, nz, 24, W).
-    lattice: (2, P) 1 at the first node of an element, else 0; and 1 / share of a node's mass, 0 where there is no node.
+    lattice: (LATTICE_ROWS, P) 1 at the first node of an element, else 0; 1 / share of a node's mass, 0 where there is
+    no node; weights of its neighbours before and after it along x, and along y, in a mean over the elements round it.
     """
 
     def __init__(self, params: GelParams, environments: int, gels: int) -> None:
@@ -109,12 +114,12 @@ class GelState:
         longest = -(-blocks // pieces)
         self._row = row
         # Elements and nodes meet at offsets 0, 1, row and row + 1, so kernels read that far beyond both ends.
-        self._nodes, self.nodes = with_margins((environments, gels, 3, 3, nz + 1, width), row + 1)
+        self._nodes, self.nodes = with_margins((environments, gels, QUANTITIES, 3, nz + 1, width), row + 1)
         self.surface = np.zeros((environments, gels, 2, nx + 3, ny + 3, 4), np.float32)
         self.contact_force = np.zeros((environments, COPIES, gels, width, 4), np.float32)
         cut = (gels, nz, 24, blocks + halo) if ON_DEVICE else (PARTS, 2, 24, (longest + halo) * LANES)
         self._corners, self.corners = with_margins((environments, *cut), row + 1)
-        self.lattice = np.zeros((2, width), np.float32)
+        self.lattice = np.zeros((LATTICE_ROWS, width), np.float32)
         whole = np.zeros((nx + 1, row), np.float32)
         whole[:-1, :-1] = 1.0
         share = np.full((nx + 1, row), 1.0, np.float32)
@@ -122,6 +127,11 @@ class GelState:
         share[:, [0, -1]] *= 0.5
         self.lattice[0, :nodes] = whole.ravel()
         self.lattice[1, :nodes] = 1.0 / share.ravel()
+        for axis in (0, 1):
+            weights = np.full((2, nx + 1, row), 0.25, np.float32)  # before, after
+            ends = np.moveaxis(weights, 1 + axis, 0)
+            ends[0], ends[-1] = np.array([[[0.0], [0.5]], [[0.5], [0.0]]])
+            self.lattice[2 + 2 * axis : 4 + 2 * axis, :nodes] = weights.reshape(2, nodes)
         self._shape = (nx + 1, row)
 
     def _view(self, quantity: int) -> np.ndarray:

@@ -23,6 +23,7 @@ from tacsim.physics.exec.lanes import (
     vec4,
 )
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
+from tacsim.physics.gel.gel import QUANTITIES
 
 Lattice = ti.types.ndarray(dtype=lanes, ndim=1)
 
@@ -102,7 +103,7 @@ def gel_forces(env: ti.template(), part, gels: ti.template()):
     row = ((blocks + pieces - 1) // pieces + halo) * LANES  # of corners
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = margin(gels) + (env.index * gels.number + g) * 9 * axis
+    u = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
     rows = filled(0.0, ROWS, LANES)
     for lane in range(LANES):
         rows[SMALLEST, lane] = 1e9
@@ -150,27 +151,28 @@ def add_contact_forces(env: ti.template(), gels: ti.template(), g, first, last, 
 
 
 @ti.func
-def gel_advance(env: ti.template(), part, gels: ti.template()):
-    """Symplectic Euler with lumped masses on this part's nodes of its gel, and their surface.
-
-    Damps the old velocity only, so that force readings stay exact. The force of this part on the backing is noted. On a
-    device a part is one column of nodes: of gel part // columns, number part % columns.
-    """
-    zero, dt, h = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING)
-    nx, ny, layers = gels.nx, gels.ny, gels.layers
+def nodes_of_part(gels: ti.template(), part):
+    """A part's gel, where it notes its sums, and its columns of nodes: first block, and the one after the last. On a
+    device a part is one column: of gel part // columns, number part % columns."""
     pieces = PARTS // gels.number
-    row, count = ny + 1, (nx + 1) * (ny + 1)
-    blocks = (count + LANES - 1) // LANES
-    g, piece = part // pieces, part % pieces
-    slot, first, last = part, share_start(blocks, piece, pieces), share_start(blocks, piece + 1, pieces)
+    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
+    g, slot, piece = part // pieces, part, part % pieces
+    first, last = share_start(blocks, piece, pieces), share_start(blocks, piece + 1, pieces)
     if ti.static(ON_DEVICE):
         g, first = part // blocks, part % blocks
         slot, last = g * pieces + first % pieces, first + 1
+    return g, slot, first, last
+
+
+@ti.func
+def gel_totals(env: ti.template(), part, gels: ti.template()):
+    """Whole forces on this part's nodes of its gel, contact included. Their force on the backing is noted."""
+    zero, layers = env.count(layout.ZERO), gels.layers
+    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
+    g, slot, first, last = nodes_of_part(gels, part)
     layer = blocks * LANES
     axis = (layers + 1) * layer
-    u = margin(gels) + (env.index * gels.number + g) * 9 * axis
-    keep = 1.0 - env.param(layout.GEL_DAMPING) * dt
-    rate = dt / (env.param(layout.GEL_DENSITY) * h * h * h)
+    u = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
     for d in ti.static(range(3)):
         held = lanes(0.0)
         for block in range(first, last):
@@ -186,6 +188,21 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
             gels.contact_force[at + d] = 0.0
     else:
         add_contact_forces(env, gels, g, first, last, top + 6 * axis, axis, zero)
+
+
+@ti.func
+def gel_advance(env: ti.template(), part, gels: ti.template()):
+    """Symplectic Euler with lumped masses on this part's nodes of its gel, and their surface. Damps the old velocity
+    only, so that force readings stay exact."""
+    gel_totals(env, part, gels)
+    zero, dt, h, layers = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING), gels.layers
+    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
+    g, _slot, first, last = nodes_of_part(gels, part)
+    layer = blocks * LANES
+    axis = (layers + 1) * layer
+    u = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
+    keep = 1.0 - env.param(layout.GEL_DAMPING) * dt
+    rate = dt / (env.param(layout.GEL_DENSITY) * h * h * h)
     for k in range(1, layers + 1):
         scale = ti.select(k == layers, 2.0 * rate, rate)
         for block in range(first, last):
@@ -197,6 +214,18 @@ def gel_advance(env: ti.template(), part, gels: ti.template()):
                 place = load_lanes(gels.nodes, x) + dt * speed
                 store_lanes(gels.nodes, v, speed, zero)
                 store_lanes(gels.nodes, x, place, zero)
+    lay_surface(env, part, gels)
+
+
+@ti.func
+def lay_surface(env: ti.template(), part, gels: ti.template()):
+    """This part's nodes of the top layer, displacement and velocity, to `surface`, and its rim outside."""
+    zero, nx, ny, layers = env.count(layout.ZERO), gels.nx, gels.ny, gels.layers
+    row, count = ny + 1, (nx + 1) * (ny + 1)
+    layer = (count + LANES - 1) // LANES * LANES
+    g, _slot, first, last = nodes_of_part(gels, part)
+    axis = (layers + 1) * layer
+    top = margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis + layers * layer
     first_row = surface_row(env, gels, g)
     i, j = first * LANES // row, first * LANES % row
     for block in range(first, last):

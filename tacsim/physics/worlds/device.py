@@ -8,6 +8,7 @@ Where its arrays are: tacsim.physics.worlds.device_state.
 """
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, grid_changes, second_changes
 from tacsim.physics.body.transfers import Body, Strips, grid_to_particles, particles_to_grid
 from tacsim.physics.contact.indenter import POINTS, Indenter, Pressure, Slip, Values, carry, indent
 from tacsim.physics.exec import layout
@@ -15,6 +16,7 @@ from tacsim.physics.exec.environment import Counts, Environment, Floats, Params,
 from tacsim.physics.exec.graph import Graph
 from tacsim.physics.exec.lanes import LANES, PARTS, smallest_lane, strip
 from tacsim.physics.gel.element import ROWS, SMALLEST, element_block
+from tacsim.physics.gel.gel import LATTICE_ROWS, QUANTITIES
 from tacsim.physics.gel.kernels import (
     Lattice,
     gel_advance,
@@ -24,6 +26,7 @@ from tacsim.physics.gel.kernels import (
     surface_at,
     surface_row,
 )
+from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 from tacsim.physics.worlds.hybrid_kernels import ContactHistories, Drive, gel_contact, grid_update
 from tacsim.physics.worlds.survey import BLOCKS
 from tacsim.physics.worlds.survey_kernels import Sums
@@ -62,7 +65,7 @@ def element(env: ti.template(), gels: ti.template(), g, k, block):
     """Forces of one element of gel g on its corners."""
     gel, blocks = env.index * gels.number + g, (gels.nx + 1) * (gels.ny + 1)
     axis, row = (gels.layers + 1) * blocks, blocks + gels.ny + 2
-    u = margin(gels) + gel * 9 * axis + k * blocks + block
+    u = margin(gels) + gel * 3 * QUANTITIES * axis + k * blocks + block
     to = margin(gels) + (gel * gels.layers + k) * 24 * row + gels.ny + 2 + block
     rows = ti.Matrix.zero(ti.f32, ROWS, LANES)
     rows[SMALLEST, 0] = 1e9
@@ -72,7 +75,7 @@ def element(env: ti.template(), gels: ti.template(), g, k, block):
 
 @ti.func
 def column(env: ti.template(), gels: ti.template(), g, block):
-    """Forces on one column of nodes of gel g, from its backing to its surface, and its motion."""
+    """Elements' forces on one column of nodes of gel g, from its backing to its surface."""
     gel, blocks, layers = env.index * gels.number + g, (gels.nx + 1) * (gels.ny + 1), gels.layers
     axis, row = (layers + 1) * blocks, blocks + gels.ny + 2
     for k in range(layers + 1):
@@ -80,9 +83,8 @@ def column(env: ti.template(), gels: ti.template(), g, block):
         j = margin(gels) + (gel * layers + ti.max(k - 1, 0)) * 24 * row + gels.ny + 2 + block
         below, above = ti.select(k < layers, 1.0, 0.0), ti.select(k > 0, 1.0, 0.0)
         for d in ti.static(range(3)):
-            to = margin(gels) + (gel * 9 + 6 + d) * axis + k * blocks + block
+            to = margin(gels) + (gel * 3 * QUANTITIES + 6 + d) * axis + k * blocks + block
             node_block(gels, to, i + d * row, j + d * row, below, above, row, 0)
-    gel_advance(env, g * blocks + block, gels)
 
 
 @ti.kernel
@@ -93,7 +95,7 @@ def press_substep(
     params: Params, counts: Counts, partial: Partial, layers: ti.i32,
 ):  # fmt: skip
     """One substep of every environment's indenter on its gel; see `tacsim.physics.worlds.press.press_substeps`."""
-    for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // 2):
+    for e, k, n in ti.ndrange(counts.shape[0], layers, lattice.shape[0] // LATTICE_ROWS):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1)), 0, k, n)
@@ -106,12 +108,13 @@ def press_substep(
         if is_active(env, clock):
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
             indent(env, cell, clock[0], drive, gels, ti.static(Indenter(slip, pressure, values)))
-    for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // 2):
+    for e, n in ti.ndrange(counts.shape[0], lattice.shape[0] // LATTICE_ROWS):
         env = ti.static(Environment(e, params, counts, partial))
         if clock[1] < counts[e, layout.STEPS]:
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
             carry(env, n, gels)
             column(env, gels, 0, n)
+            gel_advance(env, n, gels)
         if e + n == 0:
             clock[0] += 1
 
@@ -128,7 +131,7 @@ def elements_of_hybrid(
     """First third of a substep of every environment's two gels and body
     (`tacsim.physics.worlds.hybrid_kernels.substeps`): elements pull at their corners; what is summed starts from
     zero."""
-    for e, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // 2):
+    for e, g, k, n in ti.ndrange(counts.shape[0], 2, layers, lattice.shape[0] // LATTICE_ROWS):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             element(env, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)), g, k, n)
@@ -144,7 +147,7 @@ def elements_of_hybrid(
 def scatter_of_hybrid(
     clock: Clock, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    particles: Floats, masses: Strips, velocities: Strips, histories: ContactHistories,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, ceiling: Ceiling, most_particles: ti.i32, most_nodes: ti.i32,
 ):  # fmt: skip
     """Second third: contact, particles to the grid, motion of the gels' and the grid's nodes, whose masses are zero
@@ -160,22 +163,46 @@ def scatter_of_hybrid(
             for g in range(2):
                 gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g, clock[0] % 2])
             particles_to_grid(env, p, body)
-    columns = lattice.shape[0] // 2
+    columns = lattice.shape[0] // LATTICE_ROWS
+    for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock):
+            if n < 2 * columns:
+                gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
+                column(env, gels, n // columns, n % columns)
+                gel_means(env, n, gels)
+            elif n - 2 * columns < grid_nodes(env):
+                body = ti.static(Body(particles, masses, velocities, changes))
+                grid_changes(env, n - 2 * columns, clock[0], body)
+    for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock):
+            if n < 2 * columns:
+                gel_even(env, n, ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2)))
+            elif n - 2 * columns < grid_nodes(env):
+                cell_means(env, n - 2 * columns, CHANGE, ti.static(Body(particles, masses, velocities, changes)))
     for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):
             if n < 2 * columns:
                 gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
                 g, at = n // columns, n % columns
-                column(env, gels, g, at)
+                gel_advance_filtered(env, n, gels)
                 i, j = at // (gels.ny + 1), at % (gels.ny + 1)
                 height = surface[surface_at(gels, surface_row(env, gels, g) + i + 1, j + 1) + 2]
                 if height > ceiling[e, g, (clock[0] + 1) % 2]:
                     ti.atomic_max(ceiling[e, g, (clock[0] + 1) % 2], height)
             elif n - 2 * columns < grid_nodes(env):
-                node = n - 2 * columns
-                grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities)))
-                masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
+                second_changes(env, n - 2 * columns, ti.static(Body(particles, masses, velocities, changes)))
+    for e, node in ti.ndrange(counts.shape[0], most_nodes):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock) and node < grid_nodes(env):
+            cell_means(env, node, SECOND, ti.static(Body(particles, masses, velocities, changes)))
+    for e, node in ti.ndrange(counts.shape[0], most_nodes):
+        env = ti.static(Environment(e, params, counts, partial))
+        if is_active(env, clock) and node < grid_nodes(env):
+            grid_update(env, node, clock[0], drive, ti.static(Body(particles, masses, velocities, changes)))
+            masses[e * env.count(layout.CAPACITY) + node] = strip(0.0)
 
 
 @ti.kernel

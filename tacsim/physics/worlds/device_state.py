@@ -223,6 +223,7 @@ class DeviceHybrid(DeviceState):
         return {
             "masses": self.arrays.allocate("masses", strip, masses.shape[:-1]),
             "velocities": self.arrays.allocate("velocities", strip, velocities.shape[:-1]),
+            "changes": self.arrays.allocate("changes", ti.f32, (self._body.changes.size,)),
             "sums": self.arrays.allocate("sums", ti.f32, (len(self._params), MOMENTS, BLOCKS)),
             "most_particles": max(self._body.counts),
             "most_nodes": int(self._counts[:, layout.GRID : layout.GRID + 3].prod(axis=1).max()),

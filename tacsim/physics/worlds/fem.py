@@ -49,9 +49,6 @@ if TYPE_CHECKING:  # a device's kernels
     from tacsim.physics.worlds.device_state import DeviceState
     from tacsim.physics.worlds.survey import Survey
 
-# zeta in alpha = zeta c / thickness, the damping of a gel: while anything is driven, when it makes the gel lag, and
-# what yields or slides remembers that; while held
-ZETA_GEL, ZETA_GEL_HELD = 0.5, 1.0
 # Of the speed of the gel's shear wave, of an indenter with friction: up to it a slide ends within 2 % of a slow one; at
 # 0.25 it is up to 3 % off, at 0.5 up to 17 %
 HURRIED_BY_SHEAR = 0.155
@@ -271,7 +268,7 @@ class FemWorld(BaseWorld):
         )
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
-        mach, gel = self.scene.settling.flow_mach, self._gel
+        mach, gel = self.scene.flow_mach, self._gel
         return plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
 
     @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part

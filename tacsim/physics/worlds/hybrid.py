@@ -35,6 +35,7 @@ from tacsim.physics.exec.layout import (
     CENTRE,
     COUNTS,
     ELEMENTS,
+    FILTERED,
     FORCE,
     FRICTION,
     GEL_DAMPING,
@@ -45,6 +46,7 @@ from tacsim.physics.exec.layout import (
     HOUSING_FORCE,
     INVERSE_INERTIA,
     NUMBERS,
+    OWN,
     PARAMS,
     REFERENCE_CENTRE,
     RIGID_MASS_SCALE,
@@ -59,7 +61,7 @@ from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
 from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.fem import ZETA_GEL, ZETA_GEL_HELD, FemState, FemWorld, stack_drives
+from tacsim.physics.worlds.fem import FemState, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import substeps
 from tacsim.pose import HALF_TURN_X
 
@@ -69,7 +71,13 @@ if TYPE_CHECKING:
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
 COURANT = 0.5
 # Damping of a driven motion falsifies its path, since gels yield and the body spreads; damping of the hold does not.
+ZETA_GEL, ZETA_GEL_HELD = 0.8, 1.6  # zeta in rate = zeta c / thickness
 ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
+# How nodes answer to forces: by their own acceleration, and by that filtered by (4 S - 1)^2, S the mean over the cells
+# round them. What the mesh resolves, S = 1, is six times as light; the shortest waves, S = 0, are as heavy as they are.
+TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
+SELECTIVE_INERTIA = {OWN: 1 / 3, FILTERED: 2 / 3}
+FILTERED_RIGID = SELECTIVE_INERTIA[OWN] + 9.0 * SELECTIVE_INERTIA[FILTERED] - 1.0  # lighter by this are rigid motions
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 # Yield stresses (Frobenius norm) of hydrostatic tension that nothing gives a squeezed body: beyond, particles have
 # strains that no node of the grid feels (docs/physics.md)
@@ -122,7 +130,8 @@ class HybridState(FemState):
 
     def fit(self, index: int, cell: float, extents: np.ndarray) -> None:
         """Lays its grid. Raises MemoryError."""
-        self._particles.fit(index, cell, cell, self.params, self.counts, extents)
+        # a node at its border has no mass: the cells round each that has are all there (tacsim.physics.body.mass)
+        self._particles.fit(index, cell, 2.0 * cell, self.params, self.counts, extents)
 
     def moments(self, index: int) -> Moments:
         return moments_of(self._particles, index) if self.device is None else self.device.moments(index)
@@ -164,7 +173,8 @@ class HybridState(FemState):
             return
         self._gels.refresh()
         run_team(
-            substeps, drive, self._gels.arguments(), self._particles.arguments(), self._contact_history, self.params,
+            substeps, drive, self._gels.arguments(), self._particles.arguments(),
+            self._particles.changes.reshape(-1), self._contact_history, self.params,
             self.counts, self.partial, active=list(drives),
         )  # fmt: skip
 
@@ -231,12 +241,12 @@ class HybridWorld(FemWorld):
             # The body's slowest mode is its rigid translation between two soft gels: there it counts as lighter by
             # the number of particle layers. Two contact layers of stiffness ~ m_p / dt^2 then stay below
             # the step limit.
-            RIGID_MASS_SCALE: max(1.0, height / self._body.spacing),
+            RIGID_MASS_SCALE: max(1.0, height / self._body.spacing - FILTERED_RIGID),
         }  # fmt: skip
         held = {
             GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
         }  # fmt: skip
-        masses = self._masses(self._gel.density, self._body.density, step)
+        masses = {**self._masses(self._gel.density, self._body.density, step), **SELECTIVE_INERTIA}
         return Inertia({**masses, **damping, WIDENING: 0.0}, step, held=held, flowing={WIDENING: 1.0})
 
     def _true_inertia(self) -> Inertia:
@@ -246,7 +256,7 @@ class HybridWorld(FemWorld):
         wave = math.sqrt(self._body.density / density)  # the body's pressure wave; the gel's has speed 1
         step = COURANT * min(self._body.cell / wave, self._gel.spacing)
         undamped = {GEL_DAMPING: 0.0, BODY_DAMPING: 0.0, RIGID_MASS_SCALE: 1.0, WIDENING: 0.0}
-        return Inertia({**self._masses(self._gel.density, density, step), **undamped}, step, second)
+        return Inertia({**self._masses(self._gel.density, density, step), **TRUE_INERTIA, **undamped}, step, second)
 
     def _masses(self, gel: float, body: float, step: float) -> dict[int, float]:
         """Entries of `params` that follow from the densities [MPa] and the substep [mm]."""

@@ -1,13 +1,13 @@
 """Kernels of two gels round a plasticine body: contact, transfers and motion, many substeps in one launch."""
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.mass import CHANGE, SECOND, cell_means, filtered_change, grid_changes, second_changes
 from tacsim.physics.body.transfers import (
     Body,
     Strips,
     block_range,
     clear_masses,
     grid_to_particles,
-    node_sum,
     particles_to_grid,
 )
 from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
@@ -32,11 +32,11 @@ from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, n
 from tacsim.physics.gel.kernels import (
     Lattice,
     contact_force_start,
-    gel_advance,
     gel_forces,
     gels_of,
     surface_row,
 )
+from tacsim.physics.gel.mass import gel_advance_filtered, gel_even, gel_means
 
 Drive = ti.types.ndarray(dtype=ti.f32, ndim=5)
 TURN = 1.0 / 3.0  # share of the boost that rotations get: with more of it bodies overshoot when a slide stops
@@ -136,13 +136,16 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
         for j in range(j0, j1):
             for k in range(k0, k1):
                 at = (i * ny + j) * nz + k
-                q = node_sum(env, i, at, body)
+                old = strip(0.0)
+                if it > 0:
+                    old = body.velocities[base + at]
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
-                    if q[4 * n + 3] != 0.0:  # a mass that is not a number must show
+                    change, m = filtered_change(env, body, it, i, j, k * NODES + n)
+                    if m != 0.0:  # a mass that is not a number must show
                         arm = origin + cell * vec3(i, j, k * NODES + n) - reference_centre
                         x = centre + arm + carried @ arm
-                        velocity = vec3(q[4 * n], q[4 * n + 1], q[4 * n + 2]) / q[4 * n + 3] + dt * weight
+                        velocity = vec3(old[4 * n], old[4 * n + 1], old[4 * n + 2]) + change
                         velocity += boost + turn.cross(x - centre)
                         t = only_upper + share * ti.max(0.0, ti.min(1.0, (x - p0).dot(axis) / length2))
                         imposed = held * ((1.0 - t) * (v0 + w0.cross(x - p0)) + t * (v1 + w1.cross(x - p1)))
@@ -218,13 +221,14 @@ def gel_contact(
 def substeps(
     team: ti.i32, drive: Drive,
     nodes: Floats, surface: Floats, contact_force: Floats, corners: Floats, lattice: Lattice,
-    particles: Floats, masses: Strips, velocities: Strips, histories: ContactHistories,
+    particles: Floats, masses: Strips, velocities: Strips, changes: Floats, histories: ContactHistories,
     params: Params, counts: Counts, partial: Partial, sync: Sync,
 ):  # fmt: skip
     """Explicit substeps of every environment's scene in one launch, `team` threads an environment.
 
-    Two stages a substep: what is scattered must be whole before it is summed, and summed before it is gathered. A part
-    is gathered in the stage in which it is scattered again.
+    Stages of a substep: what is scattered must be whole before it is summed, the sums whole before each pass of the
+    filters reads its neighbours', and what moves before it is gathered. A part is gathered in the stage in which it is
+    scattered again.
     """
     for task in range(sync.shape[0] * team * CHUNK):
         for _ in range(first_in_chunk(task)):
@@ -232,14 +236,14 @@ def substeps(
             index = sync[turn, ENVIRONMENT]
             env = ti.static(Environment(index, params, counts, partial))
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
-            body = ti.static(Body(particles, masses, velocities))
+            body = ti.static(Body(particles, masses, velocities, changes))
             steps = env.count(layout.STEPS)
-            pieces = PARTS * (2 * steps + 1)
+            pieces = PARTS * (6 * steps + 1)
             highest, known = ti.Vector([0.0, 0.0]), -1  # of the two gels, in this stage
             piece = next_piece(sync, turn, pieces)
             while piece < pieces:
                 stage, part = piece // PARTS, piece % PARTS
-                it, scatters = stage // 2, stage % 2 == 0
+                it, scatters = stage // 6, stage % 6 == 0
                 for _new in range(once_if(scatters and stage != known)):
                     known = stage
                     for g in ti.static(range(2)):
@@ -253,8 +257,17 @@ def substeps(
                     clear_masses(env, part, body)
                     particles_to_grid(env, part, body)
                     gel_forces(env, part, gels)
-                for _motion in range(once_if(not scatters)):
-                    gel_advance(env, part, gels)
+                for _totals in range(once_if(stage % 6 == 1)):
+                    gel_means(env, part, gels)
+                    grid_changes(env, part, it, body)
+                for _even in range(once_if(stage % 6 == 2)):
+                    gel_even(env, part, gels)
+                for _cells in range(once_if(stage % 6 == 2 or stage % 6 == 4)):
+                    cell_means(env, part, ti.select(stage % 6 == 2, CHANGE, SECOND), body)
+                for _motion in range(once_if(stage % 6 == 3)):
+                    gel_advance_filtered(env, part, gels)
+                    second_changes(env, part, body)
+                for _motion in range(once_if(stage % 6 == 5)):
                     grid_update(env, part, it, drive, body)
                 piece_done(sync, turn)
                 piece = next_piece(sync, turn, pieces)

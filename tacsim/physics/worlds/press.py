@@ -60,21 +60,17 @@ from tacsim.physics.exec.team import (
 )
 from tacsim.physics.failure.health import Health, SimulationDiverged, check_launch
 from tacsim.physics.gel.gel import GelParams, GelState, common_lattice, gel_params
-from tacsim.physics.gel.kernels import (
-    Lattice,
-    gel_advance,
-    gel_forces,
-    gels_of,
-)
+from tacsim.physics.gel.kernels import Lattice, gel_advance, gel_forces, gels_of
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_second
 from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.fem import ZETA_GEL, FemState, FemWorld, stack_drives
+from tacsim.physics.worlds.fem import FemState, FemWorld, stack_drives
 from tacsim.physics.worlds.hybrid_kernels import Drive
 
 # dt / (spacing / wave speed). Edges of a rigid box tear the surface up at 0.6, without a NaN; and the penalty falls
 # with the step's square, so 0.5 costs overlap.
 COURANT = 0.4
+ZETA_GEL = 0.5  # of its damping, zeta c / thickness: it makes the gel lag, and friction remembers that
 CLEARANCE = 0.1e-3  # gap between gel and indenter at construction [m]
 GRID_SPACING = 0.1e-3  # of a mesh's distance grid [m]
 UNSEEN = 0.5  # spacings of contact points: how deep an indenter may dip between them; the largest such ball: 0.35

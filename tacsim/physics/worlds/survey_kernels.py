@@ -8,6 +8,7 @@ from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Floats, Params
 from tacsim.physics.exec.graph import Graph
 from tacsim.physics.exec.lanes import vec3
+from tacsim.physics.gel.gel import LATTICE_ROWS, QUANTITIES
 from tacsim.physics.gel.kernels import Lattice
 from tacsim.physics.worlds.survey import (
     BLOCKS,
@@ -81,11 +82,11 @@ def survey_gels(
     gels: ti.i32,
 ):  # fmt: skip
     """gels: of each environment. A node's element is the one that it begins."""
-    for e, g, k, n in ti.ndrange(counts.shape[0], gels, layers + 1, lattice.shape[0] // 2):
+    for e, g, k, n in ti.ndrange(counts.shape[0], gels, layers + 1, lattice.shape[0] // LATTICE_ROWS):
         nx, ny = counts[e, layout.ELEMENTS], counts[e, layout.ELEMENTS + 1]
-        row, layer = ny + 1, lattice.shape[0] // 2
+        row, layer = ny + 1, lattice.shape[0] // LATTICE_ROWS
         axis = (layers + 1) * layer
-        at = ny + 2 + (e * gels + g) * 9 * axis + k * layer + n  # behind the margin
+        at = ny + 2 + (e * gels + g) * 3 * QUANTITIES * axis + k * layer + n  # behind the margin
         i, j = n // row, n % row
         bad = 0
         for d in range(6):  # displacement, velocity

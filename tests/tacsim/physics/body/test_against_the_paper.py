@@ -8,6 +8,7 @@ from tacsim.compute.runtime import start, ti
 from tacsim.geometry.sampling import body_points
 from tacsim.models.scene import Body as BodyModel
 from tacsim.models.scene import BodyMaterial, Box
+from tacsim.physics.body.mass import grid_changes
 from tacsim.physics.body.plasticine import BodyState, body_params
 from tacsim.physics.body.transfers import (
     Body,
@@ -44,13 +45,15 @@ def scatter(
 
 @ti.kernel
 def update(
-    drive: Drive, particles: Floats, masses: Strips, velocities: Strips, params: Params, counts: Counts,
-    partial: Partial,
+    drive: Drive, changes: Floats, particles: Floats, masses: Strips, velocities: Strips, params: Params,
+    counts: Counts, partial: Partial,
 ):  # fmt: skip
     ti.loop_config(serialize=True)
     for part in range(PARTS):
-        body = ti.static(Body(particles, masses, velocities))
-        grid_update(ti.static(Environment(0, params, counts, partial)), part, 0, drive, body)
+        env = ti.static(Environment(0, params, counts, partial))
+        body = ti.static(Body(particles, masses, velocities, changes))
+        grid_changes(env, part, 0, body)
+        grid_update(env, part, 0, drive, body)
 
 
 @ti.kernel
@@ -110,7 +113,7 @@ def stages() -> Stages:
     found["elastic strain"] = state.e().copy(), minus_identity(f)
     found["trial strain"] = minus_identity(trial), minus_identity(f)
 
-    update(np.zeros((1, 1, 2, 6, 3), np.float32), *arrays, *numbers)
+    update(np.zeros((1, 1, 2, 6, 3), np.float32), state.changes.reshape(-1), *arrays, *numbers)
     mls_mpm.grid_update(momentum, mass, dt, GRAVITY.astype(np.float32))
     velocities = state.velocities[0, :used].reshape(*shape, 4)[..., :3]
     heavy = mass > 1e-3 * mass.max()  # a node that hardly anything reaches divides rounding by rounding

@@ -49,6 +49,17 @@ def test_forces_balance_and_point_into_the_gels(squeezed: HybridWorld) -> None:
     assert np.abs([*lower[:2], *upper[:2]]).max() < 5e-3 * abs(lower[2])
 
 
+def test_what_an_earlier_grid_has_left_in_memory_moves_nothing() -> None:
+    """The memory of the body's grid is used again by grids of other shapes, laid anew where the body has deformed."""
+    worlds = world(), world()
+    for w, left in zip(worlds, (0.0, 7.0), strict=True):
+        squeeze(w, 0.2e-3)
+        w._state._particles.changes[...] = left
+        squeeze(w, 0.4e-3)
+    a, b = (w.snapshot() for w in worlds)
+    assert all(a[name].tobytes() == b[name].tobytes() for name in a)
+
+
 def test_the_body_yields_and_keeps_its_volume(squeezed: HybridWorld) -> None:
     truth = squeezed.truth()
     assert 4.4e-3 < truth.height < 4.6e-3  # 1.4 mm less, minus what the gels give; 4.512 at Mach 0.003

@@ -1,0 +1,124 @@
+"""Selective mass scaling of the body, on its grid: what the grid resolves answers as if six times lighter.
+
+The change of a node's velocity in a substep, a, becomes OWN a + FILTERED (4 S - 1)^2 a, S the mean over the cells round
+a node, each of which has the mean of its nodes by mass; as the gel's accelerations do (tacsim.physics.gel.mass). A
+node keeps its velocity from the last substep, since the grid stays; the first substep of a launch has none to compare
+with, and is not filtered. Why: docs/decisions/0002.
+"""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.body.transfers import node_sum
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, strip, vec3
+
+# In `changes` (environments, 3, nodes, 4): change of a node's momentum, and its mass; mean change of velocity of the
+# cell that a node begins; the first again, after the filter's first pass
+CHANGE, CELL, SECOND = 0, 1, 2
+
+
+@ti.func
+def changes_at(env: ti.template(), which, node):
+    return 4 * ((env.index * 3 + which) * env.count(layout.CAPACITY) * NODES + node)
+
+
+@ti.func
+def box_of_part(env: ti.template(), part):
+    """First node of a part's share of the grid, and the one after its last, along x, y, z; on a device it has one."""
+    nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    low, high = ti.Vector([0, 0, 0]), ti.Vector([0, ny, nz])
+    if ti.static(ON_DEVICE):
+        low = ti.Vector([part // (ny * nz), part // nz % ny, part % nz])
+        high = low + 1
+    else:
+        low[0], high[0] = part_range(nx, part)
+    return low, high
+
+
+@ti.func
+def grid_changes(env: ti.template(), part, it, body: ti.template()):
+    """Changes of momentum since the last substep, and masses, of this part's nodes."""
+    dt, weight = env.param(layout.STEP), env.param3(layout.GRAVITY)
+    ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    base, to = env.index * env.count(layout.CAPACITY), changes_at(env, CHANGE, 0)
+    low, high = box_of_part(env, part)
+    for i in range(low[0], high[0]):
+        first, last = ((i * ny + low[1]) * nz + low[2]) // NODES, ((i * ny + high[1] - 1) * nz + high[2]) // NODES
+        for at in range(first, last):
+            q, old = node_sum(env, i, at, body), strip(0.0)
+            if it > 0:
+                old = body.velocities[base + at]
+            for n in ti.static(range(NODES)):
+                start, mass = bounded(to + 4 * (at * NODES + n), 1), q[4 * n + 3]
+                for c in ti.static(range(3)):
+                    body.changes[start + c] = q[4 * n + c] + mass * (dt * weight[c] - old[4 * n + c])
+                body.changes[start + 3] = mass
+
+
+@ti.func
+def cell_means(env: ti.template(), part, which, body: ti.template()):
+    """Mean change of velocity of the cells that this part's nodes begin, from the changes of momentum at `which`."""
+    nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    source, to, line, plane = changes_at(env, which, 0), changes_at(env, CELL, 0), 4 * nz, 4 * nz * ny
+    low, high = box_of_part(env, part)
+    for i in range(low[0], ti.min(high[0], nx - 1)):
+        for j in range(low[1], ti.min(high[1], ny - 1)):
+            here, last = i * plane + j * line, ti.min(high[2], nz - 1)
+            for x in range(4 * low[2], 4 * last):
+                s = bounded(source + here + x, 1)
+                body.changes[bounded(to + here + x, 1)] = (
+                    (body.changes[s] + body.changes[s + 4])
+                    + (body.changes[s + line] + body.changes[s + line + 4])
+                    + (body.changes[s + plane] + body.changes[s + plane + 4])
+                    + (body.changes[s + plane + line] + body.changes[s + plane + line + 4])
+                )
+            for k in range(low[2], last):
+                s = bounded(to + here + 4 * k, 1)
+                mass = body.changes[s + 3]
+                for c in ti.static(range(3)):
+                    body.changes[s + c] = ti.select(mass > 0.0, body.changes[s + c] / mass, 0.0)
+
+
+@ti.func
+def mean_of_cells(env: ti.template(), body: ti.template(), i, j, k):
+    """Of the eight cells round a node that is not at the border of the grid."""
+    ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    total, s = vec3(0.0), bounded(changes_at(env, CELL, (i * ny + j) * nz + k), 1)
+    for p, q, r in ti.static(ti.ndrange(2, 2, 2)):
+        for c in ti.static(range(3)):
+            total[c] += body.changes[s - 4 * ((p * ny + q) * nz + r) + c]
+    return 0.125 * total
+
+
+@ti.func
+def second_changes(env: ti.template(), part, body: ti.template()):
+    """4 S - 1 of the changes of this part's nodes; 0 at the border, where what stood there in a grid of another shape
+    would count as mass."""
+    nx, ny, nz = env.count(layout.GRID), env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    low, high = box_of_part(env, part)
+    for i in range(low[0], high[0]):
+        for j in range(low[1], high[1]):
+            for k in range(low[2], high[2]):
+                node, mean = (i * ny + j) * nz + k, vec3(0.0)
+                s, t = bounded(changes_at(env, CHANGE, node), 1), bounded(changes_at(env, SECOND, node), 1)
+                mass = body.changes[s + 3]
+                if mass != 0.0 and i > 0 and j > 0 and k > 0 and i < nx - 1 and j < ny - 1 and k < nz - 1:
+                    mean = mean_of_cells(env, body, i, j, k)
+                for c in ti.static(range(3)):
+                    body.changes[t + c] = 4.0 * mass * mean[c] - body.changes[s + c]
+                body.changes[t + 3] = mass
+
+
+@ti.func
+def filtered_change(env: ti.template(), body: ti.template(), it, i, j, k):
+    """Change of velocity of a node in this substep, and its mass."""
+    ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
+    node = (i * ny + j) * nz + k
+    s, t = bounded(changes_at(env, CHANGE, node), 1), bounded(changes_at(env, SECOND, node), 1)
+    mass, change = body.changes[s + 3], vec3(0.0)
+    if mass != 0.0:  # one that is not a number must show
+        change = vec3([body.changes[s + c] for c in range(3)]) / mass
+        if it > 0 and i > 0 and j > 0 and k > 0:
+            second = vec3([body.changes[t + c] for c in range(3)]) / mass
+            change *= env.param(layout.OWN)
+            change += env.param(layout.FILTERED) * (4.0 * mean_of_cells(env, body, i, j, k) - second)
+    return change, mass

@@ -1,0 +1,122 @@
+"""Selective mass scaling of a gel: what its mesh resolves answers as if six times lighter, the shortest waves as ever.
+
+An acceleration a, force over mass, becomes OWN a + FILTERED (4 S - 1)^2 a, S the mean over the elements round a node,
+each of which has the mean of its nodes by mass (Olovsson et al. 2005). Rest does not change by it. Why:
+docs/decisions/0002. Rows of `nodes` behind the forces: means along z; 4 S - 1 of the accelerations; its means along z.
+"""
+
+from tacsim.compute.runtime import ti
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.lanes import LANES, lanes, load_lanes, opaque, store_lanes
+from tacsim.physics.gel.gel import QUANTITIES
+from tacsim.physics.gel.kernels import gel_totals, lay_surface, margin, nodes_of_part
+
+
+@ti.func
+def z_weights(k, layers):
+    """Of the nodes below, here and above in a mean over the elements round a node of layer k, along z: the backing does
+    not move, and nothing is above the surface."""
+    below = ti.select(k == 1, 0.0, ti.select(k == layers, 0.5, 0.25))
+    return below, 0.5, ti.select(k < layers, 0.25, 0.0)
+
+
+@ti.func
+def mean_across(gels: ti.template(), at, blocks, block, zero):
+    """The same along x and y of LANES nodes, from `at` on."""
+    row = gels.ny + 1
+    weights = [gels.lattice[opaque(zero, r * blocks + block)] for r in range(2, 6)]
+    total = lanes(0.0)
+    for dx in ti.static(range(-1, 2)):
+        line = 0.5 * load_lanes(gels.nodes, at + dx * row)
+        line += weights[2] * load_lanes(gels.nodes, at + dx * row - 1)
+        line += weights[3] * load_lanes(gels.nodes, at + dx * row + 1)
+        total += (0.5 if dx == 0 else weights[0] if dx < 0 else weights[1]) * line
+    return total
+
+
+@ti.func
+def first_node(env: ti.template(), gels: ti.template(), g, axis):
+    """Where the displacements of a gel begin in `nodes`."""
+    return margin(gels) + (env.index * gels.number + g) * 3 * QUANTITIES * axis
+
+
+@ti.func
+def gel_means(env: ti.template(), part, gels: ti.template()):
+    """Whole forces on this part's nodes of its gel, and their means along z, as accelerations but for the mass of an
+    inner node."""
+    gel_totals(env, part, gels)
+    zero, layers = env.count(layout.ZERO), gels.layers
+    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
+    g, _slot, first, last = nodes_of_part(gels, part)
+    layer = blocks * LANES
+    axis = (layers + 1) * layer
+    u = first_node(env, gels, g, axis)
+    for k in range(1, layers + 1):
+        for block in range(first, last):
+            share = gels.lattice[opaque(zero, blocks + block)]
+            for d in range(3):
+                f = u + (6 + d) * axis + k * layer + block * LANES
+                below, here, above = z_weights(k, layers)
+                # surface nodes have half the mass
+                here *= ti.select(k == layers, 2.0, 1.0)
+                above *= ti.select(k == layers - 1, 2.0, 1.0)
+                # not the backing's force: 0 times what a failed attempt has left is not a number
+                under = ti.select(k > 1, layer, 0)
+                mean = below * load_lanes(gels.nodes, f - under) + here * load_lanes(gels.nodes, f)
+                mean += above * load_lanes(gels.nodes, f + ti.select(k < layers, layer, 0))
+                store_lanes(gels.nodes, f + 3 * axis, share * mean, zero)
+
+
+@ti.func
+def gel_even(env: ti.template(), part, gels: ti.template()):
+    """First pass of the filter: 4 S - 1 of the accelerations of this part's nodes, and its means along z."""
+    zero, layers = env.count(layout.ZERO), gels.layers
+    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
+    g, _slot, first, last = nodes_of_part(gels, part)
+    layer = blocks * LANES
+    axis = (layers + 1) * layer
+    u = first_node(env, gels, g, axis)
+    for k in range(1, layers + 1):
+        scale = ti.select(k == layers, 2.0, 1.0)
+        for block in range(first, last):
+            share = scale * gels.lattice[opaque(zero, blocks + block)]
+            for d in range(3):
+                f = u + (6 + d) * axis + k * layer + block * LANES
+                mean = mean_across(gels, f + 3 * axis, blocks, block, zero)
+                store_lanes(gels.nodes, f + 6 * axis, 4.0 * mean - share * load_lanes(gels.nodes, f), zero)
+    for k in range(1, layers + 1):
+        for block in range(first, last):
+            for d in range(3):
+                b = u + (12 + d) * axis + k * layer + block * LANES
+                below, here, above = z_weights(k, layers)
+                mean = below * load_lanes(gels.nodes, b - layer) + here * load_lanes(gels.nodes, b)
+                mean += above * load_lanes(gels.nodes, b + ti.select(k < layers, layer, 0))
+                store_lanes(gels.nodes, b + 3 * axis, mean, zero)
+
+
+@ti.func
+def gel_advance_filtered(env: ti.template(), part, gels: ti.template()):
+    """Second pass, and the motion: see `tacsim.physics.gel.kernels.gel_advance`."""
+    zero, dt, h, layers = env.count(layout.ZERO), env.param(layout.STEP), env.param(layout.GEL_SPACING), gels.layers
+    blocks = ((gels.nx + 1) * (gels.ny + 1) + LANES - 1) // LANES
+    g, _slot, first, last = nodes_of_part(gels, part)
+    layer = blocks * LANES
+    axis = (layers + 1) * layer
+    u = first_node(env, gels, g, axis)
+    keep = 1.0 - env.param(layout.GEL_DAMPING) * dt
+    rate = dt / (env.param(layout.GEL_DENSITY) * h * h * h)
+    own, even = env.param(layout.OWN), env.param(layout.FILTERED)
+    for k in range(1, layers + 1):
+        scale = ti.select(k == layers, 2.0, 1.0)
+        for block in range(first, last):
+            share = gels.lattice[opaque(zero, blocks + block)] * scale
+            for d in range(3):
+                x = u + d * axis + k * layer + block * LANES
+                v, f = x + 3 * axis, x + 6 * axis
+                a = 4.0 * mean_across(gels, f + 9 * axis, blocks, block, zero) - load_lanes(gels.nodes, f + 6 * axis)
+                a = even * a + own * share * load_lanes(gels.nodes, f)
+                speed = keep * load_lanes(gels.nodes, v) + rate * a
+                place = load_lanes(gels.nodes, x) + dt * speed
+                store_lanes(gels.nodes, v, speed, zero)
+                store_lanes(gels.nodes, x, place, zero)
+    lay_surface(env, part, gels)

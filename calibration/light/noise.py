@@ -1,4 +1,4 @@
-"""Noise of a real camera, from pictures without contact: what differs between two of them."""
+"""Noise of a real camera: what differs between two pictures without contact, or beside the contact of a press."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.drift import DriftFinder
+from calibration.light.press import FAR, BallPress, untouched_mean
 from calibration.reference import SATURATED
 from tacsim.models.sensor import CameraNoise
 
@@ -44,11 +45,28 @@ def measure_noise(frames: Sequence[Image]) -> CameraNoise:
     pairs = [pair for pair in zip(frames, frames[apart:], strict=False) if not np.array_equal(*pair)]
     if not pairs:
         raise NoiseUnknown("the pictures without contact are all the same one; take them from the running camera")
-    tiles = np.concatenate([_tiles(*pair) for pair in pairs])
+    return _measured(np.concatenate([_tiles(*pair) for pair in pairs]))
+
+
+def measure_press_noise(presses: Sequence[BallPress], reference: Image) -> CameraNoise:
+    """The same from presses and the one `reference` (H, W, 3) without contact, where nothing touches: farther than FAR
+    contact radii from the middle. Noise of both is taken to be alike; what has changed between them in small, such as
+    dirt, counts as noise. Raises NoiseUnknown."""
+    mean = untouched_mean(reference)
+    dark = (reference <= DARK).any(axis=2)
+    cut = []
+    for press in presses:
+        touched = press.distance() < FAR * press.circle.radius
+        cut.append(_free_tiles(press.change * mean, touched | dark | ~press.lit.all(axis=2)))
+    return _measured(np.concatenate(cut))
+
+
+def _measured(tiles: Float64) -> CameraNoise:
+    """Of tiles (n, h, w, 3) of differences of two pictures. Raises NoiseUnknown."""
     if len(tiles) < MIN_TILES:
         raise NoiseUnknown(
-            f"only {len(tiles)} parts of {TILE} x {TILE} px are neither black nor saturated in all pictures without "
-            f"contact; {MIN_TILES} are needed"
+            f"only {len(tiles)} parts of {TILE} x {TILE} px are untouched and neither black nor saturated in all "
+            f"pictures; {MIN_TILES} are needed"
         )
     size = tiles.shape[1] * tiles.shape[2]
     square = np.einsum("nyxc,nyxd->ncd", tiles, tiles) / (2 * (size - 1))  # 2: both pictures are noisy
@@ -58,7 +76,7 @@ def measure_noise(frames: Sequence[Image]) -> CameraNoise:
     covariance = np.median(square, axis=0)
     deviation = np.sqrt(np.diag(covariance))
     if not (deviation > 0).any():
-        raise NoiseUnknown("the pictures without contact do not differ on most of the gel")
+        raise NoiseUnknown("the pictures do not differ on most of the untouched gel")
     # a row of a tile has one pair less than pixels
     ends = tiles.shape[2] / (tiles.shape[2] - 1), tiles.shape[1] / (tiles.shape[1] - 1)
     usual = float(np.median(pixels))
@@ -81,8 +99,12 @@ def _tiles(one: Image, other: Image) -> Float64:
     planes = np.ascontiguousarray(np.moveaxis(change / level.astype(np.float32), -1, 0), dtype=np.float32)
     find = DriftFinder((one.shape[0], one.shape[1]))
     find.remove(planes, find(planes, lost))
-    still = np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64)
-    size = min(TILE, *one.shape[:2])
+    return _free_tiles(np.asarray(np.moveaxis(planes, 0, -1) * level, dtype=np.float64), lost)
+
+
+def _free_tiles(still: Float64, lost: NDArray[np.bool_]) -> Float64:
+    """(n, h, w, 3) tiles of a difference (H, W, 3) that hold no `lost` pixel (H, W), each less its mean."""
+    size = min(TILE, *still.shape[:2])
     tiles = _cut(still, size)[~_cut(lost[..., None], size).any(axis=(1, 2, 3))]
     return np.asarray(tiles - tiles.mean(axis=(1, 2), keepdims=True), dtype=np.float64)
 

@@ -18,6 +18,7 @@ from calibration.light.circle import Circle, NoCircle, contact_circle
 from tacsim.interface import Pose, SurfaceMap
 from tacsim.models.scene import GelSurface, Scene, Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorModel
+from tacsim.optics.noise import noise_source
 from tacsim.optics.render import Renderer
 from tacsim.optics.surface import surface_map
 from tacsim.physics.failure.health import SimulationDiverged
@@ -44,7 +45,7 @@ def match_presses(
     Args:
         real: frames of a ball's presses.
         scene: with that ball as its indenter.
-        sensor: makes the pictures, of the size of the real ones: that of the sensor's calibration.
+        sensor: makes the pictures, of the size of the real ones: that of the sensor's calibration; with its noise.
         grid: on which the surfaces are kept.
 
     A press that cannot be made (too deep for the gel, or the simulation diverged) has no frame. Raises BadFrames for a
@@ -73,14 +74,15 @@ def match_presses(
             continue
         done[name] = Frame(name, image, surface)
         notes += [f"{name}: {warning}"] if warning else []
-    untouched = gel.untouched
-    frames = tuple(
-        done.get(frame.name, Frame(frame.name, *untouched)) for frame in real.frames if frame.name not in not_made
-    )
-    made = FrameSet(
-        f"scene {scene.name}", untouched[0], "the untouched simulated gel", frames, simulated=True, placed=True
-    )
-    return made, notes
+    noise = noise_source(sensor, scene.name)
+    frames = []
+    for number, frame in enumerate(frame for frame in real.frames if frame.name not in not_made):
+        made = done.get(frame.name, Frame(frame.name, *gel.untouched))
+        frames.append(made if noise is None else replace(made, image=noise(made.image, number + 1)))
+    reference = gel.untouched[0] if noise is None else noise(gel.untouched[0], 0)
+    return FrameSet(
+        f"scene {scene.name}", reference, "the untouched simulated gel", tuple(frames), simulated=True, placed=True
+    ), notes
 
 
 class CannotPress(ValueError):

@@ -42,7 +42,7 @@ def write_calibration(
 
     verdict = judge(fit, scale)
     _show(fit, scale.pixel_pitch, found)
-    noise = _noise(read)
+    noise = _noise(read, fit)
     bundle = fit.to_calibration(serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise)
     warnings = (f"verdict: {verdict}", *bundle.provenance.warnings)
     provenance = bundle.provenance.model_copy(update={"warnings": warnings})
@@ -68,18 +68,20 @@ def write_calibration(
         raise typer.Exit(UNTRUSTED)
 
 
-def _noise(read: FrameSet) -> CameraNoise | None:
-    """The camera's noise, measured and printed."""
-    from calibration.light.noise import NoiseUnknown, measure_noise
+def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
+    """The camera's noise, measured and printed: of more pictures without contact, or else beside the contacts."""
+    from calibration.light.noise import NoiseUnknown, measure_noise, measure_press_noise
 
+    still = len(read.untouched_images)
     try:
-        noise = measure_noise(read.untouched_images)
+        noise = measure_noise(read.untouched_images) if still > 1 else measure_press_noise(fit.presses, fit.reference)
     except NoiseUnknown as why:
         notes.print(f"camera's noise not measured: {why}", markup=False)
         return None
     spread = ", ".join(f"{value:.2f}" for value in noise.deviation)
     notes.print(
-        f"camera's noise, from {len(read.untouched_images)} pictures without contact: R, G, B {spread} grey levels; "
+        f"camera's noise, from {f'{still} pictures without contact' if still > 1 else 'beside the contacts'}: R, G, B "
+        f"{spread} grey levels; "
         f"correlation of neighbours {noise.neighbours[0]:.2f} along x, {noise.neighbours[1]:.2f} along y"
     )
     return noise

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration.light.noise import NoiseUnknown, measure_noise
+from calibration.light.dent import ContactCircle
+from calibration.light.noise import NoiseUnknown, measure_noise, measure_press_noise
+from calibration.light.press import BallPress, untouched_mean
 
 SHAPE = (200, 260)
 V, U = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100.0
@@ -81,7 +83,7 @@ def test_without_two_different_pictures_nothing_is_known() -> None:
             measure_noise(few)
     speck = frames[0].copy()
     speck[5, 5] += 9
-    with pytest.raises(NoiseUnknown, match="do not differ on most"):
+    with pytest.raises(NoiseUnknown, match="do not differ on most of the untouched gel"):
         measure_noise([frames[0], speck])
     # of a source that shows a picture again only the others count
     one, other, third = camera(3)
@@ -99,3 +101,25 @@ def test_the_noise_that_is_drawn_is_measured_again() -> None:
     assert again.deviation == pytest.approx(noise.deviation, rel=0.04)
     assert again.neighbours == pytest.approx(noise.neighbours, abs=0.05)
     assert again.colours == pytest.approx(noise.colours, abs=0.06)
+
+
+def presses(circles: list[tuple[float, float, float]]) -> tuple[list[BallPress], np.ndarray]:
+    """Presses with contact of so many pixels, in which the picture is a wild one, and the one picture without."""
+    reference, *frames = camera(1 + len(circles))
+    mean, lit = untouched_mean(reference), np.ones((*SHAPE, 3), dtype=bool)
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    made = []
+    for frame, (x, y, radius) in zip(frames, circles, strict=True):
+        change = frame.astype(np.float64) - reference
+        change += 60.0 * RNG.normal(0, 1, change.shape) * (np.hypot(u - x, v - y) < 2.9 * radius)[..., None]
+        made.append(BallPress("made", ContactCircle(x, y, radius), change / mean, np.zeros(change.shape), lit))
+    return made, reference
+
+
+def test_noise_is_told_beside_the_contacts_where_there_is_one_picture_without() -> None:
+    found = measure_press_noise(*presses([(80, 60, 24), (180, 130, 20), (130, 100, 28), (70, 140, 22)]))
+    assert found.deviation == pytest.approx(np.sqrt(np.square(DEVIATION) + 1 / 12), rel=0.06)
+    assert found.neighbours == pytest.approx(NEIGHBOURS, abs=0.08)
+    assert found.colours == pytest.approx(COLOURS, abs=0.1)
+    with pytest.raises(NoiseUnknown, match="0 parts of 32 x 32 px are untouched"):
+        measure_press_noise(*presses([(130, 100, 80)]))

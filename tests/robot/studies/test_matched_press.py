@@ -18,7 +18,7 @@ from robot.cli import app
 from robot.studies.matched_press import _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene
 from tacsim.models.scene import Scene
-from tacsim.models.sensor import CanonicalGrid, SensorGeometry, SensorModel
+from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry, SensorModel
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import calibrated, save
@@ -118,3 +118,18 @@ def test_the_next_depth_follows_the_two_nearest_presses() -> None:
     assert _next_depth([(10.0, 1e-3), (11.0, 1.3e-3)], 10.5) == pytest.approx(1e-3 + 0.3e-3 * 10.25 / 21)
     assert _next_depth([(40.0, 2e-3), (40.01, 2.2e-3)], 44.0) == pytest.approx(1.3 * 2.2e-3)
     assert _next_depth([(40.0, 2e-3), (39.9, 2.2e-3)], 44.0) == pytest.approx(1.21 * 2e-3)
+
+
+def test_a_bundle_with_noise_makes_presses_with_noise_and_the_same_again(frames: FrameSet) -> None:
+    noise = CameraNoise(deviation=(2.0, 1.5, 1.0))
+    quiet = sensor_of()
+    grainy = quiet.model_copy(update={"noise": noise})
+    noisy, again, clean = (
+        match_presses(frames, scene_of("8 mm"), sensor, CanonicalGrid())[0] for sensor in (grainy, grainy, quiet)
+    )
+    added = [noisy.reference.astype(float) - clean.reference]
+    added += [one.image.astype(float) - two.image for one, two in zip(noisy.frames, clean.frames, strict=True)]
+    for grain in added:
+        assert grain.std(axis=(0, 1)) == pytest.approx((2.0, 1.5, 1.0), rel=0.05)
+    assert not np.array_equal(added[0], added[1])
+    assert all(np.array_equal(one.image, other.image) for one, other in zip(noisy.frames, again.frames, strict=True))

@@ -28,6 +28,7 @@ Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 ALIKE = 0.6  # share of the power of a press's change that is the same all round, above which no direction is told
+ROUND = 2.5  # up to where it is looked at [contact radii]: a flank's neighbours are there, too
 BLUR = 2.0  # through which the darkness of presses is looked at [px]
 MIN_CONTRAST = 0.03  # relative change of colour in the middle of a contact
 EDGE = 1.3  # contact radius over the radius where a press is half as dark as in its middle, about
@@ -68,7 +69,8 @@ def rough_contact(change: Float64) -> ContactCircle:
 
 
 def tells_no_direction(changes: Iterable[Float64]) -> bool:
-    """True where most changes of colour (H, W, 3) are the same all round their contacts."""
+    """True where most changes of colour (H, W, 3) are the same all round their contacts, in each channel: what is
+    strongest may be one flank alone, which in its own colour is round too, and not in the others."""
     shares = []
     for raw in changes:
         change = raw - np.median(raw, axis=(0, 1))
@@ -78,12 +80,12 @@ def tells_no_direction(changes: Iterable[Float64]) -> bool:
             continue
         v, u = np.mgrid[: change.shape[0], : change.shape[1]]
         distance = np.hypot(u - circle.x, v - circle.y)
-        near = distance < 1.5 * circle.radius
+        near = distance < ROUND * circle.radius
         rings = (distance[near] * (12 / circle.radius)).astype(np.intp)
         count = np.maximum(np.bincount(rings), 1)
         seen = smooth(change, BLUR)[near]
         means = np.stack([np.bincount(rings, channel) / count for channel in seen.T])
-        shares.append(float((count * means**2).sum() / (seen**2).sum()))
+        shares.append(float(((count * means**2).sum(axis=1) / np.maximum((seen**2).sum(axis=0), 1e-300)).min()))
     return bool(shares) and float(np.median(shares)) > ALIKE
 
 

@@ -105,6 +105,15 @@ def test_the_pictures_tell_which_light_it_is() -> None:
         assert tells_no_direction((p.image - reference) / 100 for p in sensor.presses(4)) is alike
 
 
+def test_one_lamp_brighter_than_the_others_still_tells_direction() -> None:
+    """The strongest change is then one flank's, a patch that is round by itself."""
+    for seed in (3, 4, 5):
+        sensor = HiddenSensor(seed, noise=0.5)
+        reference = sensor.empty().astype(float)
+        changes = [(press.image - reference) / 100 * (6.0, 1.0, 1.0) for press in sensor.presses(5)]
+        assert not tells_no_direction(np.maximum(change, -0.05) for change in changes)
+
+
 def test_flanks_that_are_dark_all_alike_tell_no_depth() -> None:
     with pytest.raises(NoDirection, match="this light tells no direction"):
         calibrated(RingSensor(4), 3)

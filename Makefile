@@ -26,7 +26,7 @@ help:
 	@echo "make test-all     make test, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
 	@echo "make reliability  what is promised of arms and cameras, measured by its tests, for docs/reliability.md"
-	@echo "make test-extras  tests that need heavy extras (torch, rerun), in an environment of their own"
+	@echo "make test-extras  tests that need heavy extras (torch, rerun, ray), in an environment of their own"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
 	@echo "Choose a Python with PYTHON=python3.12 (3.11, 3.12 or 3.13; default: python3)."
@@ -64,8 +64,9 @@ test-gpu: $(DEV)
 reliability: $(DEV)
 	@$(BIN)/tacsim bench robot --long --json benchmarks/reliability.json --docs docs
 
-# What needs torch or rerun, in an environment of its own: make test shows that all else works without them.
-WITH_EXTRAS := tests/robot/train tests/robot/cli/learn tests/robot/export tests/tacsim/record/test_viewers.py
+# What needs torch, rerun or ray, in an environment of its own: make test shows that all else works without them.
+WITH_EXTRAS := tests/robot/train tests/robot/cli/learn tests/robot/export tests/robot/collect/test_cluster.py \
+  tests/tacsim/record/test_viewers.py
 extras: $(EXTRAS)
 
 test-extras: extras
@@ -103,5 +104,5 @@ $(EXTRAS): pyproject.toml $(CONSTRAINTS) constraints/extras.txt | python
 	@echo "Installing tacsim with torch, stable-baselines3 and rerun into .venv-extras (a few minutes the first time)"
 	@rm -rf .venv-extras && $(PYTHON) -m venv .venv-extras
 	@.venv-extras/bin/python -m pip install -qq --no-input --disable-pip-version-check \
-	  -c $(CONSTRAINTS) -c constraints/extras.txt -e '.[dev,train,viz]'
+	  -c $(CONSTRAINTS) -c constraints/extras.txt -e '.[dev,train,viz,cluster]'
 	@touch $@

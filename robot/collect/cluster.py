@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import tempfile
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from robot.collect.job import Job, Piece, SetError, Worker
 from robot.collect.workers import AHEAD, CollectFailed, Stop, Stopped, piece_or_error, result_of
 from robot.deploy.control_loop import versions
 
+PATIENCE = 5.0  # for a cluster to answer [s]
 LOOK = 0.5  # for pieces that are done, and for a wish to stop [s]
 
 
@@ -30,6 +32,7 @@ def on_cluster(
     """
     if util.find_spec("ray") is None:
         raise SetError("--ray needs ray, which is not installed: pip install 'tacsim[cluster]'")
+    _require_somebody(address)
     import ray
 
     try:
@@ -58,13 +61,25 @@ def on_cluster(
         ray.shutdown()
 
 
+def _require_somebody(address: str) -> None:
+    """Ray itself would try for a minute. Raises SetError where nobody listens at HOST:PORT."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        try:
+            socket.create_connection((host, int(port)), PATIENCE).close()
+        except (OSError, OverflowError) as failure:
+            raise SetError(f"--ray {address}: no Ray cluster answers there: {failure}") from None
+
+
 _workers: dict[str, tuple[Any, Worker]] = {}  # of this process of a node, with the folder that each needs
 
 
 def _make(kit: Sequence[Any], number: int) -> Piece | str:
     """A piece, in a process of a node."""
     os.environ.setdefault("TACSIM_THREADS", "1")
-    return piece_or_error(lambda: _worker(kit[0]), number)
+    import ray
+
+    return piece_or_error(lambda: _worker(kit[0]), number, f"{ray.get_runtime_context().get_node_id()}:{os.getpid()}")
 
 
 def _worker(kit: Any) -> Worker:

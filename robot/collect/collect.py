@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -28,6 +29,8 @@ class Collected:
     failures: Mapping[int, str] = field(default_factory=dict)  # of the whole set
     bytes: int = 0  # written
     seconds: Counter[str] = field(default_factory=Counter)  # of all workers, by part
+    workers: set[str] = field(default_factory=set)
+    writing: float = 0.0  # by the one who writes [s]
 
 
 def collect(
@@ -60,7 +63,10 @@ def collect(
             write_whole(place.path / CARD, press_card(job.settings, command, versions()).encode())
         tell(place.done, job.count)
         for piece in _pieces(job, place, files, workers, cluster, stop):
+            began = time.perf_counter()
             place.put(piece)
+            found.writing += time.perf_counter() - began
+            found.workers.add(piece.worker)
             found.made += piece.made
             found.bytes += len(piece.data or b"")
             found.seconds.update(piece.seconds)

@@ -21,6 +21,7 @@ class Piece:
     failures: Mapping[int, str]  # why, by the number of the press or episode
     made: int  # presses or episodes in it
     seconds: Mapping[str, float] = field(default_factory=dict)  # what they took, by part
+    worker: str = ""  # who made it
 
 
 class Worker(Protocol):

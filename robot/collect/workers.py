@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from robot.collect.job import Job, Piece, Worker
@@ -110,11 +111,12 @@ def _begin(job: Job, folder: Path) -> None:
 def _piece(number: int) -> Piece | str:
     """The piece, or an error as text: not every exception can be sent to another process."""
     assert _worker is not None
-    return piece_or_error(_worker, number)
+    return piece_or_error(_worker, number, str(os.getpid()))
 
 
-def piece_or_error(worker: Callable[[], Worker], number: int) -> Piece | str:
+def piece_or_error(worker: Callable[[], Worker], number: int, name: str) -> Piece | str:
+    """name: of the worker."""
     try:
-        return worker().piece(number)
+        return replace(worker().piece(number), worker=name)
     except Exception as error:
         return f"{type(error).__name__}: {error}"

@@ -223,8 +223,8 @@ def _say(done: Collected, count: int, seconds: float, out: Path) -> None:
         spent = sum(done.seconds.values())
         parts = ", ".join(f"{name} {100 * part / spent:.0f} %" for name, part in done.seconds.most_common())
         results.print(
-            f"{done.made} made in {seconds:.1f} s: {done.made / seconds:.2f} a second, "
-            f"{done.bytes / 2**20:.1f} MiB; of the workers' time {parts}",
+            f"{done.made} made in {seconds:.1f} s by {len(done.workers)}: {done.made / seconds:.2f} a second; "
+            f"of their time {parts}; {done.bytes / 2**20:.1f} MiB written in {done.writing:.1f} s",
             markup=False,
         )
     if done.failures:

@@ -74,6 +74,8 @@ METRICS = (
     Metric("contact_iou", "contact IoU", digits=3, more_is_better=True),
     Metric("contact_radius", "contact radius error", "px"),
     Metric("contact_centroid", "contact centroid error", "px"),
+    Metric("grain", "grain error beside contact", "grey"),
+    Metric("contact_grain", "grain error in contact", "grey"),
     Metric("gradient_angle", "gradient angle error", "°", of_surface=True),
     Metric("height_rmse", "height RMSE", "mm", 1e3, 4, of_surface=True),
     Metric("height_share", "height RMSE of indentation", "%", 1e2, 1, of_surface=True),

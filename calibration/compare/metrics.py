@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 
 WHITE = 255.0  # grey level
 WINDOW = 7  # side of the window of SSIM [px]
+GRAIN = 1.0  # what a Gaussian of this deviation takes away is grain [px]
 CONTACT_BLUR = 2.0  # of a change of colour before contact is looked for in it, against noise [px]
 # A smoothed change shows contact beyond the largest of
 MIN_CHANGE = 5.0  # [grey levels]
@@ -93,6 +94,15 @@ def correlation(one: Picture, other: Picture, where: Mask | None = None) -> floa
     a, b = a - a.mean(), b - b.mean()
     power = math.sqrt(float(a @ a) * float(b @ b))
     return float(a @ b) / power if power > 1e-9 * a.size else 0.0
+
+
+def grain(change: Picture, where: Mask) -> float:
+    """Standard deviation of what is finer than GRAIN pixels in a change of colour [grey levels]: noise, and texture of
+    the skin."""
+    import cv2
+
+    picture = np.asarray(change, dtype=np.float32)
+    return math.sqrt(_mean(np.asarray(picture - cv2.GaussianBlur(picture, (0, 0), GRAIN), np.float64) ** 2, where))
 
 
 def gradient_angle(one: NDArray[np.floating], other: NDArray[np.floating], where: Mask | None = None) -> float:

@@ -21,7 +21,7 @@ Image = NDArray[np.uint8]
 
 MAX_PICTURED = 24  # pairs with pictures, the worst first
 THUMBNAIL = 240  # longer side [px]
-ZOOM_MARGIN = 0.5  # of the contact's width, that a zoomed picture shows round it
+ZOOM_MARGIN = 0.3  # of the contact's width, that a zoomed picture shows round it
 JPEG_QUALITY = 85
 WORST_BY = "contact_mae"
 FORMAT = 1
@@ -191,10 +191,16 @@ def _pictures(comparison: Comparison, k: int) -> list[tuple[str, str]]:
 
 
 def _near(region: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Rows and columns of a contact (H, W) and what lies round it; of the whole picture without contact."""
-    rows_, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
-    if len(rows_) == 0:
+    """Rows and columns of the largest contact of a region (H, W) and what lies round it; of the whole picture without
+    contact."""
+    from scipy.ndimage import label
+
+    parts, _ = label(region)
+    sizes = np.bincount(parts.ravel())[1:]
+    if len(sizes) == 0:
         return slice(None), slice(None)
+    largest = parts == 1 + int(sizes.argmax())
+    rows_, columns = (np.flatnonzero(largest.any(axis=axis)) for axis in (1, 0))
     half = max(8, round((0.5 + ZOOM_MARGIN) * max(np.ptp(rows_), np.ptp(columns))))
     middles = ((int(one[0]) + int(one[-1])) // 2 for one in (rows_, columns))
     down, across = (slice(max(0, middle - half), middle + half + 1) for middle in middles)

@@ -19,6 +19,7 @@ from tacsim.models.sensor import CanonicalGrid
 Mask = NDArray[np.bool_]
 Numbers = dict[str, float]
 
+GRAIN_MARGIN = 5  # of a contact's border, whose edge would pass for grain [px]
 SWAPPED_GAIN = 0.2  # of the correlation, by red and blue exchanged, that makes them look swapped
 
 
@@ -58,8 +59,11 @@ class Scorer:
         region = contact_a | contact_b
         numbers = self.pictures(seen_a, seen_b, region) | _contacts(contact_a, contact_b)
         numbers["contact_ncc"] = metrics.correlation(change_a, change_b, region)
+        grain_b = self._grain(change_b, region)
+        numbers |= {key: abs(value - grain_b[key]) for key, value in self._grain(change_a, region).items()}
         null = self.pictures(self._reference_a, seen_b, region) | _contacts(np.zeros_like(contact_b), contact_b)
         null["contact_ncc"] = metrics.correlation(np.zeros_like(change_b), change_b, region)
+        null |= grain_b  # the reference against itself has none
         if surface_a is not None and surface_b is not None:
             numbers |= self._surfaces(surface_a, surface_b, surface_a)
             null |= self._surfaces(flat_surface(surface_b), surface_b, surface_a)
@@ -88,6 +92,14 @@ class Scorer:
             "contact_psnr": metrics.peak_signal_to_noise(one, other, region),
             "contact_ssim": float(similarity[region].mean()) if region.any() else math.nan,
         }
+
+    def _grain(self, change: metrics.Picture, region: Mask) -> Numbers:
+        """How grainy a change of colour is, beside a contact `region` and in it, border left out [grey levels]."""
+        from scipy.ndimage import binary_dilation, binary_erosion
+
+        beside = self._covered & ~binary_dilation(region, iterations=GRAIN_MARGIN)
+        inside = binary_erosion(region, iterations=GRAIN_MARGIN)
+        return {"grain": metrics.grain(change, beside), "contact_grain": metrics.grain(change, inside)}
 
     def _surfaces(self, a: SurfaceEstimate, b: SurfaceEstimate, shown: SurfaceEstimate) -> Numbers:
         """Of A's surface against B's, where B or `shown` is pressed."""

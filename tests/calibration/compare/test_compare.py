@@ -463,3 +463,12 @@ def test_every_table_of_the_page_has_units(compared: Comparison, tmp_path: Path)
     assert "<td>grey</td>" in page and "contact NCC of the difference [1]" in page
     assert as_json(compared)["units"]["height_rmse"] == "m"
     assert "quarter of the strongest change" in page  # which pixels the figures are of
+
+
+def test_a_simulation_without_noise_is_told_by_its_grain(good: FrameSet, real: FrameSet) -> None:
+    import cv2
+
+    smooth = changed(good, lambda image: cv2.GaussianBlur(image, (0, 0), 2.0), "all")
+    noisy, quiet = (compare_frames(each, real).overall["grain"] for each in (good, smooth))
+    assert noisy.mean < 0.05 * noisy.null and noisy.beats_null
+    assert quiet.mean > 0.8 * quiet.null

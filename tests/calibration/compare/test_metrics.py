@@ -156,3 +156,19 @@ def test_what_does_not_fit_together_is_refused() -> None:
         metrics.gradient_angle(np.zeros((3, 3, 2)), np.zeros((3, 4, 2)))
     with pytest.raises(ValueError, match="shapes differ"):
         metrics.overlap(np.zeros((2, 2), dtype=bool), np.zeros((2, 3), dtype=bool))
+
+
+def test_grain_is_what_a_small_blur_takes_away() -> None:
+    """White noise of deviation s loses s^2 (2 K(0) - sum of K^2), K the Gaussian of deviation 1 on whole pixels; a
+    smooth dent has none."""
+    x = np.arange(-9, 10)
+    line = np.exp(-(x**2) / 2) / np.exp(-(x**2) / 2).sum()
+    kernel = np.outer(line, line)
+    left = 1 - 2 * kernel[9, 9] + (kernel**2).sum()
+    where = disc(80, 60, 40)
+    noise = RNG.normal(0, 3, (120, 160, 3))
+    v, u = np.mgrid[:120, :160]
+    dent = 60 * np.exp(-((u - 80) ** 2 + (v - 60) ** 2) / (2 * 20**2))[..., None] * np.ones(3)
+    assert metrics.grain(noise + dent, where) == pytest.approx(3 * math.sqrt(left), rel=0.02)
+    assert metrics.grain(dent, where) < 0.2
+    assert math.isnan(metrics.grain(noise, np.zeros_like(where)))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import robot.rig.reset
+from robot.export.jog import Jog
 from robot.export.lerobot_mapping import LeRobotMapping
 from robot.export.lerobot_rig import LeRobotRig
 from robot.open import open_rig, rig_spec
@@ -166,3 +167,23 @@ def test_simulated_time_passes_with_each_action() -> None:
         assert float(after["force_z_lower.vel"]) < float(before["force_z_lower.vel"])  # type: ignore[arg-type]  # presses
     finally:
         made.close()
+
+
+def test_steps_add_up_along_the_sensors_axes() -> None:
+    rig = LeRobotRig("sim")
+    jog = Jog(rig, 0.1e-3, ["upper"])
+    jog([0.0, 0.0, 1.0])
+    action = jog([-0.5, 0.0, 9.0])  # a stroke is at most 1
+    assert list(action) == list(rig.action_features)
+    gone = {name: value * SCALES["moved"] for name, value in action.items() if value != 0.0}
+    assert gone == {"moved_x_upper.pos": pytest.approx(-0.05e-3), "moved_z_upper.pos": pytest.approx(0.2e-3)}
+    jog.reset()
+    assert set(jog([0.0, 0.0, 0.0]).values()) == {0.0}
+    assert {name for name, value in Jog(rig, 0.1e-3)([1.0, 0.0, 0.0]).items() if value != 0.0} == {
+        "moved_x_lower.pos",
+        "moved_x_upper.pos",
+    }
+    with pytest.raises(IncompatibleRig, match="rig 'sim' has no arm 'left'; it has lower, upper"):
+        Jog(rig, 0.1e-3, ["left"])
+    with pytest.raises(ValueError, match="below 10 mm"):
+        Jog(rig, 0.1, [])

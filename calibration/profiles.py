@@ -1,7 +1,7 @@
 """What is known beforehand of sensors that many people have: how much of the picture shows the gel, its size, its dots.
 
 These are numbers of makers and of published code, not of one's own sensor: they stand in for a pixel pitch that was not
-measured, and against one that was.
+measured, and against one that was. `source` says where each is from, and which is a guess.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ class SensorProfile:
     native: tuple[int, int] = (640, 480)  # width, height of the camera's own pictures [px]
     crop: float = 0.0  # share of a native picture that does not show the gel, at each border
     light: str = "coloured lights from the side"
+    directed: bool | None = True  # that light tells the direction of a slope; None: not known
 
     def corners(self, shape: tuple[int, int]) -> tuple[Pair, Pair, Pair, Pair] | None:
         """The gel's corners in a picture of so many rows and columns: top left, top right, bottom right, bottom left
@@ -51,8 +52,9 @@ PROFILES = {
         gel_thickness=_MINI.gel_thickness, markers=True, native=_MINI.native, crop=_MINI.crop,
     ),
     "r1.5": SensorProfile(
-        title="GelSight R1.5", source="a gel of 18 x 24 mm (github.com/gelsightinc/gsrobotics), which is a guess",
-        gel_size=(18e-3, 24e-3), native=(240, 320),
+        title="GelSight R1.5", source="0.0877 mm a pixel at 240 x 320 (github.com/isaac-sim/IsaacLab; "
+        "github.com/gelsightinc/gsrobotics says 0.081 in one place, 0.0887 in another)",
+        gel_size=(21.05e-3, 28.06e-3), native=(240, 320),
     ),
     "digit": SensorProfile(
         title="DIGIT", source="21.09 px/mm at 240 x 320 (github.com/Rancho-zhao/FOTS); TACTO says 12.8, with which a "
@@ -62,6 +64,10 @@ PROFILES = {
     "9dtact": SensorProfile(
         title="9DTact", source="0.051 mm a pixel at 640 x 480 (github.com/linchangyi1/9DTact)",
         gel_size=(32.7e-3, 24.5e-3), light="white, from behind: it darkens where the gel is pressed",
+        directed=False,
     ),
-    "other": SensorProfile(title="another sensor", source="nothing is known beforehand"),
+    "other": SensorProfile(
+        title="another sensor", source="nothing is known beforehand", light="of what kind, its pictures tell",
+        directed=None,
+    ),
 }  # fmt: skip

@@ -43,9 +43,12 @@ class PolynomialSlopes:
         colours = [powers for powers in _colour_powers() if powers]
         self._powers: list[tuple[int, ...]] = [(), *colours]
         maps = {powers: np.zeros((2, *x.shape)) for powers in self._powers}
+        places: dict[tuple[int, ...], Float64] = {(): np.ones_like(x)}  # ten of them, each of many terms
         for (colour, place), weight in zip(_terms(), model.weights, strict=True):
-            at = np.prod([(x, y)[axis] for axis in place], axis=0) if place else np.ones_like(x)
-            maps[colour] += np.array(weight)[:, None, None] * at * COLOUR_SCALE ** len(colour)
+            if place not in places:
+                places[place] = places[place[:-1]] * (x, y)[place[-1]]
+            for axis in range(2):
+                maps[colour][axis] += (weight[axis] * COLOUR_SCALE ** len(colour)) * places[place]
         self._maps = {powers: grid.astype(np.float32) for powers, grid in maps.items()}
 
     def __call__(self, change: Float32) -> tuple[Float32, NDArray[np.bool_]]:

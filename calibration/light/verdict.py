@@ -25,6 +25,7 @@ SCALE = (0.05, 0.12)  # of lengths, by a press of known depth or by the size of 
 DIRECTED = 0.1  # least share of the power of flanks' change of colour that differs from flank to flank
 MISFIT = 0.5  # error of one press over the error of predicting nothing: its circle does not fit
 WIDEST = 0.95  # contact radius over the ball's: no gel is pressed so far
+WIDE = 0.9  # the same of all presses together: some are always lighter
 NARROWEST = 0.35  # the same of the widest contact, below which the slopes are few or the radius is a diameter
 DEEPEST = (0.5, 0.9)  # depth over the thickness of the gel
 THIN = 1.5  # thickness of a gel over the ball's radius, up to which the slopes tell it
@@ -118,7 +119,7 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
     ball = scale.ball_radius / scale.pixel_pitch
     ratios = [press.circle.radius / ball for press in fit.presses]
     wide = [press.name for press, ratio in zip(fit.presses, ratios, strict=True) if ratio > WIDEST]
-    if len(wide) > len(ratios) / 3:
+    if len(wide) > len(ratios) / 3 or (len(ratios) >= MIN_PRESSES and min(ratios) > WIDE):
         yield Finding(
             "do not trust", f"pitch or radius is wrong: contact radius over ball radius a/R = {np.median(ratios):.2f}",
             "measure the ball by a calliper (its radius is half of that) and the pitch by a board or a ruler",

@@ -42,6 +42,9 @@ def write_calibration(
 
     verdict = judge(fit, scale)
     _show(fit, scale.pixel_pitch, found)
+    if profile.directed is not None and profile.directed == (fit.darkness is not None):
+        told = "tells direction" if profile.directed else "tells none"
+        warn(f"the light of a {profile.title} {told}, that of these pictures does not do so: is --kind right?")
     noise = _noise(read, fit)
     bundle = fit.to_calibration(serial, scale.ball_radius, scale.pixel_pitch, view=view, markers=found, noise=noise)
     warnings = (f"verdict: {verdict}", *bundle.provenance.warnings)
@@ -57,15 +60,20 @@ def write_calibration(
             draw(fit, residuals)
             written.append(residuals)
         written.append(folder / page.FILE)
-        page.write_page(
-            written[-1], folder.name if serial == UNKNOWN else serial, fit, scale, verdict, residuals, facts
-        )
+        title = _title(serial, folder, profile)
+        page.write_page(written[-1], title, fit, scale, verdict, residuals, facts)
     for finding in verdict.findings:
         notes.print(f"{finding.word}: {finding.what}. {finding.todo}", markup=False)
     results.print(f"verdict: {verdict.word}")
     say_files(*written)
     if verdict.word == "do not trust":
         raise typer.Exit(UNTRUSTED)
+
+
+def _title(serial: str, folder: Path, profile: SensorProfile) -> str:
+    """Of a page: the sensor's name, and what it is where that is known."""
+    name = folder.name if serial == UNKNOWN else serial
+    return name if profile.directed is None else f"{name}, {profile.title}"
 
 
 def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter
+from typer.testing import CliRunner
 
 from calibration.bundle import read_bundle, read_sensor_model, write_bundle
 from calibration.height.darkness import DarknessSlopes
@@ -16,6 +18,7 @@ from calibration.light.darkness import tells_no_direction
 from calibration.light.fit import LightFit
 from calibration.light.verdict import KnownScale, judge
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_pictures
+from robot.cli import app
 from tacsim.interface import TactileFrame
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.optics.grid import canonical_cells
@@ -145,3 +148,29 @@ def test_a_bundle_rendered_and_found_again_gives_the_same_heights(tmp_path: Path
         off = (seen.height - true.height)[seen.valid]
         assert np.sqrt((off**2).mean()) < 0.03 * true.height.max()
         assert np.sqrt(((seen.gradient - true.gradient)[seen.valid] ** 2).mean()) < 0.05
+
+
+def run(folder: Path, sensor: DarkSensor, *words: str) -> tuple[int, str]:
+    frames = folder / "frames"
+    frames.mkdir()
+    Image.fromarray(sensor.empty()).save(frames / "background.png")
+    for number, press in enumerate(sensor.presses(2)):
+        Image.fromarray(press.image).save(frames / f"{number}.png")
+    lengths = ["--ball-diameter", f"{2e3 * BALL} mm", "--pixel-pitch", f"{1e3 * PITCH} mm"]
+    done = CliRunner().invoke(app, ["calibrate", "sensor", str(frames), *lengths, *words, "--out", str(folder / "out")])
+    return done.exit_code, " ".join(done.output.split())
+
+
+def test_the_command_says_which_light_it_found_and_what_was_expected(tmp_path: Path) -> None:
+    code, output = run(tmp_path, DarkSensor(7, 0.4), "--kind", "digit", "--serial", "finger")
+    assert code in (0, 3) and "this light tells no direction: darkness tells depth" in output
+    assert "is --kind right?" in output
+    assert read_bundle(tmp_path / "out")[0].darkness is not None
+    page = (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+    assert "<title>finger, DIGIT: " in page and "darkness tells depth" in page
+
+
+def test_no_bundle_is_written_where_nothing_is_told(tmp_path: Path) -> None:
+    code, output = run(tmp_path, RingSensor(8))
+    assert code == 3 and "this light tells no direction" in output and "no bundle is written" in output
+    assert not (tmp_path / "out" / "calibration.yaml").exists()

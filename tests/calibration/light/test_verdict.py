@@ -80,6 +80,14 @@ def test_wrong_lengths_are_told(ball: float, pitch: float, words: str, word: str
     assert words in said(calibrated(5, BALL_PX * ball / pitch), told, word)
 
 
+def test_contacts_that_are_all_as_wide_as_the_ball_tell_a_wrong_length(fit: LightFit) -> None:
+    """A pitch wrong by 1.6 makes contacts of 0.58 of the ball 0.93: nobody has told the gel's size, and none is beyond
+    what a ball can do. One press that deep may be, all of them are not."""
+    wide = tuple(replace(press, circle=replace(press.circle, radius=0.93 * BALL_PX)) for press in fit.presses)
+    assert "a/R = 0.93" in said(replace(fit, presses=wide), SCALE, "do not trust")
+    assert judge(replace(fit, presses=(*fit.presses[:4], wide[4])), SCALE).word == "good"
+
+
 def test_a_press_of_known_depth_tells_a_wrong_pitch(fit: LightFit) -> None:
     """Hertz's depth of a half-space, of which the presses are made, is 0.65 mm for the third."""
     depth = (("press 2", 0.65e-3),)

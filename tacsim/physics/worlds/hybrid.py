@@ -78,6 +78,7 @@ ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, a
 TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
 SELECTIVE_INERTIA = {OWN: 1 / 3, FILTERED: 2 / 3}
 FILTERED_RIGID = SELECTIVE_INERTIA[OWN] + 9.0 * SELECTIVE_INERTIA[FILTERED] - 1.0  # lighter by this are rigid motions
+LARGEST_SHARE = 0.5  # of a particle's mass over the step's square: the largest stiffness of its contact
 GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do not feel each other are refused
 # Yield stresses (Frobenius norm) of hydrostatic tension that nothing gives a squeezed body: beyond, particles have
 # strains that no node of the grid feels (docs/physics.md)
@@ -247,6 +248,8 @@ class HybridWorld(FemWorld):
             GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
         }  # fmt: skip
         masses = {**self._masses(self._gel.density, self._body.density, step), **SELECTIVE_INERTIA}
+        # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
+        masses[STIFFNESS] = min(masses[STIFFNESS], LARGEST_SHARE * masses[BODY_MASS] / step**2)
         return Inertia({**masses, **damping, WIDENING: 0.0}, step, held=held, flowing={WIDENING: 1.0})
 
     def _true_inertia(self) -> Inertia:

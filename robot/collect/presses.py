@@ -99,8 +99,8 @@ class PressSet(Config):
         return name, scene, replace(motion, at=(float(at[0]), float(at[1])), turn=turn)
 
     def _room(self, geometry: Shape) -> tuple[Any, Any]:
-        """Where the centre of an object comes down: where all of it is on the gel and in the picture; if it is larger,
-        the middle of both. Lowest and highest x, y [m]."""
+        """Where the middle of an object comes down, lowest and highest x, y [m]: half of its longer side away from the
+        border of gel and picture, which the corners of what is turned may so leave; for a larger object, amidst."""
         grid, gel = image_grid(self.sensor.geometry), np.array(self.scene.gel.size[:2]) / 2
         low = np.maximum(-gel, [grid.x[0], grid.y[0]])
         high = np.minimum(gel, [grid.x[-1], grid.y[-1]])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -63,7 +62,7 @@ def in_processes(job: Job, folder: Path, numbers: Sequence[int], stop: Stop, wor
             raise CollectFailed("a worker was killed; is there memory enough for all? (--workers)") from failure
         except BaseException:
             for worker in multiprocessing.active_children():
-                worker.terminate()
+                worker.kill()  # signals that could be caught never reach it (`shielded`), and it writes nothing
             raise
 
 
@@ -93,8 +92,6 @@ _worker: Callable[[], Worker] | None = None  # of this process
 
 def _begin(job: Job, folder: Path) -> None:
     global _worker
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     assert parent is not None and parent.pid is not None
     end_with_parent(parent.pid)

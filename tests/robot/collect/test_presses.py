@@ -95,7 +95,7 @@ def test_more_options_change_no_other_draws() -> None:
         assert (a.depth, a.at) == (b.depth, b.at) and np.array_equal(np.array(a.turn), np.array(b.turn))
 
 
-def test_the_whole_object_is_in_the_picture_and_on_the_gel() -> None:
+def test_a_ball_is_in_the_picture_and_on_the_gel_and_a_larger_one_amidst() -> None:
     made = settings(objects={"ball": Sphere(radius=3e-3), "large": Sphere(radius=11e-3)})
     places = np.array([made.placed(index)[2].at for index in range(0, 400, 2)])
     assert np.abs(places).max(axis=0) == pytest.approx([7e-3, 4.5e-3], rel=0.03)

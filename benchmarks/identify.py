@@ -73,13 +73,11 @@ def record(kind: str, seed: int, folder: Path) -> None:
     (folder / "truth.json").write_text(json.dumps(truth), encoding="utf-8")
 
 
-def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:
-    """The fit to `values` (m,) with other noise, zeros and places, by the simulation as it is near the estimate."""
-    fit, random, signals = found.fit, np.random.default_rng(seed), found.signals
-    p, t, zeros = len(fit.free), signals.presses, signals.zeros()
-    places = fit.system[:, p : p + t] @ random.normal(0, priors.place, t)
-    values = values + places + zeros @ random.normal(0, priors.zero, zeros.shape[1]) + random.normal(0, signals.noise)
-    own = fit.predicted - zeros @ fit.nuisances[t:]
+def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
+    """The fit to `values` (m,), by the simulation as it is near the estimate: linear."""
+    fit, zeros = found.fit, found.signals.zeros()
+    p, t = len(fit.free), found.signals.presses
+    own = fit.predicted - zeros @ fit.nuisances[t : t + zeros.shape[1]]
 
     def predict(points: Any) -> list[FloatArray]:
         return [
@@ -89,10 +87,19 @@ def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) ->
             for point in points
         ]
 
-    drawn = replace(signals, values=values)
-    again = estimate([predict], replace(drawn, noise=fit.sigma),
-                     [replace(each, start=fit.value(each.name)) for each in fit.parameters], priors, 0.0)  # fmt: skip
-    return replace(again, mesh_shift=fit.mesh_shift).with_sigma(again.sigma), drawn
+    signals = replace(found.signals, values=values, noise=fit.sigma)
+    again = estimate([predict], signals, [replace(each, start=fit.value(each.name)) for each in fit.parameters],
+                     priors, 0.0)  # fmt: skip
+    return replace(again, changed=fit.changed, runs=fit.runs).with_sigma(again.sigma)
+
+
+def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:
+    """`values` (m,) with other noise, zeros and places, and the fit to them."""
+    random, signals = np.random.default_rng(seed), found.signals
+    p, t, zeros = len(found.fit.free), signals.presses, signals.zeros()
+    places = found.fit.system[:, p : p + t] @ random.normal(0, priors.place, t)
+    values = values + places + zeros @ random.normal(0, priors.zero, zeros.shape[1]) + random.normal(0, signals.noise)
+    return refitted(found, values, priors), replace(signals, values=values)
 
 
 def recordings_of(kind: Kind, number: int, folder: Path) -> tuple[list[Path], dict[str, float]]:
@@ -116,7 +123,6 @@ def main(
     seed: int = 0,
     force_noise: Annotated[float, typer.Option(help="[N]")] = 0.02,
     preset: str = "standard",
-    forces_only: Annotated[bool, typer.Option(help="As if no sensor had seen heights and flow.")] = False,
     folder: Annotated[Path, typer.Option(help="Of the recordings; those that are there are not made again.")] = Path(
         "runs/identify"
     ),
@@ -128,17 +134,27 @@ def main(
         paths, truth = recordings_of(what, number, folder / f"{kind}-{number}")
         scene = load_scene("press" if kind == "gel" else "squeeze", [f"preset={preset}"])
         recordings, began = Recordings(scene), time.perf_counter()
-        presses = [_without_heights(press) if forces_only else press for press in read_all(recordings, paths)]
+        presses = read_all(recordings, paths)
         random = np.random.default_rng(number)
         found = identify(what, scene, recordings, [_spoilt(press, force_noise, random) for press in presses], noise,
                          priors)  # fmt: skip
         seconds = time.perf_counter() - began
-        clean = signals_of([thinned(gathered(press), MOMENTS) for press in presses], noise)
-        typer.echo(line(found, clean.values, truth, draws, priors, f"{kind} {number}", seconds))
+        clean = signals_of([thinned(gathered(press), MOMENTS) for press in presses], noise).values
+        typer.echo(line(found, clean, truth, draws, priors, f"{kind} {number}", f"{seconds:.0f} s"))
+        force = found.signals.force[found.signals.channel]
+        alone = forces_alone(found)
+        alone = replace(alone, fit=refitted(alone, alone.signals.values, priors))
+        typer.echo(line(alone, clean[force], truth, draws, priors, "the same by forces alone", ""))
 
 
-def _without_heights(press: Press) -> Press:
-    return replace(press, readings={key: each for key, each in press.readings.items() if _is_force(key)})
+def forces_alone(found: Identified) -> Identified:
+    """As if no sensor had seen heights and flow, by the system that the fit ended with."""
+    signals = found.signals
+    rows = signals.force[signals.channel]
+    one = {name: getattr(signals, name)[rows] for name in ("values", "noise", "press", "channel", "time")}
+    some = {name: getattr(found.fit, name)[rows] for name in ("predicted", "sigma", "system", "changed")}
+    by_size = None if found.by_size is None else found.by_size[rows]
+    return replace(found, fit=replace(found.fit, **some), signals=replace(signals, **one), by_size=by_size)
 
 
 def _spoilt(press: Press, noise: float, random: np.random.Generator) -> Press:
@@ -157,7 +173,7 @@ def _is_force(channel: str) -> bool:
 
 
 def line(
-    found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str, seconds: float
+    found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str, seconds: str
 ) -> str:
     """A row of the table; clean: (m,) the signals without noise."""
     fit, names = found.fit, tuple(press.name for press in found.presses)
@@ -179,7 +195,7 @@ def line(
         seen = (redrawn(found, clean + change, k, priors) for k in range(draws))
         noticed.append(f"{what} {sum(bool(findings(*one, names, found.by_size)) for one in seen)} of {draws}")
     against = ", ".join(each.kind for each in found.findings) or "nothing"
-    return (f"| {name} | {len(names)} | {fit.runs} | {seconds:.0f} s | {', '.join(cells)} | {against} | "
+    return (f"| {name} | {len(names)} | {fit.runs} | {seconds} | {', '.join(cells)} | {against} | "
             f"{', '.join(noticed)} |")  # fmt: skip
 
 

@@ -98,7 +98,7 @@ class Fit:
     held: NDArray[np.bool_]  # (p,) those that the data do not tell: they stayed at their start
     free: FloatArray  # (p,)
     covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
-    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them, by what it changed of the signals
+    changed: FloatArray  # (m,) what the finer mesh changed of the signals
     predicted: FloatArray  # (m,) with the zeros of the force
     sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
     system: FloatArray  # (m, n)
@@ -136,7 +136,13 @@ class Fit:
         """What its intervals were if the signals had these standard deviations."""
         p = len(self.free)
         spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
-        return replace(self, sigma=sigma, covariance=spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2))
+        other = replace(self, sigma=sigma)
+        return replace(other, covariance=spread + np.diag((MESH_LEFT * other.mesh_shift) ** 2))
+
+    @property
+    def mesh_shift(self) -> FloatArray:
+        """(p,) how far the finer mesh moves the free numbers."""
+        return self.influence(self.changed)
 
     def influence(self, change: FloatArray) -> FloatArray:
         """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
@@ -365,7 +371,7 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         held=fitter.held.copy(),
         free=state.point.free,
         covariance=np.zeros((p, p)),
-        mesh_shift=np.zeros(p),
+        changed=changed,
         predicted=state.predicted + fitter.zero_columns @ state.zeros,
         sigma=fitter.sigma,
         system=state.system,
@@ -373,7 +379,6 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         priors=fitter.priors,
         runs=fitter.runs,
     )
-    fit = replace(fit, mesh_shift=fit.influence(changed))
     scatter = float(((fitter.residual(state) / fitter.sigma) ** 2).sum() / fit.freedom)
     noisier = fit.with_sigma(fitter.sigma * max(1.0, np.sqrt(scatter)))
     return replace(fit, covariance=noisier.covariance)

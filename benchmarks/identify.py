@@ -1,4 +1,4 @@
-"""How well `tacsim identify` finds hidden materials: `python -m benchmarks.identify gel` (or body).
+"""How well `tacsim identify` finds hidden materials: `python -m benchmarks.identify gel` (body, poisson).
 
 Each truth is drawn and simulated in a process of its own, on a mesh that identification does not use, and recorded with
 the motions that `tacsim identify … --motions` writes; its numbers come back in a file that is opened when all is done.
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,13 +23,16 @@ import numpy as np
 import typer
 
 from calibration.materials.checks import findings
-from calibration.materials.estimate import Fit, Priors, Signals, estimate
+from calibration.materials.estimate import SETTLED_ERROR, Fit, Point, Priors, Signals, estimate
+from calibration.materials.parameters import starts
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
-from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify
+from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions
 from robot.studies.identify.recordings import Recordings, find_recordings, read_all
+from robot.studies.identify.simulation import Seen, Simulation
 from tacsim.config import load_scene
-from tacsim.interface import FloatArray
+from tacsim.interface import FloatArray, Pose
+from tacsim.models.sensor import CanonicalGrid
 
 TRUE_MESH = ("scene.element_size=0.4 mm", "scene.particle_spacing=0.2 mm")  # between those that identification uses
 RIGS = {"gel": "press", "body": "sim"}
@@ -117,7 +121,7 @@ def recordings_of(kind: Kind, number: int, folder: Path) -> tuple[list[Path], di
 
 
 def main(
-    kind: Annotated[str, typer.Argument(help="gel or body.")] = "gel",
+    kind: Annotated[str, typer.Argument(help="gel, body, or poisson: what which presses tell of it.")] = "gel",
     truths: Annotated[int, typer.Option(min=1)] = 3,
     draws: Annotated[int, typer.Option(min=1)] = 50,
     seed: int = 0,
@@ -128,6 +132,12 @@ def main(
     ),
 ) -> None:
     """Prints a line of the table for each truth."""
+    if kind == "poisson":
+        for balls, heights, one in product(((4.0,), (8.0,), (2.0, 8.0), (4.0, 8.0)), (False, True), (0.02, 0.005)):
+            felt = "forces and heights" if heights else "forces"
+            typer.echo(f"| {' and '.join(f'{each:g}' for each in balls)} mm | {felt} | {one} N | "
+                       f"{poisson(one, heights, balls)} |")  # fmt: skip
+        return
     what: Kind = "gel" if kind == "gel" else "body"
     noise, priors = Noise(force_noise), Priors(PLACE, ZERO)
     for number in range(seed, seed + truths):
@@ -197,6 +207,28 @@ def line(
     against = ", ".join(each.kind for each in found.findings) or "nothing"
     return (f"| {name} | {len(names)} | {fit.runs} | {seconds} | {', '.join(cells)} | {against} | "
             f"{', '.join(noticed)} |")  # fmt: skip
+
+
+def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
+    """The interval of a gel's Poisson's ratio by presses of these balls (radii [mm]) to a quarter of its thickness."""
+    scene = load_scene("press", ["preset=draft"])
+    parameters = [each for each in parameters_of("gel", scene) if each.name != "friction"]
+    depths = np.array([-0.2, -0.1, *np.linspace(0.1, 1.0, 10), 0.7, 0.4, -0.2]) * 1e-3
+    names = ("fz", "dent", "width") if heights else ("fz",)
+    presses = []
+    for radius in balls:
+        poses = {"indenter": tuple(Pose(np.array([0.0, 0.0, radius * 1e-3 - depth])) for depth in depths)}
+        readings = {f"lower.{name}": np.where(depths > 0.2e-3, 0.0, np.nan if name == "width" else 0.0)
+                    for name in names}  # fmt: skip
+        presses.append(Press("press", poses, readings, depths * 0, np.ones(len(depths), np.int64), radius * 1e-3))
+    seen = {"lower": Seen(CanonicalGrid(), None, np.ones((64, 64), np.bool_))}
+    simulation = Simulation(scene, tuple(parameters), tuple(presses), seen)
+    [values] = simulation([Point(starts(parameters), np.zeros(len(balls)))])
+    signals = replace(signals_of(presses, Noise(force_noise)), values=values)
+    fit = estimate([simulation], signals, parameters, Priors(PLACE, 10 * force_noise), SETTLED_ERROR)
+    if any(each.name == "poisson_ratio" for each in fit.untold):
+        return "not told"
+    return "{:.3f} to {:.3f}".format(*fit.interval("poisson_ratio"))
 
 
 def _faults(found: Identified) -> dict[str, FloatArray]:

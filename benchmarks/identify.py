@@ -94,7 +94,7 @@ def refitted(found: Identified, values: FloatArray, priors: Priors) -> Fit:
     signals = replace(found.signals, values=values, noise=fit.sigma)
     again = estimate([predict], signals, [replace(each, start=fit.value(each.name)) for each in fit.parameters],
                      priors, 0.0)  # fmt: skip
-    return replace(again, changed=fit.changed, runs=fit.runs).with_sigma(again.sigma)
+    return replace(again, mesh_shift=fit.mesh_shift, runs=fit.runs).with_sigma(again.sigma)
 
 
 def redrawn(found: Identified, values: FloatArray, seed: int, priors: Priors) -> tuple[Fit, Signals]:
@@ -162,7 +162,7 @@ def forces_alone(found: Identified) -> Identified:
     signals = found.signals
     rows = signals.force[signals.channel]
     one = {name: getattr(signals, name)[rows] for name in ("values", "noise", "press", "channel", "time")}
-    some = {name: getattr(found.fit, name)[rows] for name in ("predicted", "sigma", "system", "changed")}
+    some = {name: getattr(found.fit, name)[rows] for name in ("predicted", "sigma", "system")}
     by_size = None if found.by_size is None else found.by_size[rows]
     return replace(found, fit=replace(found.fit, **some), signals=replace(signals, **one), by_size=by_size)
 

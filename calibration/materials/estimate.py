@@ -2,8 +2,8 @@
 
 Unknowns are the parameters of the materials, and for each press two nuisances that every rig has: the place of its
 sensor is off by a little along the closing direction, and the zero of its force sensor is off. These have a standard
-deviation given beforehand (a row of the system each). Gauss-Newton with Levenberg's damping: the Jacobian costs one
-batch of perturbed simulations, once a mesh; steps bring it up to date by what they find (Broyden 1965).
+deviation given beforehand (a row of the system each). Gauss-Newton with Levenberg's damping: a whole Jacobian costs one
+batch of perturbed simulations.
 
 A coarse simulation finds the way; a finer one, run at the estimate, says by how much the coarse one is wrong there
 (space mapping: Bandler et al. 1994). How far that moved the estimate tells what is left of the mesh's error.
@@ -25,7 +25,7 @@ from tacsim.interface import FloatArray
 DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
 PLACE_DIFFERENCE = 0.02e-3  # the same of places [m]
 LONGEST = 0.7  # a step changes no free number by more: a factor of two
-MOST_STEPS, MOST_FINE = 10, 2
+MOST_STEPS, FEWER_STEPS, MOST_FINE = 12, 2, 4
 SMALL_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 SMALL_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
 SMALL_SPREAD = 0.3  # of their standard deviations, likewise
@@ -98,7 +98,7 @@ class Fit:
     held: NDArray[np.bool_]  # (p,) those that the data do not tell: they stayed at their start
     free: FloatArray  # (p,)
     covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
-    changed: FloatArray  # (m,) what the finer mesh changed of the signals
+    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them
     predicted: FloatArray  # (m,) with the zeros of the force
     sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
     system: FloatArray  # (m, n)
@@ -136,13 +136,7 @@ class Fit:
         """What its intervals were if the signals had these standard deviations."""
         p = len(self.free)
         spread = covariance_of(self.system, sigma, self.priors, self.held)[:p, :p]
-        other = replace(self, sigma=sigma)
-        return replace(other, covariance=spread + np.diag((MESH_LEFT * other.mesh_shift) ** 2))
-
-    @property
-    def mesh_shift(self) -> FloatArray:
-        """(p,) how far the finer mesh moves the free numbers."""
-        return self.influence(self.changed)
+        return replace(self, sigma=sigma, covariance=spread + np.diag((MESH_LEFT * self.mesh_shift) ** 2))
 
     def influence(self, change: FloatArray) -> FloatArray:
         """(p,) how far the free numbers move if the simulation changes by `change` (m,)."""
@@ -205,9 +199,10 @@ class _Fitter:
         columns += [np.where(self.signals.press == p, by_place, 0.0) for p in range(self.signals.presses)]
         return _State(point, zeros, base, np.column_stack([*columns, self.zero_columns]))
 
-    def secant(self, before: _State, point: Point, predicted: FloatArray) -> FloatArray:
-        """(m, n) the system at `point` after a step from `before`: the least change that explains what the step did
-        (Broyden 1965), for each press by itself, since no press knows another's place."""
+    def secant(self, predict: Predict, before: _State, point: Point, zeros: FloatArray) -> _State:
+        """One run: the system of `before` with the least change that explains what the step from there did (Broyden
+        1965), for each press by itself, since no press knows another's place."""
+        predicted = self.run(predict, [point])[0]
         p, system = len(self.held), before.system.copy()
         step = np.concatenate([point.free - before.point.free, point.places - before.point.places])
         missed = predicted - before.predicted - system[:, : len(step)] @ step
@@ -217,7 +212,7 @@ class _Fitter:
             scaled = step[columns] / scale
             weight = scaled @ scaled + DIFFERENCE**2  # what a smaller step missed is the simulation's own noise
             system[np.ix_(rows, columns)] += np.outer(missed[rows], scaled / scale / weight)
-        return system
+        return _State(point, zeros, predicted, system)
 
     def run(self, predict: Predict, points: Sequence[Point]) -> list[FloatArray]:
         self.runs += len(points) * self.signals.presses
@@ -310,10 +305,11 @@ def estimate(
     state = fitter.linearise(levels[0], begin, np.zeros(fitter.zero_columns.shape[1]))
     while fitter.hold(state, fitter.reach(state), HOPELESS):
         pass
-    state = _coarse(fitter, levels[0], state, coarse_error, on_step)
-    for level in levels[1:-1] or levels[:1]:  # linearised anew: by this the intervals are made
+    state = _coarse(fitter, levels[0], state, coarse_error, on_step, secant=len(levels) > 2)
+    for level in levels[1:-1]:
         on_step("next mesh")
-        state = fitter.stepped(fitter.linearise(level, state.point, state.zeros))
+        state = fitter.linearise(level, state.point, state.zeros)
+        state = fitter.stepped(_coarse(fitter, level, state, coarse_error / 2, on_step, FEWER_STEPS))
     while fitter.hold(state, fitter.reach(state), UNTOLD):
         state = fitter.stepped(state)
     while True:
@@ -324,26 +320,35 @@ def estimate(
         state = fitter.stepped(state)
 
 
-def _coarse(fitter: _Fitter, predict: Predict, state: _State, error: float, on_step: Callable[[str], None]) -> _State:
-    """Damped steps by the simulation `predict`, off by a share of about `error`; one run each."""
+def _coarse(
+    fitter: _Fitter,
+    predict: Predict,
+    state: _State,
+    error: float,
+    on_step: Callable[[str], None],
+    most: int = MOST_STEPS,
+    secant: bool = False,
+) -> _State:
+    """Damped steps by the simulation `predict`, off by a share of about `error`, `most` of them. secant: one run each,
+    the system brought up to date by what the step found; else linearised anew, a batch each."""
     damping = 1e-3
-    for count in range(MOST_STEPS):
+    for count in range(most):
         fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
         on_step(f"step {count + 1}")
-        point, zeros = fitter.moved(state, fitter.step(state, damping))
         try:
-            predicted = fitter.run(predict, [point])[0]
+            point, zeros = fitter.moved(state, fitter.step(state, damping))
+            after = fitter.secant(predict, state, point, zeros) if secant else fitter.linearise(predict, point, zeros)
         except CannotSimulate:
-            if count + 1 == MOST_STEPS:
+            if count + 1 == most:
                 raise
             damping = max(damping, 1e-3) * 100  # the step went too far
             continue
-        after = _State(point, zeros, predicted, fitter.secant(state, point, predicted))
         gain = fitter.cost(state) - fitter.cost(after)
         if gain > 0:
             state, damping = after, damping / 10
         else:
-            state, damping = replace(state, system=after.system), max(damping, 1e-3) * 10
+            state = replace(state, system=after.system) if secant else state
+            damping = max(damping, 1e-3) * 10
         if abs(gain) < max(SMALL_GAIN, SMALL_SHARE * fitter.cost(state)):
             break
     return state
@@ -352,26 +357,27 @@ def _coarse(fitter: _Fitter, predict: Predict, state: _State, error: float, on_s
 def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Callable[[str], None]) -> Fit:
     """Goes on with the differences between a finer simulation and the coarse one, and ends with the intervals."""
     p = len(fitter.held)
-    changed = np.zeros(len(state.predicted))
+    begun, coarse = state.point.free, state.predicted
     for count in range(0 if fine is None else MOST_FINE):
         assert fine is not None
         on_step(f"finer mesh, run {count + 1}")
         exact = fitter.run(fine, [state.point])[0]
         if count == 0:
-            changed = exact - state.predicted
+            off = np.abs(exact - coarse)
         noise, settled = fitter.signals.noise, SETTLED_ERROR * np.abs(exact)
-        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT * changed) ** 2)
+        fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT * off) ** 2)
         here = _State(state.point, state.zeros, exact, state.system)
         state = fitter.stepped(here)
         spread = np.diag(covariance_of(state.system, fitter.sigma, fitter.priors, fitter.held, 0.0))[:p]
         if (np.abs(state.point.free - here.point.free) < np.maximum(SMALL_STEP, SMALL_SPREAD * np.sqrt(spread))).all():
             break
+    shift = state.point.free - begun
     fit = Fit(
         parameters=fitter.parameters,
         held=fitter.held.copy(),
         free=state.point.free,
         covariance=np.zeros((p, p)),
-        changed=changed,
+        mesh_shift=shift,
         predicted=state.predicted + fitter.zero_columns @ state.zeros,
         sigma=fitter.sigma,
         system=state.system,

@@ -170,7 +170,9 @@ class Recordings:
         if role in self.seen:
             flow = touch.flow if self.seen[role].markers is not None else None
             felt |= shape_signals(role, touch.height, flow, touch.valid, self.seen[role].grid.pitch)
-            if touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < SHALLOWEST:
+            if self.scene.indenter is None:  # the width tells an indenter; of a body it hangs on mesh and edges
+                felt.pop(f"{role}.width", None)
+            elif touch.height is not None and np.abs(touch.height[touch.valid]).max(initial=0.0) < SHALLOWEST:
                 felt[f"{role}.width"] = math.nan
         return felt
 

@@ -239,7 +239,9 @@ def _faults(found: Identified) -> dict[str, FloatArray]:
     along = np.where(rows, signals.time - signals.time[rows].min(), 0.0) / np.ptp(signals.time[rows])
     faults = {f"drift of {size} N": size * along for size in DRIFTS[found.kind]}
     if found.by_size is not None:
-        faults |= {f"ball {factor} times as large": found.by_size * np.log(factor) for factor in (1.1, 1.25)}
+        faults |= {
+            f"ball {factor} times as large": found.by_size.sum(axis=1) * np.log(factor) for factor in (1.1, 1.25)
+        }
     return faults
 
 

@@ -44,17 +44,19 @@ class _Suspect:
 def findings(fit: Fit, signals: Signals, names: tuple[str, ...], by_size: FloatArray | None = None) -> list[Finding]:
     """What speaks against the fit; causes first, they explain a misfit too.
 
-    names: of the presses. by_size: (m,) derivative of the signals by the logarithm of the indenter's size.
+    names: of the presses. by_size: (m, b) derivative of the signals by the logarithm of the size of each indenter.
     """
     suspects = _drifts(signals, names)
-    if by_size is not None:
-        suspects.append(_Suspect(by_size, "size", _size_in_words, SIZE_ALLOWED))
+    for column in () if by_size is None else by_size.T:
+        pressed = ", ".join(names[press] for press in sorted(set(signals.press[column != 0].tolist())))
+        suspects.append(_Suspect(column, "size", partial(_size_in_words, pressed), SIZE_ALLOWED))
     return _caused(fit, signals, suspects) or _misfits(fit, signals, names)
 
 
 def size_error(fit: Fit, by_size: FloatArray) -> float:
-    """Standard deviation of the logarithm of the indenter's size, if the signals alone were to tell it."""
-    return _one_more(fit, [by_size], np.zeros(len(by_size)))[1]
+    """Standard deviation of the logarithm of an indenter's size, if the signals alone were to tell it; of several the
+    greatest. by_size: (m, b)."""
+    return max(_one_more(fit, [column], np.zeros(len(column)))[1] for column in by_size.T)
 
 
 def _drifts(signals: Signals, names: tuple[str, ...]) -> list[_Suspect]:
@@ -78,9 +80,9 @@ def _drift_in_words(press: str, channel: str, size: float, spread: float) -> str
     )
 
 
-def _size_in_words(size: float, spread: float) -> str:
+def _size_in_words(presses: str, size: float, spread: float) -> str:
     return (
-        f"the dents are those of an indenter about {math.exp(size):.2f} times as large as stated (give or take "
+        f"{presses}: felt and seen is an indenter about {math.exp(size):.2f} times as large as stated (give or take "
         f"{100 * spread:.0f} %), or of another shape; measure it, and check the pixel pitch of the sensor"
     )
 

@@ -37,11 +37,11 @@ class Identified:
     signals: Signals
     findings: tuple[Finding, ...]
     noise: Noise
-    by_size: FloatArray | None = None  # (m,) derivative of the signals by the logarithm of the indenter's size
+    by_size: FloatArray | None = None  # (m, b) derivative of the signals by the logarithm of the size of each indenter
 
     @property
     def size_error(self) -> float | None:
-        """Standard deviation of the indenter's size by these presses alone, as a share of it."""
+        """Standard deviation of the size of an indenter by these presses alone, as a share of it."""
         return None if self.by_size is None else size_error(self.fit, self.by_size)
 
 
@@ -124,7 +124,9 @@ def identify(
     by_size = None
     if kind == "gel":
         on_step("size of the indenter")
-        by_size = levels[0].by_size(Point(fit.free, fit.nuisances[: len(taken)]))
+        by_all = levels[0].by_size(Point(fit.free, fit.nuisances[: len(taken)]))
+        balls = np.array([press.ball or 0.0 for press in taken])
+        by_size = np.stack([np.where(balls[signals.press] == ball, by_all, 0.0) for ball in np.unique(balls)], axis=1)
     against = findings(fit, signals, tuple(press.name for press in taken), by_size)
     return Identified(kind, found, fit, taken, signals, tuple(against), noise, by_size)
 

@@ -128,12 +128,12 @@ def test_every_figure_is_fed_by_a_case_that_exists() -> None:
                 "R 3 mm, 1 mm deep: image", "R 3 mm, 1 mm deep: pressure",
                 "THUsight: picture", "THUsight: normals", "Taxim: picture", "FOTS: picture", "R 3 mm: height",
                 "surfaces: drift, gain −30 %", "640 x 480", "320 x 240",
-                "pictures: rho, gradient", "pictures: rho, height",
+                "pictures: rho, difference", "pictures: rho, gradient", "pictures: rho, height",
                 "surfaces: rho, gradient", "surfaces: rho, height"]  # fmt: skip
     names = ["wall_per_particle_substep_ns", "cpu_per_element_substep_ns", "second_ms", "momentum", "angular_momentum"]
     names += ["worst_percent", "env_steps_per_s", "volume_off"]
     names += ["kept_percent", "kept_in_picture_percent", "jitter_px"]
-    names += ["ncc", "ssim", "whole_percent", "auc_low", "extra_deg", "bound_ratio"]
+    names += ["ncc", "ssim", "whole_percent", "auc", "auc_low", "extra_deg", "bound_ratio"]
     figures = {**dict.fromkeys(names, 1.0), "depth_mm": 1.0}
     keys = [(case.group, case.name, case.method, case.resolution) for case in CASES]
     keys.append(("real", "contact_radius", "tacsim", "ball R 3 mm, gel 8 mm"))

@@ -109,13 +109,15 @@ def _fold(
     from calibration.errors import BadFrames
     from calibration.frame_set import Frame, FrameSet
     from calibration.light.calibrator import calibrate_light
+    from calibration.light.noise import NoiseUnknown, measure_press_noise
     from robot.studies.matched_press import match_presses
 
     try:
         fit = calibrate_light(reference, train, of.ball_radius / of.pixel_pitch)
-    except BadFrames as error:
+        noise = measure_press_noise(fit.presses, fit.reference)
+    except (BadFrames, NoiseUnknown) as error:
         raise BadData(f"{of.name}: {error}") from None
-    calibration = fit.to_calibration("bench", of.ball_radius, of.pixel_pitch)
+    calibration = fit.to_calibration("bench", of.ball_radius, of.pixel_pitch, noise=noise)
     real = FrameSet("real", reference, "as labelled", tuple(Frame(name, image) for name, image in test))
     scene = ball_scene(gel_size, of.ball_radius, ELEMENT)
     wall, cpu = perf_counter(), process_time()

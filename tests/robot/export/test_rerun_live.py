@@ -22,6 +22,7 @@ from robot.rig.recorded import observe_episode
 from tacsim.interface import Pose, Truth
 from tests.robot.cli.invoked import tacsim
 from tests.robot.export.made_up import LOADED, record
+from tests.tacsim.gym.small import SMALL
 
 needs_rerun = pytest.mark.skipif(util.find_spec("rerun") is None, reason="needs the extra 'viz'")
 TRUTH = Truth(7e-3, np.zeros(3), np.zeros((20_000, 3), np.float32), {"lower": Pose()})
@@ -153,3 +154,16 @@ if __name__ == "__main__":
         time.sleep(0.05)
     command = [sys.executable, "-m", "rerun", "rrd", "verify", "live.rrd"]
     assert subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+
+
+@needs_rerun
+def test_a_run_is_looked_at_while_it_runs() -> None:
+    sets = [word for each in SMALL for word in ("--set", each)]
+    words = ["run", "sim", "--task", "squeeze", *sets, "--steps", "2", "--save-view", "live.rrd"]
+    done = tacsim(*words, "--out", "out")
+    assert done.exit_code == 0, done.output
+    command = [sys.executable, "-m", "rerun", "rrd", "print", "live.rrd"]
+    listed = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert "/world/body" in listed.stdout + listed.stderr
+    again = tacsim(*words, "--out", "again")
+    assert again.exit_code != 0 and "live.rrd: exists already" in again.stderr and not Path("again").exists()

@@ -29,18 +29,22 @@ from calibration.light.darkness import find_dark_press, fit_darkness, tells_no_d
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
 from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
 from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
-from calibration.light.press import FAR, NEAR, BallPress, find_press, smooth, untouched_mean
-from calibration.light.refinement import RIM_BLUR, RefinedGeometry, Window, refine
+from calibration.light.press import FAR, NEAR, BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.refinement import RIM_BLUR, RefinedGeometry, refine
+from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, exchanged
 from tacsim.models.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
+from tacsim.models.shadows import CastShadows
 from tacsim.optics.darkness import darkened
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
+ROUNDS = 2
 BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 REFINEMENT_PIXELS = 2500  # of each press, about
+SHADED_PIXELS = 1000  # the same with cast shadows, which have nine times the terms
 # A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
 MAX_UNEXPLAINED = 0.5  # share of the change
 MAX_UNEXPLAINED_RATIO = 5.0  # times the median press's share, with three presses or more; at least GOOD_FIT
@@ -92,9 +96,10 @@ def calibrate_light(
     if dark:
         return replace(_darkness(found, left_out, mean, reference, ball), reference=shown, frames=_names(frames))
     presses, refined = _refined(found, left_out, ball)
-    v, u = np.mgrid[: reference.shape[0], : reference.shape[1]].astype(np.float64)
-    labels = [dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR) for press in presses]
-    forward_sets = [_forward_equations(p, g) for p, g in zip(presses, labels, strict=True)]
+    presses, refined, shade = _shaded(presses, refined, ball)
+    labels = [_label(press, refined, ball) for press in presses]
+    darks = [_dark(press, refined, ball, shade) for press in presses]
+    forward_sets = [_forward_equations(p, g, d) for p, g, d in zip(presses, labels, darks, strict=True)]
     inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     size = choose_size(forward_sets)
     all_equations = functools.reduce(operator.add, forward_sets)
@@ -103,7 +108,8 @@ def calibrate_light(
         _prediction(
             press,
             labels[i],
-            _forward_model(all_equations - forward_sets[i], size, steepest),
+            darks[i],
+            _forward_model(all_equations - forward_sets[i], size, steepest, shade),
             _inverse_model([*inverse_sets[:i], *inverse_sets[i + 1 :]], steepest),
             mean,
             reference,
@@ -112,7 +118,7 @@ def calibrate_light(
         if len(presses) > 1
     )
     return LightFit(
-        forward=_forward_model(all_equations, size, steepest),
+        forward=_forward_model(all_equations, size, steepest, shade),
         inverse=_inverse_model(inverse_sets, steepest),
         size=size,
         thickness=refined.thickness,
@@ -223,6 +229,38 @@ def _refined(
     raise _nothing_left(left_out)
 
 
+def _shaded(
+    presses: list[BallPress], refined: RefinedGeometry, ball: float
+) -> tuple[list[BallPress], RefinedGeometry, DentShade | None]:
+    """Where cast shadows are seen: their lamps, and the circles refined with them, which else grow towards the shade
+    and take it for skirt. Else what was given, and None."""
+    if len(presses) <= FEW_PRESSES:
+        return presses, refined, None
+    windows, circles = [_window(press, SHADED_PIXELS) for press in presses], refined.circles
+    shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)
+    sets = [_forward_equations(p, _label(p, refined, ball), _dark(p, refined, ball, shade)) for p in presses]
+    if not choose_size(sets).shadows:
+        return presses, refined, None
+    for _ in range(ROUNDS):  # circles tell where the lamps stand, and the lamps where the circles are
+        refined = refine(windows, refined.circles, ball, shade, (ball / refined.thickness,))
+        shade = find_lamps(windows, refined.circles, refined.thickness, ball, presses[0].shape)
+    return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade
+
+
+def _label(press: BallPress, refined: RefinedGeometry, ball: float) -> Float64:
+    """(H, W, 2) slopes that are taken for the true ones."""
+    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
+    return dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR)
+
+
+def _dark(press: BallPress, refined: RefinedGeometry, ball: float, shade: DentShade | None) -> Float64 | None:
+    """(H, W, terms) of cast shadows."""
+    if shade is None:
+        return None
+    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
+    return shade.terms(u.ravel(), v.ravel(), press.circle, refined.thickness, ball).reshape(*press.shape, -1)
+
+
 def _warnings(presses: Sequence[BallPress], mean: Float64, left_out: int) -> list[str]:
     """What a person should look at in the frames; calibration.light.verdict judges the figures."""
     found = []
@@ -259,10 +297,10 @@ def _near(press: BallPress) -> NDArray[np.bool_]:
     return np.asarray(press.distance() < NEAR * press.circle.radius + RIM_MARGIN)
 
 
-def _window(press: BallPress) -> Window:
-    """Pixels of contact and skirt, thinned out."""
+def _window(press: BallPress, pixels: int = REFINEMENT_PIXELS) -> Window:
+    """Pixels of contact and skirt, thinned out to about so many."""
     v, u = np.nonzero(_near(press))
-    thin = max(1, round(np.sqrt(len(u) / REFINEMENT_PIXELS)))
+    thin = max(1, round(np.sqrt(len(u) / pixels)))
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
     u, v = u[keep], v[keep]
     return Window(u.astype(np.float64), v.astype(np.float64), smooth(press.change, BLUR)[v, u])
@@ -275,9 +313,10 @@ def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
     return u[columns], v[rows]
 
 
-def _forward_equations(press: BallPress, gradient: Float64) -> NormalEquations:
+def _forward_equations(press: BallPress, gradient: Float64, dark: Float64 | None) -> NormalEquations:
     near = _near(press)
-    return normal_equations(gradient[near], *_places(near), smooth(press.change, BLUR)[near], press.lit[near])
+    change, shade = smooth(press.change, BLUR)[near], None if dark is None else dark[near]
+    return normal_equations(gradient[near], *_places(near), change, press.lit[near], shade)
 
 
 def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> Float64:
@@ -296,9 +335,18 @@ def _inverse_equations(press: BallPress, gradient: Float64) -> tuple[Float64, Fl
     return terms.T @ terms, terms.T @ target[near | far]
 
 
-def _forward_model(pixels: NormalEquations, size: ModelSize, steepest: float) -> PhotometricModel:
+def _forward_model(
+    pixels: NormalEquations, size: ModelSize, steepest: float, shade: DentShade | None
+) -> PhotometricModel:
     weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(pixels, size))
-    return PhotometricModel(degree=size.degree, position=size.position, weights=weights, steepest=steepest, blur=BLUR)
+    light = len(weights) - size.shadows
+    shadows = None
+    if shade is not None and size.shadows:
+        shadows = CastShadows(lamps=shade.lamps, weights=weights[light:])
+    return PhotometricModel(
+        degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=BLUR,
+        shadows=shadows,
+    )  # fmt: skip
 
 
 def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> InverseModel:
@@ -309,16 +357,20 @@ def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> 
 def _prediction(
     press: BallPress,
     gradient: Float64,
+    dark: Float64 | None,
     forward: PhotometricModel,
     inverse: InverseModel,
     mean: Float64,
     reference: Image,
 ) -> PressPrediction:
-    """Of a press labelled `gradient` (H, W, 2), by models made without it. Slopes are found as in every picture: from
-    each pixel's colour, then made those of a surface."""
+    """Of a press labelled `gradient` (H, W, 2), `dark` (H, W, terms), by models made without it.
+    Slopes are found as in every picture: from each pixel's colour, then made those of a surface."""
     places = places_in_image(*press.shape[::-1])
     light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places)
-    predicted = smooth(light.astype(np.float64), BLUR) * mean
+    predicted = light.astype(np.float64)
+    if dark is not None and forward.shadows is not None:
+        predicted += dark @ np.array(forward.shadows.weights)
+    predicted = smooth(predicted, BLUR) * mean
     seen = smooth(press.change, INVERSE_BLUR).astype(np.float32)
     slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)
     found = np.stack(slopes_of(Integrator(press.shape, 1.0)(slopes), 1.0), axis=-1)

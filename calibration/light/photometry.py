@@ -25,6 +25,7 @@ FEW_PRESSES = 3  # up to this number they cover too little of the image for ligh
 FEW_RIDGE = 1e-3
 CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
 MIN_IMPROVEMENT = 0.98  # factor of the left-out error that a larger model must reach
+SHADOW_IMPROVEMENT = 0.93  # the same of a model with cast shadows
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +35,17 @@ class ModelSize:
     degree: int
     position: int
     ridge: float
+    shadows: int = 0  # terms of cast shadows
 
     @property
     def terms(self) -> int:
-        return term_count(self.degree, self.position)
+        return term_count(self.degree, self.position) + self.shadows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one press for the terms of LARGEST. Each channel has its own where pixels are saturated in
-    one and not in another."""
+    """Normal equations of one press for the terms of LARGEST, and those of cast shadows after them. Each channel has
+    its own where pixels are saturated in one and not in another."""
 
     square: Float64  # (1, terms, terms) of all channels, or (3, terms, terms)
     right: Float64  # (terms, 3)
@@ -71,41 +73,55 @@ def features(gradient: Float64, u: Float64, v: Float64, degree: int, position: i
 
 
 def normal_equations(
-    gradient: Float64, u: Float64, v: Float64, change: Float64, lit: NDArray[np.bool_] | None = None
+    gradient: Float64,
+    u: Float64,
+    v: Float64,
+    change: Float64,
+    lit: NDArray[np.bool_] | None = None,
+    shade: Float64 | None = None,
 ) -> NormalEquations:
     """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
-    and counts; None: all."""
+    and counts; None: all; `shade` (n, terms) of cast shadows; None: there are none."""
+    dark = np.zeros((len(u), 0)) if shade is None else shade
     if lit is None or lit.all():
-        square, right = _sums(gradient, u, v, change)
+        square, right = _all_sums(gradient, u, v, change, dark)
         return NormalEquations(square[None], right, float((change**2).sum()), change.size)
     counted = change * lit
-    square, right = _sums(gradient, u, v, counted)
+    square, right = _all_sums(gradient, u, v, counted, dark)
     squares = []
     for saturated in (~lit).T:
-        lost, _ = _sums(gradient[saturated], u[saturated], v[saturated], counted[saturated])
+        lost, _ = _all_sums(gradient[saturated], u[saturated], v[saturated], counted[saturated], dark[saturated])
         squares.append(square - lost)
     return NormalEquations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
 
 
+def _all_sums(gradient: Float64, u: Float64, v: Float64, change: Float64, shade: Float64) -> tuple[Float64, Float64]:
+    """G^T G and G^T `change` for G, the features of :func:`_sums` and beside them `shade` (n, terms)."""
+    square, right = _sums(gradient, u, v, np.concatenate([change, shade], axis=1))
+    light, across = right[:, : change.shape[1]], right[:, change.shape[1] :]
+    return np.block([[square, across], [across.T, shade.T @ shade]]), np.concatenate([light, shade.T @ change])
+
+
 def _sums(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
-    """F^T F and F^T `change` for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is a term
-    of the normal times one of the place, and of the products of two columns most are the same powers. What is left are
-    87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
+    """F^T F and F^T `change` (n, any) for F = features(gradient, u, v, *LARGEST), without F: each of its 126 columns is
+    a term of the normal times one of the place, and of the products of two columns most are the same powers. What is
+    left are 87 products of the normal times 15 of the place, summed over CHUNK pixels at a time."""
     degree, position = LARGEST
     normals, places = len(_powers(degree)), len(_places(position))
     sums = np.zeros((len(_products()), len(_places(2 * position))))
-    right = np.zeros((normals, places * 3))
+    channels = change.shape[1]
+    right = np.zeros((normals, places * channels))
     for start in range(0, len(gradient), CHUNK):
         part = slice(start, start + CHUNK)
         normal = normal_terms(gradient[part], 2 * degree)
         normal = np.concatenate([normal, normal[2] * normal[:normals]])  # as _products has them
         place = np.stack(position_terms(u[part], v[part], 2 * position))
         sums += normal @ place.T
-        right += normal[:normals] @ (place[:places, None] * change[part].T).reshape(places * 3, -1).T
+        right += normal[:normals] @ (place[:places, None] * change[part].T).reshape(places * channels, -1).T
     of_normals, of_places = _pairs()
     square = sums[of_normals[None, :, None, :], of_places[:, None, :, None]]  # (places, normals, places, normals)
-    by_place = right.reshape(normals, places, 3).swapaxes(0, 1)
-    return square.reshape(places * normals, -1), by_place.reshape(-1, 3)
+    by_place = right.reshape(normals, places, channels).swapaxes(0, 1)
+    return square.reshape(places * normals, -1), by_place.reshape(-1, channels)
 
 
 def _powers(degree: int) -> list[tuple[int, ...]]:
@@ -169,19 +185,31 @@ def left_out_error(presses: Sequence[NormalEquations], ridge: float) -> float:
 
 def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
     """Up to FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
-    is clearly better at predicting left-out presses, each with its best ridge."""
+    is clearly better at predicting left-out presses, each with its best ridge. Cast shadows, where they are among the
+    terms, are taken if they make it better by far."""
     if len(presses) <= FEW_PRESSES:
         return ModelSize(3, 0, FEW_RIDGE)
+    error, size = _best_size(presses, 0)
+    shadows = len(presses[0].right) - term_count(*LARGEST)
+    if shadows:
+        other_error, other = _best_size(presses, shadows)
+        if other_error < SHADOW_IMPROVEMENT * error:
+            return other
+    return size
+
+
+def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float, ModelSize]:
+    """The left-out error of the best size with so many terms of shadows, and that size."""
     best: tuple[float, ModelSize] | None = None
     for degree, position in sorted(SIZES, key=lambda size: term_count(*size)):
-        use = _terms_of(ModelSize(degree, position, RIDGES[0]))
+        use = _terms_of(ModelSize(degree, position, RIDGES[0], shadows))
         parts = [_part(press, use) for press in presses]
         error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
-        size = ModelSize(degree, position, ridge)
+        size = ModelSize(degree, position, ridge, shadows)
         if best is None or error < MIN_IMPROVEMENT * best[0]:
             best = (error, size)
     assert best is not None
-    return best[1]
+    return best
 
 
 def _part(of: NormalEquations, use: list[int]) -> NormalEquations:
@@ -193,4 +221,5 @@ def _terms_of(size: ModelSize) -> list[int]:
     """Where the terms of `size` stand among those of LARGEST."""
     normals, all_normals = term_count(size.degree, 0), term_count(LARGEST[0], 0)
     places = term_count(1, size.position) // term_count(1, 0)
-    return [place * all_normals + term for place in range(places) for term in range(normals)]
+    dark = range(term_count(*LARGEST), term_count(*LARGEST) + size.shadows)
+    return [*(place * all_normals + term for place in range(places) for term in range(normals)), *dark]

@@ -45,6 +45,15 @@ class BallPress:
         return np.asarray(np.hypot(u - self.circle.x, v - self.circle.y), dtype=np.float64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The n pixels of one press that take part."""
+
+    u: Float64  # (n,) columns [px]
+    v: Float64  # (n,) rows [px]
+    change: Float64  # (n, 3) relative change of colour
+
+
 def untouched_mean(reference: Image) -> Float64:
     """(3,) mean colour of a picture without contact. Raises BadFrames for one that is dark or saturated."""
     try:

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient
 from calibration.light.photometry import features
+from calibration.light.press import Window
+from calibration.light.shadows import DentShade
 
 Float64 = NDArray[np.float64]
 
-DEGREE = 3  # of the light during refinement, the same everywhere on the gel
+DEGREE = 3  # of the light during refinement; without shadows the same everywhere on the gel
 RIDGE = 1e-4
 RIM_BLUR = 1.0  # of camera and smoothing together, through which the rim of a contact is seen [px]
 MAX_STEPS = 25
@@ -32,15 +34,6 @@ RIVAL = 1.2  # times the least cost, up to which what the other start leads to i
 MAX_GROUPS = 8  # that are left out in turn to tell the uncertainty of radii
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Window:
-    """The n pixels of one press that take part."""
-
-    u: Float64  # (n,) columns [px]
-    v: Float64  # (n,) rows [px]
-    change: Float64  # (n, 3) relative change of colour
-
-
 @dataclass(frozen=True, slots=True)
 class RefinedGeometry:
     """Geometry of all presses."""
@@ -51,13 +44,20 @@ class RefinedGeometry:
     radius_uncertainty: float  # of the scale of all radii together [-]; NaN for a single press
 
 
-def refine(windows: Sequence[Window], start: Sequence[ContactCircle], ball: float) -> RefinedGeometry:
-    """Refines the circles; `ball`: radius [px].
+def refine(
+    windows: Sequence[Window],
+    start: Sequence[ContactCircle],
+    ball: float,
+    shade: DentShade | None = None,
+    thinness: Sequence[float] = FIRST_THINNESS,
+) -> RefinedGeometry:
+    """Refines the circles; `ball`: radius [px]; `shade`: what dents hide from lamps belongs to the light; `thinness`:
+    where that of the gel starts.
 
     Fixed windows, so that two states compare: they are cut round `start` and stay.
     """
     ends = sorted(
-        (_descended(_Problem(windows, tuple(start), thinness, ball).solved()) for thinness in FIRST_THINNESS),
+        (_descended(_Problem(windows, tuple(start), first, ball, shade).solved()) for first in thinness),
         key=lambda problem: problem.cost,
     )
     best = ends[0]
@@ -117,6 +117,7 @@ class _Problem:
     circles: tuple[ContactCircle, ...]
     thinness: float
     ball: float
+    shade: DentShade | None = None
     cost: float = np.inf
     _terms: list[Float64] = field(default_factory=list)
     _square: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
@@ -125,7 +126,8 @@ class _Problem:
 
     def part(self, kept: Sequence[int]) -> _Problem:
         """The same of some of the presses."""
-        return _Problem([self.windows[i] for i in kept], tuple(self.circles[i] for i in kept), self.thinness, self.ball)
+        windows, circles = [self.windows[i] for i in kept], tuple(self.circles[i] for i in kept)
+        return _Problem(windows, circles, self.thinness, self.ball, self.shade)
 
     def solved(self) -> Self:
         self._terms = [self._features(i, self.circles[i], self.thinness) for i in range(len(self.windows))]
@@ -176,9 +178,13 @@ class _Problem:
             for circle, (dx, dy, dr) in zip(self.circles, np.clip(step[:-1].reshape(-1, 3), -4, 4), strict=True)
         )
         thinness = float(np.clip(self.thinness + np.clip(step[-1], -0.5, 0.5), *THINNESS_BOUNDS))
-        return _Problem(self.windows, circles, thinness, self.ball)
+        return _Problem(self.windows, circles, thinness, self.ball, self.shade)
 
     def _features(self, i: int, circle: ContactCircle, thinness: float) -> Float64:
         window = self.windows[i]
-        gradient = dent_gradient(window.u, window.v, circle, self.ball / thinness, self.ball, RIM_BLUR)
-        return features(gradient, window.u, window.v, DEGREE, 0)
+        thickness = self.ball / thinness
+        gradient = dent_gradient(window.u, window.v, circle, thickness, self.ball, RIM_BLUR)
+        if self.shade is None:
+            return features(gradient, window.u, window.v, DEGREE, 0)
+        dark = self.shade.terms(window.u, window.v, circle, thickness, self.ball)
+        return np.concatenate([self.shade.light(gradient, window.u, window.v), dark], axis=1)

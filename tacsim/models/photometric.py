@@ -7,11 +7,13 @@ the image, each from -1/2 to 1/2 across it, the relative change of colour (I - I
     sum over normal terms nx, ny, 1 - nz, nx^2, nx ny, ny^2, nx^3, ... (up to `degree`) of weight * product.
 
 No term is constant: the flat gel shows I0. Degree 1 at position 0 is the most that directional diffuse lights can do.
+What one place of the surface hides from another is added: tacsim.models.shadows.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Self
 
 import numpy as np
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from tacsim.models.quantity import Config
+from tacsim.models.shadows import CastShadows, shadow_terms
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -35,6 +38,7 @@ class PhotometricModel(Config):
     weights: tuple[tuple[Weight, Weight, Weight], ...]
     steepest: Annotated[float, Field(gt=0, le=10)]  # slope up to which it was calibrated; steeper ones are clipped [-]
     blur: Annotated[float, Field(ge=0, le=10)] = 0.0  # standard deviation of the camera's blur [px]
+    shadows: CastShadows | None = None  # None: none are seen
 
     @model_validator(mode="after")
     def _one_weight_a_term(self) -> Self:
@@ -108,6 +112,7 @@ class PhotometricLight:
         self._terms = term_count(model.degree, 0)
         weights = (np.array(model.weights) * mean).astype(np.float32).reshape(-1, self._terms, 3)
         self._weights = np.ascontiguousarray(weights.transpose(0, 2, 1)).reshape(-1, self._terms)  # place and channel
+        self._shadows = None if model.shadows is None else (np.array(model.shadows.weights) * mean).astype(np.float32)
 
     def change(self, gradient: Float32, u: Float32, v: Float32) -> tuple[Float32, int]:
         """(..., n, 3) change of colour under slopes (..., n, 2) at places u, v (..., n) in -1/2..1/2, before blur, and
@@ -122,3 +127,9 @@ class PhotometricLight:
         at_places = (self._weights @ normals).reshape(*normals.shape[:-2], len(places), 3, -1)
         red, green, blue = np.einsum("...pcn,p...n->c...n", at_places, places)
         return np.asarray(cv2.merge([red, green, blue]), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
+
+    def shadow(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:
+        """(..., 3) change of colour by cast shadows, for the horizons (...,) of each lamp at places u, v (...,), before
+        blur. Of a model with shadows."""
+        assert self._shadows is not None
+        return np.asarray(np.tensordot(shadow_terms(horizons, u, v), self._shadows, axes=(0, 0)), dtype=np.float32)

@@ -30,6 +30,7 @@ from tacsim.optics.darkness import darkened
 from tacsim.optics.grid import PixelGrid, image_grid, strips
 from tacsim.optics.ink import lifted_ink
 from tacsim.optics.markers import check_fits, marker_transmission
+from tacsim.optics.shadows import shadow_colours
 from tacsim.optics.spline import line_matrices
 from tacsim.optics.surface import SurfaceTable, look_up
 
@@ -161,6 +162,8 @@ class Renderer:
 
         assert self.model.photometric is not None
         colours, beyond = calibrated.change(table.fields[..., 1:], *self._grid.in_image(*table.place()))
+        if self.model.photometric.shadows is not None:
+            colours += shadow_colours(calibrated, self.model.photometric.shadows, table, self._grid)
         self._beyond = beyond / (colours.size // 3)
         change = table.at(colours, points, inside)
         if self.model.photometric.blur > 0:

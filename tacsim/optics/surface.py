@@ -88,6 +88,13 @@ class SurfaceTable:
         y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
         return x, y
 
+    def at_places(self, values: Float32, x: Float32, y: Float32) -> Float32:
+        """`values` (rows, columns) of the table's points at places x, y (...,) on the untouched gel [m], linear between
+        them; beyond the gel as on its border."""
+        origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
+        pitch = np.float32(self._pitch)
+        return look_up(values, np.stack([(x - origin_x) / pitch, (y - origin_y) / pitch], axis=-1))
+
     def seen(self, values: Float32, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
         """`values` (rows, columns, n <= 4) of the table's points, linear between them, as seen at the points of `grid`:
         (H, W, n), 0 outside the gel; and (H, W) False there. Not `fine` will do for colours. Raises SurfaceFolded.

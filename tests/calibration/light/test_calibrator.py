@@ -284,3 +284,8 @@ def test_printed_dots_that_move_are_erased() -> None:
     np.testing.assert_array_equal(erased.reference, reference)
     with pytest.raises(BadFrames, match="no frame can be used"):
         calibrate_light(reference, frames, BALL_PX)
+
+
+def test_where_nothing_casts_a_shadow_none_is_made_up(calibrated: tuple[LightFit, list[Made]]) -> None:
+    fit, _ = calibrated
+    assert fit.forward is not None and fit.forward.shadows is None

@@ -1,0 +1,116 @@
+"""Cast shadows of ball presses: where lamps stand that throw them, found from the presses themselves."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.light.dent import FAR, ContactCircle, dent_gradient, depth_profile
+from calibration.light.photometry import features
+from calibration.light.press import Window
+from tacsim.models.shadows import Floats, horizon, shadow_terms
+
+Float64 = NDArray[np.float64]
+
+DEGREE, POSITION = 3, 2  # of the light beside which shadows are sought
+RIDGE = 1e-4
+PIXELS = 600  # of each press, about, that tell where lamps stand
+DISTANCES = (0.35, 0.7, 1.3, 4.0)  # of lamps from the middle of the picture at which the search starts [widths]
+DIRECTIONS = 10
+SEARCH_STEPS = 30
+STEP = 1.0  # of the radii at which the depth of a dent is found [px]
+
+
+@dataclass(frozen=True, slots=True)
+class DentShade:
+    """The lamps of a sensor, and its picture: what tells the shade round a ball's dent."""
+
+    lamps: tuple[tuple[float, float], ...]  # [widths of the picture], from its middle
+    shape: tuple[int, int]  # rows, columns
+
+    def terms(self, u: Float64, v: Float64, circle: ContactCircle, thickness: float, ball: float) -> Float64:
+        """(n, terms) of the shadows at pixels u, v (n,), in the order of their weights."""
+        rows, columns = self.shape
+        radii, depth = _profile(circle.radius, ball, thickness)
+        x, y = self._places(u, v)
+        middle_x, middle_y = self._places(np.array(circle.x), np.array(circle.y))
+
+        def height(x: Floats, y: Floats) -> Floats:
+            distance = np.hypot(x - middle_x, y - middle_y) * columns
+            return np.asarray(np.interp(distance, radii, depth) / columns, dtype=np.float64)
+
+        horizons = [horizon(height, x, y, lamp) for lamp in self.lamps]
+        return np.ascontiguousarray(shadow_terms(horizons, x, y * (columns / rows)).T, dtype=np.float64)
+
+    def light(self, gradient: Float64, u: Float64, v: Float64) -> Float64:
+        """(n, terms) of the light beside shadows, for slopes (n, 2)."""
+        x, y = self._places(u, v)
+        return features(gradient, x, y * (self.shape[1] / self.shape[0]), DEGREE, POSITION)
+
+    def _places(self, u: Float64, v: Float64) -> tuple[Float64, Float64]:
+        rows, columns = self.shape
+        return (u - (columns - 1) / 2) / columns, (v - (rows - 1) / 2) / columns
+
+
+@functools.lru_cache(maxsize=64)
+def _profile(contact: float, ball: float, thickness: float) -> tuple[Float64, Float64]:
+    """Radii and the depth of a dent there [px]."""
+    radii = np.arange(0.0, FAR * ball, STEP)
+    return radii, depth_profile(radii, contact, ball, thickness)
+
+
+def find_lamps(
+    windows: Sequence[Window],
+    circles: Sequence[ContactCircle],
+    thickness: float,
+    ball: float,
+    shape: tuple[int, int],
+) -> DentShade:
+    """A lamp for each colour: where it stands if its shadows explain most of what the slopes leave of that colour. They
+    must darken: a shade that brightens is the lit flank of a lamp on the other side. `thickness` of the gel, `ball`
+    radius [px].
+    """
+    from scipy.optimize import minimize
+
+    thin = [_thinned(window) for window in windows]
+    nobody = DentShade((), shape)
+    light = [
+        nobody.light(dent_gradient(s.u, s.v, circle, thickness, ball), s.u, s.v)
+        for s, circle in zip(thin, circles, strict=True)
+    ]
+    lit = np.concatenate(light)
+    changes = np.concatenate([window.change for window in thin])
+    own = lit.T @ lit
+
+    def unexplained(place: Float64, channel: int) -> float:
+        shade = DentShade(((float(place[0]), float(place[1])),), shape)
+        dark = np.concatenate(
+            [shade.terms(s.u, s.v, circle, thickness, ball)[:, ::3] for s, circle in zip(thin, circles, strict=True)]
+        )
+        across = lit.T @ dark
+        square = np.block([[own, across], [across.T, dark.T @ dark]])
+        right = np.concatenate([lit, dark], axis=1).T @ changes[:, channel]
+        weights = np.linalg.solve(square + RIDGE * np.trace(square) / len(square) * np.eye(len(square)), right)
+        return -float(weights @ right) if float(weights[len(own) :] @ dark.sum(axis=0)) < 0 else 0.0
+
+    turns = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    places = [far * np.array([np.cos(turn), np.sin(turn)]) for far in DISTANCES for turn in turns]
+    lamps = []
+    for channel in range(3):
+        first = min(places, key=lambda place: unexplained(place, channel))
+        size = 0.25 * float(np.hypot(*first)) + 0.02
+        found = minimize(
+            unexplained, first, args=(channel,), method="Nelder-Mead",
+            options={"maxiter": SEARCH_STEPS, "initial_simplex": first + np.array([[0, 0], [size, 0], [0, size]])},
+        )  # fmt: skip
+        lamps.append((float(found.x[0]), float(found.x[1])))
+    return DentShade(tuple(lamps), shape)
+
+
+def _thinned(window: Window) -> Window:
+    keep = slice(None, None, max(1, len(window.u) // PIXELS))
+    return Window(window.u[keep], window.v[keep], window.change[keep])

@@ -43,7 +43,7 @@ class HiddenSensor:
             )
             for i, a in enumerate((0.0, 2.2, 4.1))
         )
-        self._lighting = Lighting(lights=lights, background=(0.4, 0.4, 0.4))
+        self.lighting = Lighting(lights=lights, background=(0.4, 0.4, 0.4))
         v, u = np.mgrid[:ROWS, :COLUMNS]
         slope = rng.uniform(-20, 20, (2, 3))
         level = rng.uniform(90, 130, 3)
@@ -76,8 +76,8 @@ class HiddenSensor:
         return [self.press(d * 1e-3, x + jx, y + jy) for d, (x, y), (jx, jy) in spread][:count]
 
     def photograph(self, gradient: np.ndarray, drift: np.ndarray | float = 0.0) -> np.ndarray:
-        flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self._lighting)
-        change = 255 * (shade(gradient.astype(np.float32), self._lighting) - flat)
+        flat = shade(np.zeros((1, 1, 2), dtype=np.float32), self.lighting)
+        change = 255 * (shade(gradient.astype(np.float32), self.lighting) - flat)
         if self._spread:
             change = gaussian_filter(change, (self._spread, self._spread, 0))
         noise = self._rng.normal(0, self._noise, (ROWS, COLUMNS, 3))

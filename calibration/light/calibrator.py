@@ -40,10 +40,11 @@ from tacsim.optics.darkness import darkened
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-ROUNDS = 2
 BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
 INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 REFINEMENT_PIXELS = 2500  # of each press, about
+UNSHADED = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
+ROUNDS = 2  # of refining circles and lamps in turn
 SHADED_PIXELS = 1000  # the same with cast shadows, which have nine times the terms
 # A press is left out if the fitted dent leaves more of its change of colour unexplained than the smaller of
 MAX_UNEXPLAINED = 0.5  # share of the change
@@ -234,7 +235,7 @@ def _shaded(
 ) -> tuple[list[BallPress], RefinedGeometry, DentShade | None]:
     """Where cast shadows are seen: their lamps, and the circles refined with them, which else grow towards the shade
     and take it for skirt. Else what was given, and None."""
-    if len(presses) <= FEW_PRESSES:
+    if len(presses) <= FEW_PRESSES or np.mean(refined.unexplained) < UNSHADED:
         return presses, refined, None
     windows, circles = [_window(press, SHADED_PIXELS) for press in presses], refined.circles
     shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)

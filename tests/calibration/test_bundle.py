@@ -22,10 +22,12 @@ from calibration.height.slope_polynomial import TERMS, InverseModel
 from calibration.lens.rectification import to_metric
 from calibration.lens.view import GelView, pinhole, view_of_corners
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_camera
+from tacsim.config.bundle import digest
 from tacsim.interface import TactileFrame
 from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.photometric import PhotometricModel
 from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry
+from tacsim.models.shadows import CastShadows
 from tacsim.optics.render import Renderer
 from tests.tacsim.optics.surfaces import dent, flat
 
@@ -247,3 +249,19 @@ def test_geometry_and_view_must_agree(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="format 2 has no noise"):
         Calibration.model_validate(calibration().model_dump() | {"noise": {"deviation": (1, 1, 1)}, "format": 2})
     assert pinhole((240, 320)).centre == (159.5, 119.5)
+
+
+def test_shadows_are_kept_and_are_none_in_bundles_that_lack_the_field(tmp_path: Path) -> None:
+    weights = tuple((-0.3 * k / 9, 0.0, 0.1) for k in range(9))
+    shadows = CastShadows(lamps=((0.4, -1.2),), weights=weights)
+    made = calibration()
+    path = write_bundle(
+        tmp_path, made.model_copy(update={"forward": made.forward.model_copy(update={"shadows": shadows})}), PICTURE
+    )
+    assert read_bundle(tmp_path)[0].forward.shadows == shadows
+    assert read_sensor_model(tmp_path).photometric.shadows == shadows
+    content = yaml.safe_load(path.read_text())
+    del content["forward"]["shadows"]  # as older versions wrote it
+    content["checksum"] = digest(content)
+    path.write_text(yaml.safe_dump(content))
+    assert read_bundle(tmp_path)[0].forward.shadows is None

@@ -31,7 +31,7 @@ def cast(height: np.ndarray, lamps: np.ndarray) -> np.ndarray:
 
 
 def in_shade(image: np.ndarray, height: np.ndarray, lamps: np.ndarray) -> np.ndarray:
-    return np.clip(image - 45.0 * cast(height, lamps), 0, 255).round().astype(np.uint8)
+    return np.clip(image - 70.0 * cast(height, lamps), 0, 255).round().astype(np.uint8)
 
 
 @pytest.mark.deep
@@ -42,14 +42,13 @@ def test_shadows_are_found_and_hold_for_what_is_no_ball(monkeypatch: pytest.Monk
     presses = [replace(made, image=in_shade(made.image, made.height / PITCH, lamps)) for made in sensor.presses(8)]
     named = [(f"press {i}", press.image) for i, press in enumerate(presses)]
     fit = calibrate_light(sensor.empty(), named, BALL_PX)
-    monkeypatch.setattr("calibration.light.photometry.SHADOW_IMPROVEMENT", 0.0)
+    monkeypatch.setattr("calibration.light.calibrator.UNSHADED", 1.0)
     without = calibrate_light(sensor.empty(), named, BALL_PX)
     assert fit.forward is not None and without.forward is not None
     assert fit.forward.shadows is not None and without.forward.shadows is None
     for found, true in zip(fit.forward.shadows.lamps, lamps, strict=True):
         assert np.dot(found, true) / np.hypot(*found) / np.hypot(*true) > np.cos(np.radians(20))
     errors = [np.mean([press.error for press in each.predictions]) for each in (fit, without)]
-    print(errors)
     assert errors[0] < 0.75 * errors[1]
     wrong = [
         np.mean([abs(p.circle.radius / made.circle[2] - 1) for p, made in zip(each.presses, presses, strict=True)])
@@ -77,5 +76,4 @@ def test_shadows_are_found_and_hold_for_what_is_no_ball(monkeypatch: pytest.Monk
             towards = [horizon(height, u, v * np.float32(ROWS / COLUMNS), lamp) for lamp in each.forward.shadows.lamps]
             predicted = predicted + light.shadow(towards, u, v)
         off.append(np.abs(predicted - change)[cast(bar, lamps).max(axis=2) > 0.2].mean())
-    print(errors, wrong, off, fit.forward.shadows.lamps, lamps)
-    assert off[0] < 0.75 * off[1], off
+    assert off[0] < 0.5 * off[1]  # 2.4 and 7.1 grey levels

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import pickle
 import queue
 import threading
 from multiprocessing.connection import Connection
@@ -90,11 +91,28 @@ class LiveView(Closing):
                 self.left_out += 1
                 continue
             try:
-                self._pipe.send(seen)
+                send(self._pipe, seen)
             except Exception:  # whatever befalls it, it is gone
                 self._ended = True
         with contextlib.suppress(OSError):
-            self._pipe.send(None)
+            send(self._pipe, None)
+
+
+def send(pipe: Connection, seen: Seen | None) -> None:
+    """Arrays go as they lie, without a copy: a copy would keep the control loop from running meanwhile."""
+    arrays: list[memoryview] = []
+    rest = pickle.dumps(seen, protocol=5, buffer_callback=lambda array: arrays.append(array.raw()))
+    pipe.send(len(arrays))
+    pipe.send_bytes(rest)
+    for array in arrays:
+        pipe.send_bytes(array)
+
+
+def _receive(pipe: Connection) -> Seen | None:
+    number = pipe.recv()
+    rest = pipe.recv_bytes()
+    found: Seen | None = pickle.loads(rest, buffers=[pipe.recv_bytes() for _ in range(number)])  # noqa: S301  # of `send`
+    return found
 
 
 def _show(pipe: Connection, spec: RigSpec, config: RigConfig, file: Path | None) -> None:
@@ -111,7 +129,7 @@ def _show(pipe: Connection, spec: RigSpec, config: RigConfig, file: Path | None)
             pipe.send(None)
             begun = True
             with contextlib.suppress(EOFError, ConnectionError):
-                while (seen := pipe.recv()) is not None:
+                while (seen := _receive(pipe)) is not None:
                     step, observation, truth = seen
                     log.step(step, observation, truth)
                     check()

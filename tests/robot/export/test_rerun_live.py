@@ -42,11 +42,12 @@ class NoViewer:
         made: Any = object.__new__(LiveView)
         made._line, made.left_out, made._ended = rerun_live.queue.Queue(rerun_live.WAITING), 0, False
         made._pipe = made._process = self
+        monkeypatch.setattr(rerun_live, "send", self.send)
         made._thread = threading.Thread(target=made._hand_over, daemon=True)
         made._thread.start()
         self.view: LiveView = made
 
-    def send(self, seen: Any) -> None:
+    def send(self, pipe: Any, seen: Any) -> None:
         self.go.wait()
         self.sent.append(seen)
 

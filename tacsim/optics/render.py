@@ -130,10 +130,9 @@ class Renderer:
             return self._calibrated(self._light, table, points, inside)
         if self.model.darkness is None:
             return self._shaded(table, points, inside)
-        height = table.at(np.ascontiguousarray(table.fields[..., 0]), points, inside)
-        change, self._beyond = darkened(self.model.darkness, height, self._grid.pitch)
-        coloured: Float32 = change * self._mean
-        return coloured.__getitem__
+        # at the points of the surface's table, of which there are fewer than pixels, as for calibrated slopes
+        change, self._beyond = darkened(self.model.darkness, np.ascontiguousarray(table.fields[..., 0]), table.pitch)
+        return table.at(change * self._mean, points, inside).__getitem__
 
     def _shaded(self, table: SurfaceTable, points: Float32, inside: Mask) -> Callable[[slice], Float32]:
         """Rows of an image -> (rows, W, 3) light of the lamps, by the slopes of surface and texture; 255 is white."""

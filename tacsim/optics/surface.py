@@ -71,7 +71,7 @@ class SurfaceTable:
         check_surface(surface)
         self._surface = surface
         self.fields, self._lateral = _table(surface)
-        self._pitch = surface.spacing / _table_points(surface)  # [m]
+        self.pitch = surface.spacing / _table_points(surface)  # [m]
 
     def of_nodes(self, values: Float32) -> Float32:
         """(rows, columns, 1) at the table's points of the spline whose control values are `values` (nx, ny)."""
@@ -82,7 +82,7 @@ class SurfaceTable:
 
     def place(self) -> tuple[Float32, Float32]:
         """x and y (rows, columns) where each point is seen [m]."""
-        (rows, columns), pitch = self.fields.shape[:2], np.float32(self._pitch)
+        (rows, columns), pitch = self.fields.shape[:2], np.float32(self.pitch)
         origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
         x = origin_x + pitch * (np.arange(columns, dtype=np.float32) + self._lateral[..., 0])
         y = origin_y + pitch * (np.arange(rows, dtype=np.float32)[:, None] + self._lateral[..., 1])
@@ -92,7 +92,7 @@ class SurfaceTable:
         """`values` (rows, columns) of the table's points at places x, y (...,) on the untouched gel [m], linear between
         them; beyond the gel as on its border."""
         origin_x, origin_y = (np.float32(each) for each in self._surface.origin)
-        pitch = np.float32(self._pitch)
+        pitch = np.float32(self.pitch)
         return look_up(values, np.stack([(x - origin_x) / pitch, (y - origin_y) / pitch], axis=-1))
 
     def seen(self, values: Float32, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
@@ -115,7 +115,7 @@ class SurfaceTable:
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
-        block = max(1, int(self._pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
+        block = max(1, int(self.pitch / (grid.pitch * (2 if fine else 1))))  # points a coarse one, along a side
         points = self._material_points(grid if block == 1 else _coarse(grid, block))
         inside = self._on_gel(points)
         if block > 1:
@@ -125,13 +125,13 @@ class SurfaceTable:
 
     def at_rest(self, points: Float32, grid: PixelGrid) -> Float32:
         """(H, W, 2) column, row in `grid` of where `points` of :meth:`points` lie on the untouched gel."""
-        scale = np.float32(self._pitch / grid.pitch)
+        scale = np.float32(self.pitch / grid.pitch)
         start = (np.array(self._surface.origin) - (grid.x0, grid.y0)) / grid.pitch
         return points * scale + start.astype(np.float32)
 
     def _material_points(self, grid: PixelGrid) -> Float32:
         """(rows, columns, 2) material points [table points] under the image points of `grid`: X <- x - u(X)."""
-        seen = _table_coordinates(self._surface.origin, self._pitch, grid)
+        seen = _table_coordinates(self._surface.origin, self.pitch, grid)
         points, change = seen, seen
         for _ in range(FIXED_POINT_STEPS):
             moved = seen - look_up(self._lateral, points)
@@ -140,8 +140,8 @@ class SurfaceTable:
             if float(change.max()) <= CONVERGED:
                 return points
         restless = change.max(axis=2) > CONVERGED
-        exact = material_points(self._surface, self._surface.origin + self._pitch * seen[restless].astype(np.float64))
-        points[restless] = (exact - self._surface.origin) / self._pitch
+        exact = material_points(self._surface, self._surface.origin + self.pitch * seen[restless].astype(np.float64))
+        points[restless] = (exact - self._surface.origin) / self.pitch
         return points
 
     def _on_gel(self, points: Float32) -> NDArray[np.bool_]:

@@ -29,6 +29,10 @@ def test_a_bundle_of_the_first_release_gives_the_heights_that_it_gave_then() -> 
     at = tuple(np.array([(cell["row"], cell["column"]) for cell in expected["cells"]]).T)
     # the last bits may differ: OpenCV and SciPy round differently from version to version
     np.testing.assert_allclose(seen.height[at], [cell["height"] for cell in expected["cells"]], rtol=0, atol=2e-8)
-    np.testing.assert_allclose(seen.gradient[at], [cell["gradient"] for cell in expected["cells"]], rtol=0, atol=2e-4)
+    # slopes were those of each pixel's colour then; they have been those of the height since, which is nearer the truth
+    slopes = np.stack(np.gradient(seen.height, CanonicalGrid().pitch)[::-1], axis=-1)
+    assert np.sqrt(((seen.gradient - slopes) ** 2).mean()) < 0.004  # differences over two cells, at the rim
+    then = np.array([cell["gradient"] for cell in expected["cells"]])
+    assert np.sqrt(((seen.gradient[at] - then) ** 2).mean()) < 0.006
     assert seen.contact.sum() == expected["contact_cells"]
     assert normalise.diagnostics()["drift"] == pytest.approx(expected["drift"], rel=1e-4)

@@ -11,6 +11,7 @@ lines are those of the table in docs/identify.md. A gel takes half a minute, a b
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -62,6 +63,7 @@ def draw(kind: str, seed: int) -> dict[str, float]:
 def record(kind: str, seed: int, folder: Path) -> None:
     """In a process of its own: draws a truth, runs the motions, writes recordings and, apart, the truth."""
     truth = draw(kind, seed)
+    shutil.rmtree(folder / "runs", ignore_errors=True)  # of a recording that was cut off
     scene = load_scene("press" if kind == "gel" else "squeeze")
     sets = [
         word for text in (*TRUE_MESH, *(f"{key}={value!r}" for key, value in truth.items())) for word in ("--set", text)

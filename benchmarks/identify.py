@@ -166,7 +166,10 @@ def forces_alone(found: Identified) -> Identified:
     one = {name: getattr(signals, name)[rows] for name in ("values", "noise", "press", "channel", "time")}
     some = {name: getattr(found.fit, name)[rows] for name in ("predicted", "sigma", "system")}
     by_size = None if found.by_size is None else found.by_size[rows]
-    return replace(found, fit=replace(found.fit, **some), signals=replace(signals, **one), by_size=by_size)
+    checked = replace(found.checked, sigma=found.checked.sigma[rows])
+    return replace(
+        found, fit=replace(found.fit, **some), signals=replace(signals, **one), checked=checked, by_size=by_size
+    )  # fmt: skip
 
 
 def _spoilt(press: Press, noise: float, random: np.random.Generator) -> Press:
@@ -201,11 +204,15 @@ def line(
             f"{'holds' if low <= truth[each.name] <= high else 'MISSES'}, {held} of {len(ends)})"
         )
     cells += [f"{each.name} not told" for each in fit.untold]
-    false = sum(bool(findings(fit, signals, names, found.by_size)) for fit, signals in again)
+
+    def noticed_in(drawn: tuple[Fit, Signals]) -> bool:
+        return bool(findings(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
+
+    false = sum(map(noticed_in, again))
     noticed = [f"nothing wrong {false} of {draws}"]
     for what, change in _faults(found).items():
         seen = (redrawn(found, clean + change, k, priors) for k in range(draws))
-        noticed.append(f"{what} {sum(bool(findings(*one, names, found.by_size)) for one in seen)} of {draws}")
+        noticed.append(f"{what} {sum(map(noticed_in, seen))} of {draws}")
     against = ", ".join(each.kind for each in found.findings) or "nothing"
     return (f"| {name} | {len(names)} | {fit.runs} | {seconds} | {', '.join(cells)} | {against} | "
             f"{', '.join(noticed)} |")  # fmt: skip

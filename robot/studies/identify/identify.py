@@ -19,6 +19,9 @@ from tacsim.interface import FloatArray
 from tacsim.models.scene import Scene, lame
 
 Kind = Literal["gel", "body"]
+UNWEIGHED = (
+    0.01  # noise by which the width of a dent counts for nothing in a fit: it tells indenters, not materials [m]
+)
 MOMENTS = 16  # of a press, that are simulated
 FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
 LEAST_FRICTION, MOST_FRICTION = 0.01, 5.0
@@ -37,12 +40,13 @@ class Identified:
     signals: Signals
     findings: tuple[Finding, ...]
     noise: Noise
+    checked: Fit  # with the weights by which it was checked: the width of dents, too
     by_size: FloatArray | None = None  # (m, b) derivative of the signals by the logarithm of the size of each indenter
 
     @property
     def size_error(self) -> float | None:
         """Standard deviation of the size of an indenter by these presses alone, as a share of it."""
-        return None if self.by_size is None else size_error(self.fit, self.by_size)
+        return None if self.by_size is None else size_error(self.checked, self.by_size)
 
 
 def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
@@ -117,7 +121,10 @@ def identify(
             error *= 2
     else:
         levels = [exact]
-    fit = estimate(levels, signals, parameters, priors, error, on_step)
+    width = np.array([name.endswith(".width") for name in signals.channels])[signals.channel]
+    fit = estimate(
+        levels, replace(signals, noise=np.where(width, UNWEIGHED, signals.noise)), parameters, priors, error, on_step
+    )  # fmt: skip
     if gel_error > 0 and kind == "body":
         fit = _with_gel_error(fit, signals, gel_error)
     found = scene_with(start, {each.name: fit.value(each.name) for each in fit.parameters})
@@ -127,8 +134,10 @@ def identify(
         by_all = levels[0].by_size(Point(fit.free, fit.nuisances[: len(taken)]))
         balls = np.array([press.ball or 0.0 for press in taken])
         by_size = np.stack([np.where(balls[signals.press] == ball, by_all, 0.0) for ball in np.unique(balls)], axis=1)
-    against = findings(fit, signals, tuple(press.name for press in taken), by_size)
-    return Identified(kind, found, fit, taken, signals, tuple(against), noise, by_size)
+    sigma = np.sqrt(fit.sigma**2 - np.where(width, UNWEIGHED**2 - signals.noise**2, 0.0))
+    checked = replace(fit, sigma=sigma)
+    against = findings(checked, signals, tuple(press.name for press in taken), by_size)
+    return Identified(kind, found, fit, taken, signals, tuple(against), noise, checked, by_size)
 
 
 def _with_gel_error(fit: Fit, signals: Signals, error: float) -> Fit:

@@ -115,7 +115,7 @@ def identified(tmp_path: Path) -> Identified:
 
     fit = estimate([predict], signals, parameters, Priors(1e-6, 1e-6), coarse_error=0.0)
     found = scene_with(scene, {each.name: fit.value(each.name) for each in fit.told})
-    return Identified("body", found, fit, (press,), signals, (), noise)
+    return Identified("body", found, fit, (press,), signals, (), noise, fit)
 
 
 def test_the_files_are_taken_by_other_commands(

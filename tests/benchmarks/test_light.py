@@ -225,6 +225,7 @@ def test_each_target_of_the_real_group_finds_its_rows() -> None:
             for way in ("pictures", "surfaces")
             for view in ("gradient", "height")
         ),
+        row("invariance", "pictures: rho, difference", auc=0.5),
         row("invariance", "surfaces: drift, gain −30 %", extra_deg=0.5),
         *(row("calibrated_render", size) for size in ("640 x 480", "320 x 240")),
         row("normaliser", "320 x 240"),

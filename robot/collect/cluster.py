@@ -11,9 +11,9 @@ from importlib import util
 from pathlib import Path
 from typing import Any
 
-from robot.collect.folder import write_whole
 from robot.collect.job import Job, Piece, SetError, Worker
 from robot.collect.workers import AHEAD, CollectFailed, Stop, Stopped, piece_or_error, result_of
+from robot.common.whole_file import write_whole
 from robot.deploy.control_loop import versions
 
 PATIENCE = 5.0  # for a cluster to answer [s]

@@ -12,10 +12,11 @@ from typing import Any
 from robot.collect.card import press_card, press_statistics
 from robot.collect.cluster import on_cluster
 from robot.collect.episodes import EpisodeJob
-from robot.collect.folder import CARD, SetFolder, open_set, write_whole
+from robot.collect.folder import CARD, SetFolder, open_set
 from robot.collect.job import Job
 from robot.collect.presses import PressJob, reference
 from robot.collect.workers import Stop, in_processes, in_this_process
+from robot.common.whole_file import write_whole
 from robot.deploy.control_loop import versions
 
 Tell = Callable[[int, int], None]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from robot.collect.job import Job, Piece, SetError
+from robot.common.whole_file import write_whole
 from robot.deploy.control_loop import versions
 from tacsim.models.text import printable
 
@@ -183,20 +184,3 @@ def _lengthen(path: Path, job: Job, before: Mapping[str, Any], now: Mapping[str,
         text = _text({**before, "count": now["count"], "command": now["command"]})
         file.write(text)
         file.truncate()
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """There is a whole file or none, whenever the process ends. Raises OSError that names the file."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except BaseException as failure:
-        part.unlink(missing_ok=True)
-        if isinstance(failure, OSError):
-            failure.filename = str(path)
-        raise

@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from robot.common.whole_file import write_whole
 from robot.train.network import PolicyNetwork
-from robot.train.run_folder import RunError, Tell, save
+from robot.train.run_folder import RunError, Tell
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.text import printable
 from tacsim.models.training import Training
@@ -36,7 +37,7 @@ class Dagger:
     def round(self, number: int, tell: Tell) -> dict[str, float]:
         """Acts, keeps what was met, and learns."""
         seen, wanted, figures = self._collect(number, tell)
-        save(
+        write_whole(
             self._folder / f"round-{number:03d}.npz",
             lambda file: np.savez(file, allow_pickle=False, action=wanted, **seen),
         )

@@ -11,8 +11,8 @@ import onnx
 import onnxruntime
 import torch
 
+from robot.common.whole_file import write_whole
 from robot.train.network import PolicyNetwork, Shapes
-from robot.train.run_folder import save
 from tacsim.models.policy import METADATA_KEY, PolicySpec
 
 OPSET = 17
@@ -53,7 +53,7 @@ def export(network: PolicyNetwork, spec: PolicySpec, shapes: Shapes, path: Path)
     worst = _difference(network, data, examples)
     if not worst <= PARITY:
         raise ExportError(f"the file's actions differ by {worst:.2g} from the network's, allowed: {PARITY:g}")
-    save(path, lambda file: file.write(data))
+    write_whole(path, data)
     return worst
 
 

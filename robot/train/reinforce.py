@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
+from robot.common.whole_file import write_whole
 from robot.train.network import PolicyNetwork
-from robot.train.run_folder import Tell, save
+from robot.train.run_folder import Tell
 from robot.train.sb3 import FeaturesExtractor, SharedVecEnv
 from tacsim.gym.vector import TacsimVectorEnv
 from tacsim.models.training import Training
@@ -61,7 +62,7 @@ class Reinforce:
         model.learn(total, callback=watch, reset_num_timesteps=False)
         self._take_actor()
         if isinstance(model, SAC):
-            save(self._folder / f"memory-{number % 2}.npz", self._write_memory)
+            write_whole(self._folder / f"memory-{number % 2}.npz", self._write_memory)
         rewards, distances, successes, forces = np.array(watch.ends).T
         return {
             "steps": float(total), "distance": float(distances.mean()), "success": float(successes.mean()),

@@ -6,10 +6,11 @@ import json
 from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 from pydantic import Field, ValidationError
 
+from robot.common.whole_file import write_whole
 from tacsim.models.policy import PolicySpec
 from tacsim.models.quantity import Config
 from tacsim.models.text import printable
@@ -63,7 +64,7 @@ class RunFolder:
         settings = RunSettings(tacsim=version(), training=training, spec=spec, shapes=dict(shapes))
         folder.mkdir(parents=True)
         text = settings.model_dump_json(indent=1)
-        save(folder / "run.json", lambda file: file.write(text.encode()))
+        write_whole(folder / "run.json", text.encode())
         return cls(folder)
 
     def keep(self, number: int, state: Mapping[str, Any], curve: list[dict[str, float]]) -> None:
@@ -71,7 +72,7 @@ class RunFolder:
         import torch
 
         content = {"format": FORMAT, "rounds": number + 1, "state": dict(state), "curve": curve}
-        save(self.folder / CHECKPOINT, lambda file: torch.save(content, file))
+        write_whole(self.folder / CHECKPOINT, lambda file: torch.save(content, file))
 
     def last(self) -> tuple[int, dict[str, Any], list[dict[str, float]]]:
         """Rounds done, the state after them, and their figures; 0 rounds where none is done. Raises RunError."""
@@ -90,20 +91,6 @@ class RunFolder:
         except Exception as failure:  # torch has no common base of what a broken file raises
             words = printable((str(failure).splitlines() or [repr(failure)])[0][:200])
             raise RunError(f"{path} is no checkpoint of this version: {words}; train anew") from None
-
-
-def save(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """There is a whole file or none, whenever the process ends. Raises OSError that names the file."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            write(file)
-        part.replace(path)
-    except (OSError, RuntimeError) as failure:  # torch turns a full disk into a RuntimeError of its own
-        part.unlink(missing_ok=True)
-        why = failure.strerror if isinstance(failure, OSError) else str(failure).splitlines()[0]
-        number = failure.errno if isinstance(failure, OSError) else None
-        raise OSError(number or 5, f"cannot be written: {why}", str(path)) from failure
 
 
 def version() -> str:

@@ -16,11 +16,12 @@ from typing import Any, Protocol
 import torch
 from gymnasium.vector import AutoresetMode
 
+from robot.common.whole_file import write_whole
 from robot.open import load_with_task, make_vector_env
 from robot.train.dagger import Dagger
 from robot.train.export import export
 from robot.train.network import PolicyNetwork
-from robot.train.run_folder import RunError, RunFolder, Tell, save, version
+from robot.train.run_folder import RunError, RunFolder, Tell, version
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import TacsimVectorEnv
@@ -105,7 +106,7 @@ def train(
             figures = learner.round(number, tell)
             curve.append({"round": number + 1, **figures, "seconds": time.perf_counter() - began})
             run.keep(number, learner.state(), curve)
-            save(run.folder / CURVE, lambda file: file.write(json.dumps(curve, indent=1).encode()))
+            write_whole(run.folder / CURVE, json.dumps(curve, indent=1).encode())
             say(curve[-1])
     finally:
         envs.close()

@@ -104,13 +104,13 @@ def test_a_full_disk_says_so_and_leaves_the_last_checkpoint(tmp_path: Path) -> N
     run = begin(training(), tmp_path / "run")
 
     def fill_in_round_2(words: str, done: int, of: int) -> None:
-        if "round 2" in words and not (run.folder / "checkpoint.pt.part").exists():
-            (run.folder / "checkpoint.pt.part").symlink_to("/dev/full")
+        if "round 2" in words and not (run.folder / ".checkpoint.pt.part").exists():
+            (run.folder / ".checkpoint.pt.part").symlink_to("/dev/full")
 
     with pytest.raises(OSError, match=r"cannot be written") as failed:
         train(run, fill_in_round_2)
     assert failed.value.filename == str(run.folder / "checkpoint.pt")
-    assert not (run.folder / "checkpoint.pt.part").is_symlink()
+    assert not (run.folder / ".checkpoint.pt.part").is_symlink()
     assert run.last()[0] == 1
     train(run)
     assert run.last()[0] == 3

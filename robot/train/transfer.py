@@ -166,31 +166,29 @@ def _line(played: Played) -> str:
 
 
 def _on_twin(study: Study, side: Side, twin: int, left: Sequence[tuple[str, int]]) -> Iterator[Played]:
-    """One rig for all policies on a twin; in simulation, where each has its own, one for each."""
-    names = [None] if side == "twin" else list(dict.fromkeys(policy for policy, _ in left))
-    for name in names:
-        mine = [each for each in left if name in (None, each[0])]
-        if not mine:
-            continue
-        loaded = [_loaded(study, side, twin, number, name) for _, number in mine]
+    """One rig for all on a twin; in simulation one for each episode, as each policy has a simulation of its own."""
+    groups = [left] if side == "twin" else [[each] for each in left]
+    for group in groups:
+        loaded = [_loaded(study, side, twin, number, policy) for policy, number in group]
         with open_rig(loaded[0]) as rig:
-            for (policy, number), each in zip(mine, loaded, strict=True):
+            for (policy, number), each in zip(group, loaded, strict=True):
                 yield _episode(study, side, rig, each, policy, number)
 
 
 def _loaded(study: Study, side: Side, twin: int, number: int, policy: str | None = None) -> LoadedRig:
-    """The rig of an episode: its task's values are drawn anew for each episode, all others for each twin."""
+    """The rig of an episode: its task's values are drawn anew for each episode, all others for each twin. What only the
+    training of a policy draws, for each episode."""
     drawn = study.twins.model_copy(update={"draws": max(study.episodes, twin + 1)}).drawn()
     words = [word for word in drawn[twin] if not word.startswith("task.")]
     words += [word for word in drawn[number] if word.startswith("task.")]
     if side == "simulation":
         words = [word for word in words if word.startswith(SEEN)]
-        words = [*_own_simulation(policy, study.task, twin), *words]
+        words = [*_own_simulation(policy, study.task, number), *words]
     return load_rig(RIGS[side], task=study.task, overrides=[*study.overrides, *words])
 
 
-def _own_simulation(policy: str | None, task: str, twin: int) -> list[str]:
-    """Overrides of the rig that a learned policy was trained in, drawn anew; none of another policy."""
+def _own_simulation(policy: str | None, task: str, number: int) -> list[str]:
+    """Overrides of the rig that a learned policy was trained in, its draw `number`; none of another policy."""
     if policy is None or not (policy == "learned" or policy.endswith(".onnx")):
         return []
     loaded = load_rig(RIGS["simulation"], task=task)
@@ -205,8 +203,8 @@ def _own_simulation(policy: str | None, task: str, twin: int) -> list[str]:
     drawn = training.randomise
     if drawn is None:
         return list(training.overrides)
-    unseen = drawn.model_copy(update={"draws": twin + 1, "seed": UNSEEN + drawn.seed})
-    return [*training.overrides, *unseen.drawn()[twin]]
+    unseen = drawn.model_copy(update={"draws": number + 1, "seed": UNSEEN + drawn.seed})
+    return [*training.overrides, *unseen.drawn()[number]]
 
 
 def _episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy: str, number: int) -> Played:

@@ -63,7 +63,7 @@ def test_a_learned_policy_is_played_in_the_simulation_that_it_was_trained_in() -
     assert own.scene.preset == "learn" and own.motion == "flowing" and twin.scene.preset == "draft"
     assert own.scene.body.geometry == twin.scene.body.geometry  # type: ignore[union-attr]
     assert own.task.goal == twin.task.goal  # type: ignore[attr-defined, union-attr]
-    other = _loaded(study(), "simulation", 2, 3, "learned").config
+    other = _loaded(study(), "simulation", 1, 2, "learned").config
     assert other.scene is not None and other.scene.body is not None
     assert other.scene.body.material != own.scene.body.material  # which its training draws
 

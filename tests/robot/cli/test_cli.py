@@ -18,7 +18,6 @@ from robot.cli.output import writing
 from robot.studies.press import PressMotion, _targets
 from tacsim.config import ConfigError
 from tacsim.interface import IncompatibleRig, Pose
-from tacsim.models.scene import Sphere
 from tacsim.record.episode import EpisodeError
 from tests.robot.cli.invoked import START, environment, tacsim
 
@@ -187,7 +186,7 @@ def test_a_machine_that_is_not_there_ends_with_2(variable: str, value: str, said
 
 def test_a_twist_beyond_half_a_turn_goes_on_the_same_way() -> None:
     start, motion = Pose(np.array([0.0, 0.0, 5e-3])), PressMotion(twist=np.radians(-270.0))
-    targets = _targets(start, Sphere(radius=4e-3), motion)
+    targets = _targets(start, 4e-3, motion)
     turns = [Rotation.from_quat(target.quaternion) for target in targets]
     steps = [np.degrees((b * a.inv()).as_rotvec()) for a, b in pairwise(turns)]
     assert np.allclose(steps, [[0, 0, -90.0]] * 3)

@@ -30,7 +30,7 @@ PRESETS: dict[Preset, tuple[float, float]] = {
 MACH_BY_TOLERANCE, MACH_BY_STRESS, SLOWEST_MACH, FASTEST_MACH = 3.0, 4.0, 0.001, 0.03
 MACH_BY_SHEAR = 0.1
 LIGHTER = 1.5  # so much faster may sensors go whose gels and body answer as if they were lighter: no indenter, no seed
-FLOW_MACH = 0.01  # of motions that flow into one another, where nothing is lighter; else twice that
+FLOW_MACH = 0.01  # of motions that flow into one another, where nothing is lighter
 CATCHING = 0.5  # element sizes: an edge that is less round catches on the mesh
 MAX_CELLS = 5_000_000  # elements of one gel, or its particles in the seed's scheme; a standard gel has 12,800
 
@@ -294,7 +294,7 @@ class Scene(Config):
         """Speed of motions that flow into one another, over the wave speed."""
         if self.settling.flow_mach is not None:
             return self.settling.flow_mach
-        return FLOW_MACH if self.body is None else 2.0 * FLOW_MACH
+        return FLOW_MACH if self.body is None else LIGHTER * FLOW_MACH
 
     @property
     def spacing(self) -> float:

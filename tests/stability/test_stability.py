@@ -145,7 +145,8 @@ EXPECTED: dict[str, dict[str, Callable[[Config], bool] | str]] = {
         "hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.635, rel=0.05),
         "seed": balanced,
     },
-    "body over the rim, no housing": {"hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.381, rel=0.05)},
+    # the slow limit (Mach 0.004) is 0.405
+    "body over the rim, no housing": {"hybrid": lambda f: balanced(f) and f["force"] == pytest.approx(0.405, rel=0.03)},
     # In between, nothing is left of the first grasp but what has flown; then it is met again.
     "release and grasp again": {
         "hybrid": lambda f: (

@@ -31,6 +31,10 @@ def tree(command: Any) -> dict[str, Any]:
     return {"parameters": options, "commands": commands}
 
 
+# The default depends on what is compared now: none of a scene, whose pictures are made in B's pixels
+CHANGED = {("tacsim compare", "--shift")}
+
+
 @pytest.mark.deep
 def test_every_command_and_option_of_the_first_release_is_there() -> None:
     """Made anew by running this file with the code to compare with on PYTHONPATH."""
@@ -42,7 +46,7 @@ def test_every_command_and_option_of_the_first_release_is_there() -> None:
         missing.extend(
             f"{name}: {key}: {told} -> {new['parameters'].get(key)}"
             for key, told in old["parameters"].items()
-            if new["parameters"].get(key) != told
+            if new["parameters"].get(key) != told and (name, key) not in CHANGED
         )
         for key, each in old["commands"].items():
             if key in new["commands"]:

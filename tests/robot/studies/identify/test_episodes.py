@@ -41,5 +41,6 @@ def test_a_recording_simulated_again(
     for index, channel in enumerate(signals.channels):
         rows = signals.channel == index
         size = np.abs(signals.values[rows]).max()
-        assert again[rows] == pytest.approx(signals.values[rows], abs=max(0.04 * size, 1e-5)), channel
+        digits = 1e-4 if ".f" in channel else 1e-5  # [N, m]: what is left of forces that symmetry makes zero
+        assert again[rows] == pytest.approx(signals.values[rows], abs=max(0.04 * size, digits)), channel
     assert np.abs(press.readings["lower.fz"]).max() > 0.1

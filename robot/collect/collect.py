@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from robot.collect.card import press_card, press_statistics
 from robot.collect.cluster import on_cluster
 from robot.collect.episodes import EpisodeJob
 from robot.collect.folder import CARD, SetFolder, open_set
-from robot.collect.job import Job
+from robot.collect.job import Job, Piece
 from robot.collect.presses import PressJob, reference
 from robot.collect.workers import Stop, in_processes, in_this_process
 from robot.common.whole_file import write_whole
@@ -81,7 +80,7 @@ def collect(
 
 def _pieces(
     job: Job, place: SetFolder, files: Mapping[str, bytes], workers: int, cluster: str | None, stop: Stop
-) -> Any:
+) -> Iterator[Piece]:
     missing = place.missing
     if cluster is not None:
         return on_cluster(cluster, job, files, missing, stop)

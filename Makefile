@@ -3,6 +3,7 @@
 
 PYTHON ?= python3
 PYTHONS ?= python3.11 python3.12 python3.13
+PYTHON312 ?= python3.12
 ARGS ?=
 
 BIN := .venv/bin
@@ -13,9 +14,10 @@ INSTALL := $(BIN)/python -m pip install -qq --no-input --disable-pip-version-che
 CORE := .venv/installed-core-$(VERSION)
 DEV := .venv/installed-dev-$(VERSION)
 EXTRAS := .venv-extras/installed-$(VERSION)
+PLUGINS := .venv-lerobot/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check test-deep test-all test-gpu extras test-extras reliability lock clean python
+.PHONY: help run test check test-deep test-all test-gpu extras test-extras plugins test-plugins reliability lock clean python
 # Two installations into one environment must not run at once.
 .NOTPARALLEL:
 
@@ -26,7 +28,8 @@ help:
 	@echo "make test-all     make test, then make test-deep: the long runs"
 	@echo "make test-gpu     the physics tests and the benchmark on CUDA, for docs/benchmarks.md   (without CUDA: says so, and fails)"
 	@echo "make reliability  what is promised of arms and cameras, measured by its tests, for docs/reliability.md"
-	@echo "make test-extras  tests that need heavy extras (torch, rerun, ray), in an environment of their own"
+	@echo "make test-extras  tests that need heavy extras (torch, rerun, ray, av), in an environment of their own"
+	@echo "make test-plugins tests of the plug-ins for LeRobot, which wants Python 3.12   (without one: says so, and fails)"
 	@echo "make lock         renew constraints/ for each of: $(PYTHONS)"
 	@echo "make clean        remove the environment, caches and builds (runs/ stays)"
 	@echo "Choose a Python with PYTHON=python3.12 (3.11, 3.12 or 3.13; default: python3)."
@@ -38,6 +41,7 @@ check: $(DEV)
 	@$(BIN)/ruff check -q .
 	@$(BIN)/ruff format -q --check .
 	@$(BIN)/mypy
+	@$(BIN)/mypy plugins/*/lerobot_*.py
 	@$(BIN)/lint-imports --no-logo
 
 # Two processes; the tests of a file stay in one of them, for what a module opens is opened once.
@@ -72,6 +76,16 @@ extras: $(EXTRAS)
 test-extras: extras
 	@.venv-extras/bin/python -m pytest -q $(PARALLEL) $(WITH_EXTRAS) $(ARGS)
 
+# LeRobot is large (torch), wants Python 3.12, and other versions than constraints/py312.txt: an environment of its own.
+# Where pip finds torch for CPUs alone is the machine's affair (PIP_EXTRA_INDEX_URL). 77: nothing was tested.
+plugins: $(PLUGINS)
+
+test-plugins:
+	@command -v $(PYTHON312) >/dev/null 2>&1 || { \
+	  echo "make test-plugins: LeRobot wants Python 3.12, and '$(PYTHON312)' is not found, so nothing was tested."; exit 77; }
+	@$(MAKE) --no-print-directory plugins
+	@.venv-lerobot/bin/python -m pytest -q -m "" tests/plugins tests/robot/export/test_lerobot_video.py $(ARGS)
+
 lock:
 	@for each in $(PYTHONS); do \
 	  if $$each -c 'import pip' >/dev/null 2>&1; then $$each constraints/lock.py || exit 1; \
@@ -79,7 +93,7 @@ lock:
 	done
 
 clean:
-	rm -rf .venv .venv-extras .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist
+	rm -rf .venv .venv-extras .venv-lerobot .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build dist
 
 # Stands before each installation: a clear word about the Python, and an environment made by that Python.
 python:
@@ -104,5 +118,13 @@ $(EXTRAS): pyproject.toml $(CONSTRAINTS) constraints/extras.txt | python
 	@echo "Installing tacsim with torch, stable-baselines3 and rerun into .venv-extras (a few minutes the first time)"
 	@rm -rf .venv-extras && $(PYTHON) -m venv .venv-extras
 	@.venv-extras/bin/python -m pip install -qq --no-input --disable-pip-version-check \
-	  -c $(CONSTRAINTS) -c constraints/extras.txt -e '.[dev,train,viz,cluster]'
+	  -c $(CONSTRAINTS) -c constraints/extras.txt -e '.[dev,train,viz,cluster,video]'
+	@touch $@
+
+$(PLUGINS): pyproject.toml constraints/lerobot.txt $(wildcard plugins/*/pyproject.toml)
+	@echo "Installing LeRobot and tacsim's plug-ins for it into .venv-lerobot (minutes the first time)"
+	@rm -rf .venv-lerobot && $(PYTHON312) -m venv .venv-lerobot
+	@.venv-lerobot/bin/python -m pip install -qq --no-input --disable-pip-version-check -c constraints/lerobot.txt \
+	  -e '.[export,video]' 'lerobot[core_scripts,training]' pytest pytest-timeout hypothesis \
+	  $(addprefix -e ,$(wildcard plugins/lerobot_*))
 	@touch $@

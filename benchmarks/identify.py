@@ -1,11 +1,13 @@
-"""How well `tacsim identify` finds hidden materials: `python -m benchmarks.identify gel` (body, poisson).
+"""How well `tacsim identify` finds hidden materials: `python -m benchmarks.identify gel` (body, poisson, friction,
+docs).
 
 Each truth is drawn and simulated in a process of its own, on a mesh that identification does not use, and recorded with
 the motions that `tacsim identify … --motions` writes; its numbers come back in a file that is opened when all is done.
 Then noise, zeros and places are drawn again many times: how often do the intervals hold the truth, how often is a drift
 or a wrong ball noticed, how often something that is not there? No draw needs a simulation: near the estimate the
-simulation is the linear system that the fit ended with, and what is drawn is added to the recordings as they were. The
-lines are those of the table in docs/identify.md. A gel takes half a minute, a body some minutes.
+simulation is the linear system that the fit ended with, and what is drawn is added to the recordings as they were. A
+gel takes a minute, a body a quarter of an hour. `friction` says which motion tells which friction. `docs` writes the
+table of docs/identify.md, of what was measured in `--folder` before; what lacks it measures.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,22 +26,52 @@ import numpy as np
 import typer
 
 from calibration.materials.checks import findings
-from calibration.materials.estimate import SETTLED_ERROR, Fit, Point, Priors, Signals, estimate
+from calibration.materials.covariance import covariance_of
+from calibration.materials.estimate import SETTLED_ERROR, UNTOLD, Fit, Point, Priors, Signals, estimate
 from calibration.materials.parameters import starts
 from calibration.materials.presses import Noise, Press, gathered, signals_of, thinned
 from robot.studies.identify.identify import MOMENTS, Identified, Kind, identify, parameters_of
 from robot.studies.identify.motions import motions
 from robot.studies.identify.recordings import Recordings, find_recordings, read_all
 from robot.studies.identify.simulation import Seen, Simulation
+from tacsim import pose as se3
 from tacsim.config import load_scene
 from tacsim.interface import FloatArray, Pose
+from tacsim.models.scene import Scene
 from tacsim.models.sensor import CanonicalGrid
 
 TRUE_MESH = ("scene.element_size=0.4 mm", "scene.particle_spacing=0.2 mm")  # between those that identification uses
 RIGS = {"gel": "press", "body": "sim"}
 MOTIONS = {"gel": ("press", "slide"), "body": ("squeeze", "tilt")}
 DRIFTS = {"gel": (0.05, 0.1, 0.2), "body": (0.2, 0.5, 1.0)}  # of the normal force during the first recording [N]
+PAGE, ROWS = Path("docs/identify.md"), "found.json"  # of all truths; of each, in its folder
+BEGIN, END = "<!-- made by python -m benchmarks.identify docs -->", "<!-- end of the table -->"
+HEAD = (
+    "| Truth | Recordings | Simulated | Time | Off the truth (95 %; draws that hold it) | Told against it | Noticed |",
+    "|---|---|---|---|---|---|---|",
+)
+WORDS = {
+    "youngs_modulus": "stiffness", "poisson_ratio": "Poisson's ratio", "yield_stress": "yield",
+    "hardening_modulus": "hardening", "friction_lower": "friction below", "friction_upper": "friction above",
+}  # fmt: skip
+FRICTIONS = ((0.15, 0.15), (0.3, 0.3), (0.6, 0.6), (1.0, 1.0), (0.3, 0.6), (0.6, 0.3), (0.2, 0.6))  # below, above
 PLACE, ZERO = 0.02e-3, 0.2  # standard deviations of what the recordings are spoilt with [m, N]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    name: str
+    recordings: int
+    simulated: int
+    seconds: float | None
+    # By name: how far the estimate and the ends of its interval are off, as shares of the truth; in how many draws of
+    # how many the interval holds it. None: not told.
+    parameters: dict[str, tuple[float, ...] | None]
+    against: list[str]
+    noticed: dict[str, int]  # in how many draws something is said, by what is wrong
+    draws: int
 
 
 def draw(kind: str, seed: int) -> dict[str, float]:
@@ -122,8 +154,33 @@ def recordings_of(kind: Kind, number: int, folder: Path) -> tuple[list[Path], di
     return find_recordings([folder / "runs"]), truth
 
 
+def measured(kind: Kind, number: int, folder: Path, draws: int, force_noise: float, preset: str) -> list[Row]:
+    """Of one truth: by all that was recorded, and by forces alone. Kept in `folder`."""
+    noise, priors = Noise(force_noise), Priors(PLACE, ZERO)
+    paths, truth = recordings_of(kind, number, folder)
+    scene = load_scene("press" if kind == "gel" else "squeeze", [f"preset={preset}"])
+    recordings, began = Recordings(scene), time.perf_counter()
+    presses = read_all(recordings, paths)
+    random = np.random.default_rng(number)
+    spoilt = [_spoilt(press, force_noise, random) for press in presses]
+    found = identify(kind, scene, recordings, spoilt, noise, priors)
+    seconds = time.perf_counter() - began
+    clean = signals_of([thinned(gathered(press), MOMENTS) for press in presses], noise).values
+    force = found.signals.force[found.signals.channel]
+    alone = forces_alone(found)
+    alone = replace(alone, fit=refitted(alone, alone.signals.values, priors))
+    rows = [
+        row(found, clean, truth, draws, priors, f"{kind} {number}", seconds),
+        row(alone, clean[force], truth, draws, priors, "the same by forces alone", None),
+    ]
+    (folder / ROWS).write_text(json.dumps([asdict(each) for each in rows], indent=1), encoding="utf-8")
+    return rows
+
+
 def main(
-    kind: Annotated[str, typer.Argument(help="gel, body, or poisson: what which presses tell of it.")] = "gel",
+    kind: Annotated[
+        str, typer.Argument(help="gel, body, docs; poisson, friction: what which presses tell of it.")
+    ] = "gel",
     truths: Annotated[int, typer.Option(min=1)] = 3,
     draws: Annotated[int, typer.Option(min=1)] = 50,
     seed: int = 0,
@@ -133,30 +190,32 @@ def main(
         "runs/identify"
     ),
 ) -> None:
-    """Prints a line of the table for each truth."""
+    """Prints a line of the table for each truth; `docs` writes the table."""
     if kind == "poisson":
         for balls, heights, one in product(((4.0,), (8.0,), (2.0, 8.0), (4.0, 8.0)), (False, True), (0.02, 0.005)):
             felt = "forces and heights" if heights else "forces"
             typer.echo(f"| {' and '.join(f'{each:g}' for each in balls)} mm | {felt} | {one} N | "
                        f"{poisson(one, heights, balls)} |")  # fmt: skip
         return
-    what: Kind = "gel" if kind == "gel" else "body"
-    noise, priors = Noise(force_noise), Priors(PLACE, ZERO)
-    for number in range(seed, seed + truths):
-        paths, truth = recordings_of(what, number, folder / f"{kind}-{number}")
-        scene = load_scene("press" if kind == "gel" else "squeeze", [f"preset={preset}"])
-        recordings, began = Recordings(scene), time.perf_counter()
-        presses = read_all(recordings, paths)
-        random = np.random.default_rng(number)
-        found = identify(what, scene, recordings, [_spoilt(press, force_noise, random) for press in presses], noise,
-                         priors)  # fmt: skip
-        seconds = time.perf_counter() - began
-        clean = signals_of([thinned(gathered(press), MOMENTS) for press in presses], noise).values
-        typer.echo(line(found, clean, truth, draws, priors, f"{kind} {number}", f"{seconds:.0f} s"))
-        force = found.signals.force[found.signals.channel]
-        alone = forces_alone(found)
-        alone = replace(alone, fit=refitted(alone, alone.signals.values, priors))
-        typer.echo(line(alone, clean[force], truth, draws, priors, "the same by forces alone", ""))
+    if kind == "friction":
+        for motion in ("squeeze", "slide", "tilt"):
+            typer.echo("\n".join(friction(motion)))
+        return
+    rows = []
+    kinds: tuple[Kind, ...] = ("gel", "body") if kind == "docs" else ("gel" if kind == "gel" else "body",)
+    for what, number in product(kinds, range(seed, seed + truths)):
+        own = folder / f"{what}-{number}"
+        if kind == "docs" and (own / ROWS).exists():
+            found = [Row(**each) for each in json.loads((own / ROWS).read_text(encoding="utf-8"))]
+        else:
+            found = measured(what, number, own, draws, force_noise, preset)
+        typer.echo("\n".join(map(line, found)))
+        rows += found
+    if kind == "docs":
+        text = PAGE.read_text(encoding="utf-8")
+        before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+        table = "\n".join([*HEAD, *map(line, rows)])
+        PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}", encoding="utf-8")
 
 
 def forces_alone(found: Identified) -> Identified:
@@ -187,35 +246,46 @@ def _is_force(channel: str) -> bool:
     return channel.rpartition(".")[2] in ("fx", "fy", "fz")
 
 
-def line(
-    found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str, seconds: str
-) -> str:
-    """A row of the table; clean: (m,) the signals without noise."""
+def row(
+    found: Identified, clean: FloatArray, truth: dict[str, float], draws: int, priors: Priors, name: str,
+    seconds: float | None,
+) -> Row:  # fmt: skip
+    """What was found, beside the truth; clean: (m,) the signals without noise."""
     fit, names = found.fit, tuple(press.name for press in found.presses)
-    cells = []
+    parameters: dict[str, tuple[float, ...] | None] = {each.name: None for each in fit.parameters}
     again = [redrawn(found, clean, k, priors) for k in range(draws)]
     for each in fit.told:
-        low, high = fit.interval(each.name)
-        ends = [fit.interval(each.name) for fit, _ in again if each.name in {one.name for one in fit.told}]
-        held = sum(low <= truth[each.name] <= high for low, high in ends)
-        cells.append(
-            f"{each.name} {100 * (fit.value(each.name) / truth[each.name] - 1):+.1f} % "
-            f"(-{100 * (1 - low / fit.value(each.name)):.0f}, +{100 * (high / fit.value(each.name) - 1):.0f}; "
-            f"{'holds' if low <= truth[each.name] <= high else 'MISSES'}, {held} of {len(ends)})"
-        )
-    cells += [f"{each.name} not told" for each in fit.untold]
+        one, value, true = each.name, fit.value(each.name), truth[each.name]
+        ends = [fit.interval(one) for fit, _ in again if one in {told.name for told in fit.told}]
+        held = sum(low <= true <= high for low, high in ends)
+        parameters[one] = (value / true - 1, *(end / true - 1 for end in fit.interval(one)), held, len(ends))
 
     def noticed_in(drawn: tuple[Fit, Signals]) -> bool:
         return bool(findings(replace(drawn[0], sigma=found.checked.sigma), drawn[1], names, found.by_size))
 
-    false = sum(map(noticed_in, again))
-    noticed = [f"nothing wrong {false} of {draws}"]
+    noticed = {"nothing wrong": sum(map(noticed_in, again))}
     for what, change in _faults(found).items():
-        seen = (redrawn(found, clean + change, k, priors) for k in range(draws))
-        noticed.append(f"{what} {sum(map(noticed_in, seen))} of {draws}")
-    against = ", ".join(each.kind for each in found.findings) or "nothing"
-    return (f"| {name} | {len(names)} | {fit.runs} | {seconds} | {', '.join(cells)} | {against} | "
-            f"{', '.join(noticed)} |")  # fmt: skip
+        noticed[what] = sum(noticed_in(redrawn(found, clean + change, k, priors)) for k in range(draws))
+    return Row(
+        name, len(names), fit.runs, seconds, parameters, [each.kind for each in found.findings], noticed, draws
+    )  # fmt: skip
+
+
+def line(row: Row) -> str:
+    """A row of the table."""
+    cells = []
+    for name, found in row.parameters.items():
+        words = WORDS.get(name, name)
+        if found is None:
+            cells.append(f"{words} not told")
+            continue
+        off, low, high, held, of = found
+        miss = "" if low <= 0 <= high else ", MISSES"
+        cells.append(f"{words} {100 * off:+.1f} % ({100 * low:+.0f} to {100 * high:+.0f}{miss}; {held:g} of {of:g})")
+    noticed = ", ".join(f"{what} {count}" for what, count in row.noticed.items())
+    seconds = "" if row.seconds is None else f"{row.seconds:.0f} s"
+    return (f"| {row.name} | {row.recordings} | {row.simulated} | {seconds} | {'; '.join(cells)} | "
+            f"{', '.join(row.against) or 'nothing'} | {noticed} of {row.draws} |")  # fmt: skip
 
 
 def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
@@ -238,6 +308,43 @@ def poisson(force_noise: float, heights: bool, balls: tuple[float, ...]) -> str:
     if any(each.name == "poisson_ratio" for each in fit.untold):
         return "not told"
     return "{:.3f} to {:.3f}".format(*fit.interval("poisson_ratio"))
+
+
+def planned(scene: Scene, motion: str, moments: int) -> Press:
+    """One of the motions of a body, from first touch on, at so many moments, before anything is felt."""
+    touch = Pose(np.array([0.0, 0.0, 10e-3]), se3.HALF_TURN_X.quaternion)
+    rows = np.loadtxt(motions(scene)[motion].splitlines(), delimiter=",", skiprows=1)
+    upper = [touch, *(se3.compose(touch, se3.from_rotation_vector([x, 0, z], [0, turn, 0])) for x, z, turn in rows)]
+    count = len(upper)
+    readings = {f"{gel}.{force}": np.zeros(count) for gel in ("lower", "upper") for force in ("fx", "fz")}
+    poses = {"lower": (Pose(),) * count, "upper": tuple(upper)}
+    return thinned(Press(motion, poses, readings, np.arange(float(count)), np.ones(count, np.int64)), moments)
+
+
+def friction(motion: str, sensors: tuple[float, ...] = (0.02, 0.2, 1.0)) -> list[str]:
+    """Lines of a table: half the 95 % intervals of both frictions of a body by one motion, its material known, for
+    these force sensors [N]."""
+    scene = load_scene("squeeze", ["preset=learn"])
+    press = planned(scene, motion, MOMENTS)
+    parameters = [each for each in parameters_of("body", scene) if each.name.startswith("friction")]
+    simulation, signals = Simulation(scene, tuple(parameters), (press,), {}), signals_of([press], Noise(1.0))
+    points = [
+        Point(np.log(pair) + change, np.array([place]))
+        for pair in FRICTIONS
+        for change, place in ((0, 0), (np.array([0.08, 0]), 0), (np.array([0, 0.08]), 0), (0, PLACE))
+    ]
+    values, lines = np.array(simulation(points)).reshape(len(FRICTIONS), 4, -1), []
+    for (lower, upper_one), (base, *changed) in zip(FRICTIONS, values, strict=True):
+        columns = [(one - base) / step for one, step in zip(changed, (0.08, 0.08, PLACE), strict=True)]
+        system, cells = np.column_stack([*columns, signals.zeros()]), []
+        for noise in sensors:
+            priors = np.array([PLACE, *[10 * noise] * 4])
+            known = covariance_of(system, np.hypot(noise, SETTLED_ERROR * base), priors, np.zeros(2, np.bool_))
+            halves = 1.96 * np.sqrt(np.diag(known))[:2]
+            cells.append(" / ".join("no" if half > UNTOLD else f"{100 * half:.0f} %" for half in halves))
+        apart = np.degrees(abs(np.arctan(lower) - np.arctan(upper_one)))
+        lines.append(f"| {motion} | {lower:g} / {upper_one:g} | {apart:.0f} | {' | '.join(cells)} |")
+    return lines
 
 
 def _faults(found: Identified) -> dict[str, FloatArray]:

@@ -20,6 +20,7 @@ import typer
 from robot.studies.identify.motions import motions
 from tacsim.config import load, load_scene
 from tacsim.models.randomisation import Randomisation
+from tacsim.models.scene import BodyMaterial, GelMaterial
 from tacsim.models.training import Training
 
 SIGHTS = {"canonical": "squeeze", "raw": "squeeze-pictures"}  # training files
@@ -70,9 +71,10 @@ def record(folder: Path, preset: str) -> None:
 
 def identify(folder: Path, preset: str) -> None:
     """By the shipped command, on a coarser mesh than the twin's."""
-    for kind, more in (("gel", []), ("body", sets([f"gel.material={folder / 'my-gel/material.yaml'}"]))):
+    for kind in RECORDED:
         out = folder / f"my-{kind}"
         if not out.exists():
+            more = sets([f"gel.material={gel(folder)}"]) if kind == "body" else []  # the gel is known by then
             words = ["--preset", preset, "--force-noise", NOISE, "--out", str(out), *more]
             tacsim("identify", kind, str(folder / kind), *words)
 
@@ -81,10 +83,19 @@ def found(folder: Path) -> list[str]:
     """What was identified, as overrides of a rig."""
     friction = load_scene(str(folder / "my-body/scene.yaml")).friction
     return [
-        f"scene.gel.material={folder / 'my-gel/material.yaml'}",
-        f"scene.body.material={folder / 'my-body/material.yaml'}",
+        f"scene.gel.material={gel(folder)}",
+        f"scene.body.material={typed(load(BodyMaterial, folder / 'my-body/material.yaml'))}",
         *(f"scene.friction.{name}={mu:.9g}" for name, mu in friction.items()),
     ]
+
+
+def gel(folder: Path) -> str:
+    return typed(load(GelMaterial, folder / "my-gel/material.yaml"))
+
+
+def typed(material: GelMaterial | BodyMaterial) -> str:
+    """As a value of --set: its numbers, not the path of a file, which would have to lie below the current folder."""
+    return material.model_dump_json(exclude_none=True, exclude={"source"})
 
 
 def training(sight: str, materials: str, folder: Path) -> Training:

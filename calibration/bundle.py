@@ -40,12 +40,9 @@ from tacsim.record.episode import EpisodeError
 from tacsim.record.images import decode_image, encode_png
 
 FORMAT = FORMATS[-1]
-NOT_YET = {
-    1: {"view", "noise", "darkness", "region"},
-    2: {"noise", "darkness", "region"},
-    3: {"darkness", "region"},
-    4: {"darkness", "region"},
-}  # by format: the fields it lacks
+SERIAL = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+SINCE = {"darkness": 5, "noise": 3, "region": 5, "view": 2}  # the first format that has the field
+DEPTH_FORMAT = 6  # from which on a light may tell what depth changes
 
 Positive = Annotated[Length, Field(gt=0)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -80,8 +77,8 @@ class Provenance(Config):
 class Calibration(Config):
     """All that calibration has found out about one sensor."""
 
-    format: Literal[1, 2, 3, 4, 5]
-    serial: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    format: Literal[1, 2, 3, 4, 5, 6]
+    serial: Annotated[str, Field(pattern=SERIAL)]
     geometry: SensorGeometry  # of the picture that the models are for: the native one, or with `view` the rectified
     gel_size: tuple[Positive, Positive]  # x, y of the gel that the picture shows [m]
     forward: PhotometricModel | None = None  # slope -> colour
@@ -116,14 +113,21 @@ class Calibration(Config):
             raise ValueError(f"gel_size is {self.gel_size} m, the picture of its geometry shows {shown} m")
         if self.view is not None and self.view.geometry != self.geometry:
             raise ValueError(f"geometry is {self.geometry}, its view gives {self.view.geometry}")
-        for name in sorted(NOT_YET.get(self.format, ())):
+        if self.format < DEPTH_FORMAT and self.forward is not None and self.forward.depth is not None:
+            raise ValueError(f"format {self.format} has no forward.depth")
+        for name in sorted(_later_than(self.format)):
             if getattr(self, name) is not None:
                 raise ValueError(f"format {self.format} has no {name}")
         return self
 
     def digest(self) -> str:
         """What `checksum` must be."""
-        return digest(self.model_dump(mode="json", exclude=NOT_YET.get(self.format)))
+        return digest(self.model_dump(mode="json", exclude=_later_than(self.format)))
+
+
+def _later_than(number: int) -> set[str]:
+    """The fields that format `number` lacks."""
+    return {name for name, first in SINCE.items() if number < first}
 
 
 def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.uint8]) -> Path:
@@ -134,7 +138,7 @@ def write_bundle(folder: Path, calibration: Calibration, reference: NDArray[np.u
     stamped = stamped.model_copy(update={"checksum": stamped.digest()})
     (folder / REFERENCE).write_bytes(png)
     path = folder / FILE
-    content = stamped.model_dump(mode="json", exclude=NOT_YET.get(stamped.format))
+    content = stamped.model_dump(mode="json", exclude=_later_than(stamped.format))
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
     path.write_text(text, encoding="utf-8")
     return path

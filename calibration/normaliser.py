@@ -18,6 +18,7 @@ from calibration.drift import DriftFinder, size_of
 from calibration.errors import BadFrames
 from calibration.height.colour_table import GradientModel, from_model
 from calibration.height.darkness import DarknessSlopes
+from calibration.height.forward_steps import ForwardSteps
 from calibration.height.slope_polynomial import PolynomialSlopes
 from calibration.height.surface_finder import SurfaceFinder, canonical_part, extended_view
 from calibration.lens.rectification import (
@@ -47,6 +48,8 @@ from tacsim.models.hardware import CameraSensorConfig
 from tacsim.models.rig import ReplaySensorConfig
 from tacsim.models.sensor import CanonicalGrid, SensorModel
 from tacsim.optics.grid import PixelGrid, canonical_cells, canonical_image
+
+BETTERED = 5  # format of bundles from which on the forward model betters heights: older ones give what they gave
 
 
 class NoReference(RuntimeError):
@@ -296,12 +299,17 @@ def normaliser_for_calibration(
     pixels = (wide.points() / geometry.pixel_pitch + geometry.principal + 0.5) / (geometry.width, geometry.height)
     x, y = np.moveaxis(2.0 * pixels[seen_box(rectify.valid)] - 1.0, -1, 0)
     slopes: GradientModel
+    better = None
     if calibration.darkness is not None:
         slopes = DarknessSlopes(calibration.darkness, x.shape, wide.pitch)
     else:
-        assert calibration.inverse is not None
+        assert calibration.inverse is not None and calibration.forward is not None
         slopes = PolynomialSlopes(calibration.inverse, x, y)
-    find = SurfaceFinder(slopes, rectify.valid, grid, dots=calibration.markers is not None, drifts=True)
+        if calibration.format >= BETTERED:
+            u, v = (np.asarray(place / 2, dtype=np.float32) for place in (x, y))
+            better = ForwardSteps(calibration.forward, u, v, wide.pitch, geometry.width * geometry.pixel_pitch)
+    dots = calibration.markers is not None
+    find = SurfaceFinder(slopes, rectify.valid, grid, dots=dots, drifts=True, better=better)
     flow = marker_flow(calibration.markers, geometry, calibration.gel_size, calibration.view, calibration.region)
     known = None
     if untouched is not None:  # it is metric by itself, whatever the camera's picture is

@@ -135,27 +135,11 @@ def test_public_names_are_those_of_the_list(package: str) -> None:
         module.nothing  # noqa: B018
 
 
-def test_only_runtime_imports_taichi() -> None:
-    found = {name(path) for path, tree in TREES.items() if "taichi" in map(top, imports(tree))}
-    assert found == {"tacsim/compute/runtime.py"}
-
-
 def test_opencv_and_ur_rtde_are_imported_inside_functions() -> None:
     found = {
         name(path): sorted(heavy)
         for path, tree in TREES.items()
         if (heavy := (HEAVY - {"taichi"}) & set(map(top, loaded_on_import(tree))))
-    }
-    assert found == {}
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_no_file_imports_upward(package: str) -> None:
-    above = set(PACKAGES[PACKAGES.index(package) + 1 :])
-    found = {
-        name(path): sorted(wrong)
-        for path, tree in TREES.items()
-        if path.is_relative_to(ROOT / package) and (wrong := above & set(map(top, imports(tree))))
     }
     assert found == {}
 

@@ -49,7 +49,7 @@ def on_incline(slope: float, half: int = HALF) -> tuple[World, float]:
     return world, float(np.linalg.norm(after.position - before.position))
 
 
-def stick_limit(steps: int = STEPS) -> tuple[float, float]:
+def stick_limit() -> tuple[float, float]:
     """tan(tilt) / friction at which the block begins to slide, by bisection: the middle and half the last bracket.
 
     Raises RuntimeError when the limit lies outside the bracket.
@@ -59,7 +59,7 @@ def stick_limit(steps: int = STEPS) -> tuple[float, float]:
         moved = on_incline(end * FRICTION)[1]
         if (moved < STILL) != sticks:
             raise RuntimeError(f"at tan(tilt) = {end:g} of the friction the block moves {moved * 1e6:.3g} µm")
-    for _ in range(steps):
+    for _ in range(STEPS):
         middle = (low + high) / 2
         low, high = (middle, high) if on_incline(middle * FRICTION)[1] < STILL else (low, middle)
     return (low + high) / 2, (high - low) / 2

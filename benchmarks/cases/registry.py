@@ -94,9 +94,9 @@ def _real_cases(data: Path) -> tuple[Case, ...]:
     except BadData as error:
         if all(case.missing for case in found) or (data / labels.OWN).is_file():
             raise
-        presses = (missing_case("real", contact_radius.CASE, str(error)),)
+        presses = (missing_case(contact_radius.CASE, str(error)),)
     if not any(case.name == films.CASE for case in found):
-        found = (*found, missing_case("real", films.CASE, f"no film of a dotted gel below {data}"))
+        found = (*found, missing_case(films.CASE, f"no film of a dotted gel below {data}"))
     of_light = (*known_depth.cases(data), *punches.cases(data), *invariance.cases(data))
     return (*presses, *found, *of_light, *costs.CASES, *ball_touch.CASES)
 

@@ -17,7 +17,7 @@ from tacsim.physics.body.transfers import (
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Environment, Floats, Params, Partial
 from tacsim.physics.exec.lanes import LANES, NODES, PARTS, share_start, strip, vec3
-from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, piece_done, run_team
+from tacsim.physics.exec.team import CHUNK, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done, run_team
 from tacsim.physics.gel.element import SMALLEST_STRETCH
 from tacsim.physics.gel.gel import GelParams, GelState
 from tacsim.physics.gel.kernels import (
@@ -46,15 +46,15 @@ def body_substeps(
             env = ti.static(Environment(0, params, counts, partial))
             body = ti.static(Body(particles, masses, velocities))
             rows, plane = env.count(layout.GRID), env.count(layout.GRID + 1) * (env.count(layout.GRID + 2) // NODES)
-            pieces = PARTS * (2 * steps.shape[1] + 1)
-            piece = next_piece(sync, 0, pieces)
-            while piece < pieces:
+            stages, own = 2 * steps.shape[1] + 1, own_part(task, team)
+            piece = next_piece(sync, 0, own, stages)
+            while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 for _gather in range(once_if(stage % 2 == 0 and stage > 0)):
                     grid_to_particles(env, part, body)
                 for _scatter in range(once_if(stage % 2 == 0 and stage < 2 * steps.shape[1])):
                     clear_masses(env, part, body)
-                    particles_to_grid(env, part, body)
+                    particles_to_grid(env, part, 0, body)
                 for _motion in range(once_if(stage % 2 == 1)):
                     for i in range(share_start(rows, part, PARTS), share_start(rows, part + 1, PARTS)):
                         for at in range(i * plane, (i + 1) * plane):
@@ -67,7 +67,7 @@ def body_substeps(
                                     moved[4 * n + 2] = keep_z * q[4 * n + 2] / q[4 * n + 3]
                             velocities[at] = moved
                 piece_done(sync, 0)
-                piece = next_piece(sync, 0, pieces)
+                piece = next_piece(sync, 0, own, stages)
 
 
 @ti.kernel

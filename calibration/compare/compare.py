@@ -20,12 +20,11 @@ from calibration.bundle import Calibration
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment, by_geometry, by_size, find_shift
 from calibration.compare.scorer import Numbers, Pair, Scorer, surface_errors
-from calibration.compare.surfaces import SurfaceEstimate, estimate_surfaces, flat_surface
+from calibration.compare.surfaces import GRID, SurfaceEstimate, estimate_surfaces, flat_surface
 from calibration.drift import without_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
 from tacsim.control.contact_signal import CONTACT_HEIGHT
-from tacsim.models.sensor import CanonicalGrid
 
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
@@ -34,7 +33,6 @@ MAX_SHIFT_PAIRS = 40  # pairs from which the shift is found
 MAX_NOISE_FRAMES = 5  # untouched frames from which the floor is made
 BOOTSTRAP_DRAWS = 2000
 MIN_PAIRS = 3  # for an interval
-GRID = CanonicalGrid()  # the usual one
 
 
 class Pairing(StrEnum):
@@ -55,7 +53,6 @@ class Metric:
     scale: float = 1.0  # shown in `unit` as value times this; files and thresholds have SI units, degrees and pixels
     digits: int = 2
     more_is_better: bool = False
-    of_surface: bool = False  # needs height and gradient of both sides
 
     @property
     def si(self) -> str:
@@ -76,13 +73,13 @@ METRICS = (
     Metric("contact_centroid", "contact centroid error", "px"),
     Metric("grain", "grain error beside contact", "grey"),
     Metric("contact_grain", "grain error in contact", "grey"),
-    Metric("gradient_angle", "gradient angle error", "°", of_surface=True),
-    Metric("height_rmse", "height RMSE", "mm", 1e3, 4, of_surface=True),
-    Metric("height_share", "height RMSE of indentation", "%", 1e2, 1, of_surface=True),
-    Metric("surface_iou", "pressed area IoU", digits=3, more_is_better=True, of_surface=True),
-    Metric("surface_radius", "pressed radius error", "mm", 1e3, 3, of_surface=True),
-    Metric("surface_centroid", "pressed centroid error", "mm", 1e3, 3, of_surface=True),
-    Metric("marker_error", "marker end-point error", "mm", 1e3, 4, of_surface=True),
+    Metric("gradient_angle", "gradient angle error", "°"),
+    Metric("height_rmse", "height RMSE", "mm", 1e3, 4),
+    Metric("height_share", "height RMSE of indentation", "%", 1e2, 1),
+    Metric("surface_iou", "pressed area IoU", digits=3, more_is_better=True),
+    Metric("surface_radius", "pressed radius error", "mm", 1e3, 3),
+    Metric("surface_centroid", "pressed centroid error", "mm", 1e3, 3),
+    Metric("marker_error", "marker end-point error", "mm", 1e3, 4),
 )
 
 
@@ -129,7 +126,6 @@ class Options:
 
     pairing: Pairing = Pairing.auto
     shift: bool | None = None  # look for the shift between the two; None: unless A is made in the pixels of B
-    grid: CanonicalGrid = GRID  # on which surfaces are compared
 
 
 USUAL = Options()
@@ -154,11 +150,10 @@ def compare_frames(
     shift = not a.placed if options.shift is None else options.shift
     alignment = _alignment(a, b, couples, calibration_a, calibration_b, shift=shift)
     notes: list[str] = [*a.notes, *b.notes]
-    grid = options.grid
-    found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a, grid)
-    found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b, grid)
+    found_a, said_a = estimate_surfaces(a, [frame for frame, _ in couples], calibration_a)
+    found_b, said_b = estimate_surfaces(b, [frame for _, frame in couples], calibration_b)
     if found_a is not None and found_b is not None and calibration_b is not None:
-        moved = np.array(alignment.shift) * calibration_b.geometry.pixel_pitch / grid.pitch
+        moved = np.array(alignment.shift) * calibration_b.geometry.pixel_pitch / GRID.pitch
         found_a = tuple(None if each is None else each.moved(moved) for each in found_a)
     elif found_a is not None and found_b is not None and max(map(abs, alignment.shift)) > 0.5:
         notes.append("surfaces are compared as they were recorded, without the shift: it is known in pixels only")
@@ -169,13 +164,13 @@ def compare_frames(
     else:
         unknown = zip(names, (said_a, said_b), strict=True)
         notes += [f"{side}: no surface where nothing can be measured: {why}" for side, why in unknown if why]
-    scorer = Scorer(a, b, alignment, grid, names)
+    scorer = Scorer(a, b, alignment, names)
     pairs = []
     for k, (frame_a, frame_b) in enumerate(couples):
         on_pair(k, len(couples))
         surface_a, surface_b = (None if found is None else found[k] for found in (found_a, found_b))
         pairs.append(scorer.pair(frame_a, frame_b, surface_a, surface_b))
-    floor, of_floor = _floor(scorer, b, pairs, calibration_b, options.grid)
+    floor, of_floor = _floor(scorer, b, pairs, calibration_b)
     overall = {metric.key: _overall(metric, pairs, floor.get(metric.key, math.nan)) for metric in METRICS}
     notes += [*left, *of_floor, *scorer.swapped()]
     if len(pairs) < MIN_PAIRS:
@@ -260,7 +255,7 @@ def _alignment(
 
 
 def _floor(
-    scorer: Scorer, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None, grid: CanonicalGrid
+    scorer: Scorer, b: FrameSet, pairs: Sequence[Pair], calibration: Calibration | None
 ) -> tuple[Numbers, list[str]]:
     """What pictures of B without contact score against each other, where the pairs have contact; and a note."""
     frames = [*b.untouched, *(pair.b for pair in pairs if not pair.region.any())][:MAX_NOISE_FRAMES]
@@ -269,8 +264,8 @@ def _floor(
         why = f"{scorer.names[1]} has no second frame without contact" if not frames else "no pair has contact"
         return {}, [f"noise floor absent: {why}"]
     floor = _means([scorer.pictures(frame.image, b.reference, pair.region) for frame in frames for pair in touched])
-    found, _ = estimate_surfaces(b, frames, calibration, grid)
-    pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration, grid)
+    found, _ = estimate_surfaces(b, frames, calibration)
+    pressed, _ = estimate_surfaces(b, [pair.b for pair in touched], calibration)
     if found is not None and pressed is not None:
         known = [each for each in pressed if each is not None]
         regions = [metrics.pressed_region(each.height, CONTACT_HEIGHT) & each.valid for each in known]

@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 
 from calibration.bundle import Calibration
 from calibration.compare import metrics
-from calibration.compare.compare import BOOTSTRAP_DRAWS, GRID, Comparison
-from calibration.compare.surfaces import estimate_surfaces
+from calibration.compare.compare import BOOTSTRAP_DRAWS, Comparison
+from calibration.compare.surfaces import GRID, estimate_surfaces
 from calibration.drift import without_drift
 from calibration.errors import BadFrames
 from calibration.frame_set import Image
 from tacsim.control.contact_signal import CONTACT_HEIGHT
-from tacsim.models.sensor import CanonicalGrid
 
 Float64 = NDArray[np.float64]
 
@@ -103,7 +102,6 @@ class Report:
 
 def invariance(
     folds: Sequence[tuple[Comparison, Calibration | None]],
-    grid: CanonicalGrid = GRID,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
     """Of finished comparisons, each with B's calibration (needed for drifts): one, or parts of one set of presses, each
@@ -127,7 +125,7 @@ def invariance(
     radii = [patch.radius for one in touched for patch in one.values()]
     half, words = _size(folds[0][1], radii)
     parts = [
-        _patches(comparison, one, calibration, grid, half)
+        _patches(comparison, one, calibration, half)
         for (comparison, calibration), one in zip(folds, touched, strict=True)
         if one
     ]
@@ -145,11 +143,11 @@ def invariance(
     if any(comparison.surfaces_a is None or calibration is None for comparison, calibration in folds):
         notes.append("no drift table: it needs surfaces of A and the calibration of B")
     else:
-        angle = _angle(folds, touched, grid, None, None)
+        angle = _angle(folds, touched, None, None)
         for k, change in enumerate(CHANGES):
             on_step(len(views) + k, steps)
-            fresh = _angle(folds, touched, grid, change, change)
-            stale = _angle(folds, touched, grid, change, None)
+            fresh = _angle(folds, touched, change, change)
+            stale = _angle(folds, touched, change, None)
             drifts.append(DriftError(change, fresh - angle, stale - angle))
     return Report(count, tuple(views), words, angle, tuple(drifts), tuple(notes))
 
@@ -239,7 +237,6 @@ def _patches(
     comparison: Comparison,
     touched: dict[int, metrics.Patch],
     calibration: Calibration | None,
-    grid: CanonicalGrid,
     half: float,
 ) -> dict[str, tuple[Float64, Float64, Float64]]:
     """Of each view the patches (n, d) of A and of B, and the norms (n,) of B's change."""
@@ -258,7 +255,7 @@ def _patches(
         surfaces = comparison.surfaces(k)
         if surfaces is None:
             continue
-        at_x, at_y, reach = _in_cells(comparison, k, calibration, grid, x, y)
+        at_x, at_y, reach = _in_cells(comparison, k, calibration, x, y)
         surface_a, surface_b = surfaces
         for view, one, other in (
             ("gradient", surface_a.gradient, surface_b.gradient),
@@ -280,18 +277,18 @@ def _add(to: tuple[list[Float64], list[Float64], list[float]], a: Float64, b: Fl
 
 
 def _in_cells(
-    comparison: Comparison, k: int, calibration: Calibration | None, grid: CanonicalGrid, x: float, y: float
+    comparison: Comparison, k: int, calibration: Calibration | None, x: float, y: float
 ) -> tuple[float, float, float]:
     """Centre of the patch of pair k on the canonical grid, and half its side [cells]."""
-    reach = PATCH_SIDE / 2 / grid.pitch
+    reach = PATCH_SIDE / 2 / GRID.pitch
     if calibration is None:  # both surfaces were recorded
         surfaces = comparison.surfaces(k)
         assert surfaces is not None
         patch = metrics.patch_of(metrics.pressed_region(surfaces[1].height, CONTACT_HEIGHT))
-        return (patch.x, patch.y, reach) if patch is not None else (grid.columns / 2, grid.rows / 2, reach)
+        return (patch.x, patch.y, reach) if patch is not None else (GRID.columns / 2, GRID.rows / 2, reach)
     u0, v0 = calibration.geometry.principal
-    scale = calibration.geometry.pixel_pitch / grid.pitch
-    return (x - u0) * scale + (grid.columns - 1) / 2, (y - v0) * scale + (grid.rows - 1) / 2, reach
+    scale = calibration.geometry.pixel_pitch / GRID.pitch
+    return (x - u0) * scale + (GRID.columns - 1) / 2, (y - v0) * scale + (GRID.rows - 1) / 2, reach
 
 
 def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> Float64:
@@ -311,7 +308,6 @@ def _cut(field: NDArray[np.float32], x: float, y: float, half: float) -> Float64
 def _angle(
     folds: Sequence[tuple[Comparison, Calibration | None]],
     touched: Sequence[dict[int, metrics.Patch]],
-    grid: CanonicalGrid,
     change: Change | None,
     of_reference: Change | None,
 ) -> float:
@@ -323,7 +319,7 @@ def _angle(
         reference = comparison.b.reference if of_reference is None else of_reference(comparison.b.reference)
         real = [comparison.pairs[k].b for k in one]
         frames = [replace(frame, image=frame.image if change is None else change(frame.image)) for frame in real]
-        found, _ = estimate_surfaces(replace(comparison.b, reference=reference), frames, calibration, grid)
+        found, _ = estimate_surfaces(replace(comparison.b, reference=reference), frames, calibration)
         assert found is not None  # there is a calibration
         angles += [
             metrics.gradient_angle(

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from calibration.compare import metrics
 from calibration.compare.alignment import Alignment
-from calibration.compare.surfaces import SurfaceEstimate, flat_surface
+from calibration.compare.surfaces import GRID, SurfaceEstimate, flat_surface
 from calibration.drift import without_drift
 from calibration.frame_set import Frame, FrameSet, frame_warnings
 from tacsim.control.contact_signal import CONTACT_HEIGHT
-from tacsim.models.sensor import CanonicalGrid
 
 Mask = NDArray[np.bool_]
 Numbers = dict[str, float]
@@ -39,10 +38,8 @@ class Pair:
 class Scorer:
     """Scores pairs in the pixels of B."""
 
-    def __init__(
-        self, a: FrameSet, b: FrameSet, alignment: Alignment, grid: CanonicalGrid, names: tuple[str, str]
-    ) -> None:
-        self._b, self._alignment, self._grid, self.names = b, alignment, grid, names
+    def __init__(self, a: FrameSet, b: FrameSet, alignment: Alignment, names: tuple[str, str]) -> None:
+        self._b, self._alignment, self.names = b, alignment, names
         self._covered = alignment.covered
         self._whole = None if self._covered.all() else self._covered
         self._reference_a = alignment(a.reference)
@@ -108,8 +105,8 @@ class Scorer:
         no_flow = a.flow is None or b.flow is None or a.flow.shape != b.flow.shape
         return surface_errors(a, b, (of_shown | pressed_b) & b.valid, b) | {
             "surface_iou": pressed["contact_iou"],
-            "surface_radius": pressed["contact_radius"] * self._grid.pitch,
-            "surface_centroid": pressed["contact_centroid"] * self._grid.pitch,
+            "surface_radius": pressed["contact_radius"] * GRID.pitch,
+            "surface_centroid": pressed["contact_centroid"] * GRID.pitch,
             "marker_error": math.nan if no_flow else metrics.end_point_error(np.asarray(a.flow), np.asarray(b.flow)),
         }
 

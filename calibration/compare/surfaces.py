@@ -20,6 +20,8 @@ from tacsim.models.sensor import CanonicalGrid
 
 Float32 = NDArray[np.float32]
 
+GRID = CanonicalGrid()  # on which surfaces are compared
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceEstimate:
@@ -50,7 +52,6 @@ def estimate_surfaces(
     side: FrameSet,
     frames: Sequence[Frame],
     calibration: Calibration | None,
-    grid: CanonicalGrid,
 ) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
     """The surfaces of some of the frames; or None, and why not. None also in place of a frame in which nothing can be
     measured, and which these are.
@@ -59,8 +60,8 @@ def estimate_surfaces(
     treated alike. Raises BadFrames for a reference that cannot be used.
     """
     if calibration is None:
-        return _recorded(frames, grid)
-    normaliser = normaliser_for_calibration(calibration, grid)
+        return _recorded(frames)
+    normaliser = normaliser_for_calibration(calibration, GRID)
     try:
         normaliser.take_reference(TactileFrame(side.reference, 0.0, 0))
         found: list[SurfaceEstimate | None] = []
@@ -87,8 +88,8 @@ def flat_surface(like: SurfaceEstimate) -> SurfaceEstimate:
     return SurfaceEstimate(np.zeros_like(like.height), np.zeros_like(like.gradient), flow, like.valid)
 
 
-def _recorded(frames: Sequence[Frame], grid: CanonicalGrid) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
-    shape = (grid.rows, grid.columns)
+def _recorded(frames: Sequence[Frame]) -> tuple[tuple[SurfaceEstimate | None, ...] | None, str]:
+    shape = (GRID.rows, GRID.columns)
     found: list[SurfaceEstimate | None] = []
     for frame in frames:
         if frame.surface is None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.drift import STRIDE, DriftFinder, size_of
 from calibration.height.colour_table import GradientModel
+from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
 from calibration.lens.rectification import seen_box
 from tacsim.models.sensor import CanonicalGrid
@@ -50,12 +51,20 @@ class SurfaceFinder:
         valid: (H, W) of :func:`extended_view`, as the rectification gives it.
         dots: dots are printed on the gel.
         drifts: the light is real and drifts: the drift, which is measured in any case, is removed.
+        better: what betters the height by the light's forward model, on the same pixels; None: nothing does.
     """
 
     def __init__(
-        self, slopes: GradientModel, valid: Mask, grid: CanonicalGrid, *, dots: bool, drifts: bool = False
+        self,
+        slopes: GradientModel,
+        valid: Mask,
+        grid: CanonicalGrid,
+        *,
+        dots: bool,
+        drifts: bool = False,
+        better: ForwardSteps | None = None,
     ) -> None:
-        self._slopes, self._grid, self._dots = slopes, grid, dots
+        self._slopes, self._grid, self._dots, self._better = slopes, grid, dots, better
         self._box = seen_box(valid)
         self._unseen = ~valid[self._box]
         self._pitch = grid.pitch / grid.image_scale
@@ -92,6 +101,8 @@ class SurfaceFinder:
         if self._any_unseen:
             by_x[self._unseen] = by_y[self._unseen] = 0.0  # what is not seen is taken as flat
         height = self._integrate(np.stack([by_x, by_y], axis=-1))
+        if self._better is not None:
+            height = self._better(planes, height, hidden, self._integrate)
         by_x, by_y = slopes_of(height, self._pitch)
         return FoundSurface(
             height=self._cells(height),

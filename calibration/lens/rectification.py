@@ -87,13 +87,17 @@ class Rectification:
 
 
 def region_mask(region: PictureRegion, image_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """(rows, columns) pixels inside a polygon. Raises BadCorners for one that encloses hardly any."""
+    """(rows, columns) pixels inside a polygon. Raises BadCorners for one that encloses hardly any pixel, or that
+    reaches beyond the picture."""
     import cv2
 
+    rows, columns = image_shape
+    for u, v in region:
+        if not (-1 <= u <= columns and -1 <= v <= rows):
+            raise BadCorners(f"region: its corner {u:g},{v:g} lies beyond the picture of {columns} x {rows} px")
     shown = np.zeros(image_shape, dtype=np.uint8)
     cv2.fillPoly(shown, [np.rint(np.array(region, dtype=np.float64)).astype(np.int32)], 1)
     if np.count_nonzero(shown) < MIN_REGION * shown.size:
-        rows, columns = image_shape
         raise BadCorners(
             f"region {region!r} encloses {np.count_nonzero(shown)} of the picture's {columns} x {rows} px; give its "
             "corners one after the other [px, u to the right, v down]"

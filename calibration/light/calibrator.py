@@ -8,40 +8,55 @@ from __future__ import annotations
 
 import functools
 import operator
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import BadFrames
 from calibration.height.darkness import DarknessSlopes
+from calibration.height.forward_steps import ForwardSteps
 from calibration.height.integration import Integrator, slopes_of
 from calibration.height.slope_polynomial import (
     InverseModel,
     PolynomialSlopes,
-    fit_inverse,
-    inverse_features,
     to_normal,
 )
 from calibration.light.circle import NoCircle
 from calibration.light.darkness import find_dark_press, fit_darkness, tells_no_direction
 from calibration.light.dent import dent_gradient, dent_height, rim_slope
 from calibration.light.fit import LightFit, PressPrediction, compared, normal_angle
-from calibration.light.photometry import FEW_PRESSES, ModelSize, NormalEquations, choose_size, normal_equations, solve
-from calibration.light.press import FAR, NEAR, BallPress, Window, find_press, smooth, untouched_mean
-from calibration.light.refinement import RIM_BLUR, RefinedGeometry, refine
+from calibration.light.labels import (
+    BLUR,
+    INVERSE_BLUR,
+    beside_slopes,
+    deepest_dent,
+    forward_equations,
+    forward_model,
+    inverse_equations,
+    inverse_model,
+    label,
+    near_contact,
+)
+from calibration.light.photometry import FEW_PRESSES, choose_size
+from calibration.light.press import BallPress, Window, find_press, smooth, untouched_mean
+from calibration.light.refinement import RefinedGeometry, refine
 from calibration.light.shadows import DentShade, find_lamps
 from calibration.reference import STALE_COLOUR, exchanged
-from tacsim.models.photometric import PhotometricLight, PhotometricModel, place_in_image, places_in_image
-from tacsim.models.shadows import CastShadows
+from tacsim.models.photometric import (
+    DEPTH_TERMS,
+    PhotometricLight,
+    PhotometricModel,
+    places_in_image,
+)
 from tacsim.optics.darkness import darkened
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-BLUR = 0.8  # of the camera, and of what the forward model is fitted to [px]
-INVERSE_BLUR = 1.2  # of what the inverse is fitted to [px]
 REFINEMENT_PIXELS = 2500  # of each press, about
 UNSHADED = 0.02  # share of the change of colour: where slopes leave no more, shadows are not looked for
 ROUNDS = 2  # of refining circles and lamps in turn
@@ -51,7 +66,6 @@ MAX_UNEXPLAINED = 0.5  # share of the change
 MAX_UNEXPLAINED_RATIO = 5.0  # times the median press's share, with three presses or more; at least GOOD_FIT
 DARK_UNEXPLAINED = 0.1  # the same of darkness that is no function of depth; 0.003 on real frames
 GOOD_FIT = 0.05  # share of the change: a press that is explained so well always stays
-RIM_MARGIN = 5.0  # that contact and skirt reach further, whatever the radius [px]
 ORDER_FRAMES = 9  # frames whose median tells the order of colours, at most
 MIN_SPREAD = 0.2  # share of the picture that presses spread over; else nothing is known of the rest
 NO_DIRECTION = "this light tells no direction: all flanks of a dent change alike"
@@ -98,20 +112,21 @@ def calibrate_light(
         return replace(_darkness(found, left_out, mean, reference, ball), reference=shown, frames=_names(frames))
     presses, refined = _refined(found, left_out, ball)
     presses, refined, shade = _shaded(presses, refined, ball)
-    labels = [_label(press, refined, ball) for press in presses]
-    darks = [_dark(press, refined, ball, shade) for press in presses]
-    forward_sets = [_forward_equations(p, g, d) for p, g, d in zip(presses, labels, darks, strict=True)]
-    inverse_sets = [_inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
+    labels = [label(press, refined, ball) for press in presses]
+    besides = [beside_slopes(press, refined, ball, shade) for press in presses]
+    forward_sets = [forward_equations(p, g, b) for p, g, b in zip(presses, labels, besides, strict=True)]
+    inverse_sets = [inverse_equations(p, g) for p, g in zip(presses, labels, strict=True)]
     size = choose_size(forward_sets)
     all_equations = functools.reduce(operator.add, forward_sets)
-    steepest = max(rim_slope(press.circle, ball) for press in presses)
+    steepest, deepest = max(rim_slope(press.circle, ball) for press in presses), deepest_dent(refined, ball)
+    model = partial(forward_model, size=size, steepest=steepest, deepest=deepest / reference.shape[1], shade=shade)
     predictions = tuple(
         _prediction(
             press,
             labels[i],
-            darks[i],
-            _forward_model(all_equations - forward_sets[i], size, steepest, shade),
-            _inverse_model([*inverse_sets[:i], *inverse_sets[i + 1 :]], steepest),
+            besides[i],
+            model(all_equations - forward_sets[i]),
+            inverse_model([*inverse_sets[:i], *inverse_sets[i + 1 :]], steepest),
             mean,
             reference,
         )
@@ -119,11 +134,11 @@ def calibrate_light(
         if len(presses) > 1
     )
     return LightFit(
-        forward=_forward_model(all_equations, size, steepest, shade),
-        inverse=_inverse_model(inverse_sets, steepest),
+        forward=model(all_equations),
+        inverse=inverse_model(inverse_sets, steepest),
         size=size,
         thickness=refined.thickness,
-        radius_uncertainty=refined.radius_uncertainty,
+        radius_uncertainty=refined.radius_uncertainty(),
         unexplained=refined.unexplained,
         predictions=predictions,
         left_out=tuple(left_out),
@@ -187,7 +202,13 @@ def _darkness(
 
 
 def _nothing_left(left_out: Sequence[tuple[str, str]]) -> BadFrames:
-    return BadFrames("no frame can be used. " + "; ".join(f"{name}: {why}" for name, why in left_out))
+    alike: dict[str, list[tuple[str, str]]] = {}
+    for name, why in left_out:
+        alike.setdefault(re.sub(r"\d+", "", why), []).append((name, why))
+    said = (
+        f"{some[0][0]}{f' and {len(some) - 1} more' if len(some) > 1 else ''}: {some[0][1]}" for some in alike.values()
+    )
+    return BadFrames("no frame can be used. " + "; ".join(said))
 
 
 def _check(reference: Image, frames: Sequence[tuple[str, Image]]) -> None:
@@ -239,27 +260,13 @@ def _shaded(
         return presses, refined, None
     windows, circles = [_window(press, SHADED_PIXELS) for press in presses], refined.circles
     shade = find_lamps(windows, circles, refined.thickness, ball, presses[0].shape)
-    sets = [_forward_equations(p, _label(p, refined, ball), _dark(p, refined, ball, shade)) for p in presses]
+    sets = [forward_equations(p, label(p, refined, ball), beside_slopes(p, refined, ball, shade)) for p in presses]
     if not choose_size(sets).shadows:
         return presses, refined, None
     for _ in range(ROUNDS):  # circles tell where the lamps stand, and the lamps where the circles are
         refined = refine(windows, refined.circles, ball, shade, (ball / refined.thickness,))
         shade = find_lamps(windows, refined.circles, refined.thickness, ball, presses[0].shape)
     return [replace(p, circle=c) for p, c in zip(presses, refined.circles, strict=True)], refined, shade
-
-
-def _label(press: BallPress, refined: RefinedGeometry, ball: float) -> Float64:
-    """(H, W, 2) slopes that are taken for the true ones."""
-    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-    return dent_gradient(u, v, press.circle, refined.thickness, ball, RIM_BLUR)
-
-
-def _dark(press: BallPress, refined: RefinedGeometry, ball: float, shade: DentShade | None) -> Float64 | None:
-    """(H, W, terms) of cast shadows."""
-    if shade is None:
-        return None
-    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
-    return shade.terms(u.ravel(), v.ravel(), press.circle, refined.thickness, ball).reshape(*press.shape, -1)
 
 
 def _warnings(presses: Sequence[BallPress], mean: Float64, left_out: int) -> list[str]:
@@ -293,87 +300,40 @@ def _badly_predicted(predictions: Sequence[PressPrediction]) -> list[str]:
     ]
 
 
-def _near(press: BallPress) -> NDArray[np.bool_]:
-    """(H, W) contact and skirt."""
-    return np.asarray(press.distance() < NEAR * press.circle.radius + RIM_MARGIN)
-
-
 def _window(press: BallPress, pixels: int = REFINEMENT_PIXELS) -> Window:
     """Pixels of contact and skirt, thinned out to about so many."""
-    v, u = np.nonzero(_near(press))
+    v, u = np.nonzero(near_contact(press))
     thin = max(1, round(np.sqrt(len(u) / pixels)))
     keep = (u % thin == 0) & (v % thin == 0) & press.lit[v, u].all(axis=1)
     u, v = u[keep], v[keep]
     return Window(u.astype(np.float64), v.astype(np.float64), smooth(press.change, BLUR)[v, u])
 
 
-def _places(mask: NDArray[np.bool_]) -> tuple[Float64, Float64]:
-    """u, v in -1/2..1/2 across the picture of the pixels of a mask (H, W)."""
-    rows, columns = np.nonzero(mask)
-    u, v = place_in_image(mask.shape[1], mask.shape[0])
-    return u[columns], v[rows]
-
-
-def _forward_equations(press: BallPress, gradient: Float64, dark: Float64 | None) -> NormalEquations:
-    near = _near(press)
-    change, shade = smooth(press.change, BLUR)[near], None if dark is None else dark[near]
-    return normal_equations(gradient[near], *_places(near), change, press.lit[near], shade)
-
-
-def _inverse_terms(press: BallPress, where: NDArray[np.bool_]) -> Float64:
-    """(n, terms) of the inverse at the pixels of a mask (H, W)."""
-    u, v = _places(where)
-    return inverse_features(smooth(press.change, INVERSE_BLUR)[where], 2 * u, 2 * v)
-
-
-def _inverse_equations(press: BallPress, gradient: Float64) -> tuple[Float64, Float64]:
-    """Normal equations from contact and skirt, and from a tenth as many untouched pixels, whose slope is 0."""
-    v, u = np.mgrid[: press.shape[0], : press.shape[1]]
-    near, far = _near(press), press.distance() > FAR * press.circle.radius
-    far &= (u + 7 * v) % max(1, round(10 * int(far.sum()) / max(int(near.sum()), 1))) == 0
-    target = np.where(far[..., None], 0.0, to_normal(gradient))
-    terms = _inverse_terms(press, near | far)
-    return terms.T @ terms, terms.T @ target[near | far]
-
-
-def _forward_model(
-    pixels: NormalEquations, size: ModelSize, steepest: float, shade: DentShade | None
-) -> PhotometricModel:
-    weights = tuple((float(r), float(g), float(b)) for r, g, b in solve(pixels, size))
-    light = len(weights) - size.shadows
-    shadows = None
-    if shade is not None and size.shadows:
-        shadows = CastShadows(lamps=shade.lamps, weights=weights[light:])
-    return PhotometricModel(
-        degree=size.degree, position=size.position, weights=weights[:light], steepest=steepest, blur=BLUR,
-        shadows=shadows,
-    )  # fmt: skip
-
-
-def _inverse_model(sets: Sequence[tuple[Float64, Float64]], steepest: float) -> InverseModel:
-    weights = fit_inverse(sets, with_position=len(sets) > FEW_PRESSES)
-    return InverseModel(weights=tuple((float(x), float(y)) for x, y in weights), steepest=steepest)
-
-
 def _prediction(
     press: BallPress,
     gradient: Float64,
-    dark: Float64 | None,
+    beside: Float64,
     forward: PhotometricModel,
     inverse: InverseModel,
     mean: Float64,
     reference: Image,
 ) -> PressPrediction:
-    """Of a press labelled `gradient` (H, W, 2), `dark` (H, W, terms), by models made without it.
-    Slopes are found as in every picture: from each pixel's colour, then made those of a surface."""
+    """Of a press labelled `gradient` (H, W, 2), `beside` (H, W, terms), by models made without it.
+    Slopes are found as in every picture: from each pixel's colour, then those of a surface that the forward model
+    agrees with."""
     places = places_in_image(*press.shape[::-1])
     light, _ = PhotometricLight(forward).change(gradient.astype(np.float32), *places)
     predicted = light.astype(np.float64)
-    if dark is not None and forward.shadows is not None:
-        predicted += dark @ np.array(forward.shadows.weights)
+    if forward.depth is not None:
+        predicted += beside[..., :DEPTH_TERMS] @ np.array(forward.depth.weights)
+    if forward.shadows is not None:
+        predicted += beside[..., DEPTH_TERMS:] @ np.array(forward.shadows.weights)
     predicted = smooth(predicted, BLUR) * mean
     seen = smooth(press.change, INVERSE_BLUR).astype(np.float32)
     slopes, _ = PolynomialSlopes(inverse, *(2 * place.astype(np.float64) for place in places))(seen)
-    found = np.stack(slopes_of(Integrator(press.shape, 1.0)(slopes), 1.0), axis=-1)
+    integrate, nothing = Integrator(press.shape, 1.0), np.zeros(press.shape, dtype=np.bool_)
+    steps = ForwardSteps(forward, *places, 1.0, float(press.shape[1]))
+    height = steps(np.ascontiguousarray(np.moveaxis(seen, -1, 0)), integrate(slopes), nothing, integrate)
+    found = np.stack(slopes_of(height, 1.0), axis=-1)
     angles = normal_angle(to_normal(found.astype(np.float64)), to_normal(gradient))
     return compared(press, predicted, angles, mean, reference)

@@ -24,6 +24,7 @@ BLUR = 1.5  # of images and of the fitted dent, against noise [px]
 WINDOW = 2.0  # half side of what the fit looks at [half widths of the bright patch]
 MIN_RADIUS = 4.0  # of a circle that differs from noise [px]
 MIN_EXPLAINED = 0.7  # share of the difference that a ball's dent must explain
+AT_RIM = 0.98  # contact radius over the largest that a ball can have, from which a larger ball is tried
 
 
 class NoCircle(ValueError):
@@ -45,8 +46,6 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
 
     Raises ValueError when the two images differ in size, NoCircle when no ball's contact is seen.
     """
-    from scipy.optimize import minimize
-
     if image.shape != reference.shape:
         raise ValueError(
             f"the image is {image.shape[1]} x {image.shape[0]} px, the one without contact "
@@ -59,27 +58,44 @@ def contact_circle(image: NDArray[np.uint8], reference: NDArray[np.uint8], ball_
     columns = np.arange(max(round(x) - window, 0), min(round(x) + window + 1, image.shape[1]))
     rows = np.arange(max(round(y) - window, 0), min(round(y) + window + 1, image.shape[0]))
     seen = np.ascontiguousarray(difference[np.ix_(rows, columns)].reshape(-1, 3).T)
+    circle = _fitted(seen, columns, rows, (x, y, size), ball_radius)
+    if circle.explained >= MIN_EXPLAINED and circle.radius >= MIN_RADIUS:
+        return circle
+    if circle.radius > AT_RIM * MAX_RIM_RATIO * ball_radius:
+        larger = _fitted(seen, columns, rows, (x, y, size), 2 * ball_radius)
+        if larger.explained >= MIN_EXPLAINED:
+            raise NoCircle(
+                "the contact is wider than the ball can be: pixel pitch or the ball's radius is wrong (or no ball was "
+                "pressed)"
+            )
+    raise NoCircle(
+        f"no ball's contact is seen: a dent explains {max(circle.explained, 0.0):.0%} of the difference to the image "
+        f"without contact, {MIN_EXPLAINED:.0%} are needed"
+    )
+
+
+def _fitted(
+    seen: Float64, columns: NDArray[np.intp], rows: NDArray[np.intp], start: tuple[float, float, float], ball: float
+) -> Circle:
+    """The circle that explains best what is `seen` (3, n) in a window; `start`: x, y, radius, about [px]."""
+    from scipy.optimize import minimize
+
     power = float((seen**2).sum()), float(((seen - seen.mean(axis=1, keepdims=True)) ** 2).sum())
-    largest = MAX_RIM_RATIO * ball_radius
+    largest = MAX_RIM_RATIO * ball
 
     def unexplained(guess: Float64) -> float:
         if not MIN_RADIUS / 2 < guess[2] < largest:
             return 2.0
-        return _unexplained(seen, power, columns - guess[0], rows - guess[1], float(guess[2]), ball_radius)
+        return _unexplained(seen, power, columns - guess[0], rows - guess[1], float(guess[2]), ball)
 
-    start = np.array([x, y, min(size, 0.95 * largest)])
-    simplex = start + np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, -0.15 * start[2]]])
+    x, y, size = start
+    first = np.array([x, y, min(size, 0.95 * largest)])
+    simplex = first + np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, -0.15 * first[2]]])
     found = minimize(
-        unexplained, start, method="Nelder-Mead",
+        unexplained, first, method="Nelder-Mead",
         options={"xatol": 0.02, "fatol": 1e-7, "maxiter": 400, "initial_simplex": simplex},
     )  # fmt: skip
-    explained = 1.0 - float(found.fun)
-    if explained < MIN_EXPLAINED or found.x[2] < MIN_RADIUS:
-        raise NoCircle(
-            f"no ball's contact is seen: a dent explains {max(explained, 0.0):.0%} of the difference to the image "
-            f"without contact, {MIN_EXPLAINED:.0%} are needed"
-        )
-    return Circle(float(found.x[0]), float(found.x[1]), float(found.x[2]), explained)
+    return Circle(float(found.x[0]), float(found.x[1]), float(found.x[2]), 1.0 - float(found.fun))
 
 
 def _blurred(image: Float64) -> Float64:

@@ -26,6 +26,7 @@ MAX_RIM_RATIO = 0.98  # contact radius over ball radius; the slope is infinite a
 POISSON = 0.48  # of silicone; between 0.45 and 0.495 the slope changes by 2 % of that at the circle
 FAR = 6.0  # up to which a dent is followed [ball radii]
 STEP = 0.25  # of the radii at which a blurred slope is found [px]
+DEPTH_STEP = 1.0  # of those at which the depth is found [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,10 +120,16 @@ def depth_profile(radii: Float64, contact: float, ball: float, thickness: float)
     return np.asarray(depth[-1] - depth, dtype=np.float64)
 
 
+@functools.lru_cache(maxsize=64)
+def whole_profile(contact: float, ball: float, thickness: float) -> tuple[Float64, Float64]:
+    """Radii up to FAR ball radii and the depth of a dent there [px]; for everybody, not to be written to."""
+    radii = np.arange(0.0, FAR * ball, DEPTH_STEP)
+    return radii, depth_profile(radii, contact, ball, thickness)
+
+
 def dent_height(u: Float64, v: Float64, circle: ContactCircle, thickness: float, ball: float) -> Float64:
     """(...,) height (into the gel) of that dent at pixels u, v (...,) [px]; 0 at FAR ball radii."""
-    radii = np.arange(0.0, FAR * ball, STEP)
-    depth = depth_profile(radii, circle.radius, ball, thickness)
+    radii, depth = whole_profile(circle.radius, ball, thickness)
     return np.asarray(np.interp(np.hypot(u - circle.x, v - circle.y), radii, depth), dtype=np.float64)
 
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacsim.models.photometric import normal_terms, position_terms, term_count
+from tacsim.models.photometric import DEPTH_TERMS, normal_terms, position_terms, term_count
 
 Float64 = NDArray[np.float64]
 
@@ -26,6 +26,7 @@ FEW_RIDGE = 1e-3
 CHUNK = 16384  # pixels that are summed at a time: fewer wake the threads of BLAS too often, more leave the cache
 MIN_IMPROVEMENT = 0.98  # factor of the left-out error that a larger model must reach
 SHADOW_IMPROVEMENT = 0.93  # the same of a model with cast shadows
+DEPTH_IMPROVEMENT = 0.99  # the same of one that knows the depth, which is known with few terms
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +36,18 @@ class ModelSize:
     degree: int
     position: int
     ridge: float
+    depth: int = 0  # terms of the depth
     shadows: int = 0  # terms of cast shadows
 
     @property
     def terms(self) -> int:
-        return term_count(self.degree, self.position) + self.shadows
+        return term_count(self.degree, self.position) + self.depth + self.shadows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one press for the terms of LARGEST, and those of cast shadows after them. Each channel has
-    its own where pixels are saturated in one and not in another."""
+    """Normal equations of one press for the terms of LARGEST, and after them those of depth and of cast shadows. Each
+    channel has its own where pixels are saturated in one and not in another."""
 
     square: Float64  # (1, terms, terms) of all channels, or (3, terms, terms)
     right: Float64  # (terms, 3)
@@ -78,28 +80,28 @@ def normal_equations(
     v: Float64,
     change: Float64,
     lit: NDArray[np.bool_] | None = None,
-    shade: Float64 | None = None,
+    beside: Float64 | None = None,
 ) -> NormalEquations:
     """Of n pixels: slopes (n, 2), places (n,), relative changes of colour (n, 3); `lit` (n, 3): what is not saturated,
-    and counts; None: all; `shade` (n, terms) of cast shadows; None: there are none."""
-    dark = np.zeros((len(u), 0)) if shade is None else shade
+    and counts; None: all; `beside` (n, terms): of depth and cast shadows; None: there are none."""
+    more = np.zeros((len(u), 0)) if beside is None else beside
     if lit is None or lit.all():
-        square, right = _all_sums(gradient, u, v, change, dark)
+        square, right = _all_sums(gradient, u, v, change, more)
         return NormalEquations(square[None], right, float((change**2).sum()), change.size)
     counted = change * lit
-    square, right = _all_sums(gradient, u, v, counted, dark)
+    square, right = _all_sums(gradient, u, v, counted, more)
     squares = []
     for saturated in (~lit).T:
-        lost, _ = _all_sums(gradient[saturated], u[saturated], v[saturated], counted[saturated], dark[saturated])
+        lost, _ = _all_sums(gradient[saturated], u[saturated], v[saturated], counted[saturated], more[saturated])
         squares.append(square - lost)
     return NormalEquations(np.stack(squares), right, float((counted**2).sum()), int(lit.sum()))
 
 
-def _all_sums(gradient: Float64, u: Float64, v: Float64, change: Float64, shade: Float64) -> tuple[Float64, Float64]:
-    """G^T G and G^T `change` for G, the features of :func:`_sums` and beside them `shade` (n, terms)."""
-    square, right = _sums(gradient, u, v, np.concatenate([change, shade], axis=1))
+def _all_sums(gradient: Float64, u: Float64, v: Float64, change: Float64, beside: Float64) -> tuple[Float64, Float64]:
+    """G^T G and G^T `change` for G, the features of :func:`_sums` and beside them others (n, terms)."""
+    square, right = _sums(gradient, u, v, np.concatenate([change, beside], axis=1))
     light, across = right[:, : change.shape[1]], right[:, change.shape[1] :]
-    return np.block([[square, across], [across.T, shade.T @ shade]]), np.concatenate([light, shade.T @ change])
+    return np.block([[square, across], [across.T, beside.T @ beside]]), np.concatenate([light, beside.T @ change])
 
 
 def _sums(gradient: Float64, u: Float64, v: Float64, change: Float64) -> tuple[Float64, Float64]:
@@ -186,14 +188,19 @@ def left_out_error(presses: Sequence[NormalEquations], ridge: float) -> float:
 def choose_size(presses: Sequence[NormalEquations]) -> ModelSize:
     """Up to FEW_PRESSES a cubic that is the same everywhere. With more, the smallest model to which no larger one
     is clearly better at predicting left-out presses, each with its best ridge. Cast shadows, where they are among the
-    terms, are taken if they make it better by far."""
+    terms, are taken if they make it better by far; depth if they are, if it makes it better."""
     if len(presses) <= FEW_PRESSES:
         return ModelSize(3, 0, FEW_RIDGE)
     error, size = _best_size(presses, 0)
-    shadows = len(presses[0].right) - term_count(*LARGEST)
+    depth = min(len(presses[0].right) - term_count(*LARGEST), DEPTH_TERMS)
+    shadows = len(presses[0].right) - term_count(*LARGEST) - depth
     if shadows:
         other_error, other = _best_size(presses, shadows)
         if other_error < SHADOW_IMPROVEMENT * error:
+            error, size = other_error, other
+    if depth:
+        other_error, other = _best_ridge(presses, replace(size, depth=depth))
+        if other_error < DEPTH_IMPROVEMENT * error:
             return other
     return size
 
@@ -202,14 +209,19 @@ def _best_size(presses: Sequence[NormalEquations], shadows: int) -> tuple[float,
     """The left-out error of the best size with so many terms of shadows, and that size."""
     best: tuple[float, ModelSize] | None = None
     for degree, position in sorted(SIZES, key=lambda size: term_count(*size)):
-        use = _terms_of(ModelSize(degree, position, RIDGES[0], shadows))
-        parts = [_part(press, use) for press in presses]
-        error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
-        size = ModelSize(degree, position, ridge, shadows)
+        error, size = _best_ridge(presses, ModelSize(degree, position, RIDGES[0], shadows=shadows))
         if best is None or error < MIN_IMPROVEMENT * best[0]:
             best = (error, size)
     assert best is not None
     return best
+
+
+def _best_ridge(presses: Sequence[NormalEquations], size: ModelSize) -> tuple[float, ModelSize]:
+    """The left-out error of a size with its best ridge, and that size."""
+    use = _terms_of(size)
+    parts = [_part(press, use) for press in presses]
+    error, ridge = min((left_out_error(parts, ridge), ridge) for ridge in RIDGES)
+    return error, replace(size, ridge=ridge)
 
 
 def _part(of: NormalEquations, use: list[int]) -> NormalEquations:
@@ -221,5 +233,9 @@ def _terms_of(size: ModelSize) -> list[int]:
     """Where the terms of `size` stand among those of LARGEST."""
     normals, all_normals = term_count(size.degree, 0), term_count(LARGEST[0], 0)
     places = term_count(1, size.position) // term_count(1, 0)
-    dark = range(term_count(*LARGEST), term_count(*LARGEST) + size.shadows)
-    return [*(place * all_normals + term for place in range(places) for term in range(normals)), *dark]
+    deep, dark = term_count(*LARGEST), term_count(*LARGEST) + DEPTH_TERMS
+    return [
+        *(place * all_normals + term for place in range(places) for term in range(normals)),
+        *range(deep, deep + size.depth),
+        *range(dark, dark + size.shadows),
+    ]

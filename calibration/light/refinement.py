@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient
+from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
 from calibration.light.photometry import features
 from calibration.light.press import Window
 from calibration.light.shadows import DentShade
@@ -41,7 +41,25 @@ class RefinedGeometry:
     circles: tuple[ContactCircle, ...]
     thickness: float  # of the gel, as its skirts tell it [px]; above two ball radii it hardly matters
     unexplained: tuple[float, ...]  # share of the power of each press's change of colour
-    radius_uncertainty: float  # of the scale of all radii together [-]; NaN for a single press
+    _ends: tuple[_Problem, ...]  # what each start led to, the best first
+
+    def radius_uncertainty(self) -> float:
+        """Standard deviation of the scale of all radii together [-]: by leaving out one group of presses after the
+        other (the jackknife), or what another solution as good says differently, if that is more. NaN for a single
+        press."""
+        best, *others = self._ends
+        count = len(best.circles)
+        if count < 2:
+            return float("nan")
+        groups = min(count, MAX_GROUPS)
+        scales = []
+        for group in range(groups):
+            kept = [i for i in range(count) if i % groups != group]
+            refined = _descended(best.part(kept).solved())
+            scales.append(_scale(refined, best.part(kept)))
+        spread = np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2))
+        rivals = [abs(_scale(other, best)) for other in others if other.cost < RIVAL * best.cost]
+        return float(max([spread, *rivals]))
 
 
 def refine(
@@ -63,7 +81,7 @@ def refine(
     best = ends[0]
     powers = [float((window.change**2).sum()) for window in windows]
     shares = tuple(part / max(power, 1e-300) for part, power in zip(best.part_costs(), powers, strict=True))
-    return RefinedGeometry(best.circles, ball / best.thinness, shares, _radius_uncertainty(best, ends[1:]))
+    return RefinedGeometry(best.circles, ball / best.thinness, shares, tuple(ends))
 
 
 def _descended(state: _Problem) -> _Problem:
@@ -84,23 +102,6 @@ def _descended(state: _Problem) -> _Problem:
         if gain < MIN_GAIN:
             break
     return state
-
-
-def _radius_uncertainty(best: _Problem, others: Sequence[_Problem]) -> float:
-    """Standard deviation of the scale of all radii [-]: by leaving out one group of presses after the other (the
-    jackknife), or what another solution as good says differently, if that is more."""
-    count = len(best.circles)
-    if count < 2:
-        return float("nan")
-    groups = min(count, MAX_GROUPS)
-    scales = []
-    for group in range(groups):
-        kept = [i for i in range(count) if i % groups != group]
-        refined = _descended(best.part(kept).solved())
-        scales.append(_scale(refined, best.part(kept)))
-    spread = np.sqrt((groups - 1) / groups * np.sum((np.array(scales) - np.mean(scales)) ** 2))
-    rivals = [abs(_scale(other, best)) for other in others if other.cost < RIVAL * best.cost]
-    return float(max([spread, *rivals]))
 
 
 def _scale(one: _Problem, other: _Problem) -> float:
@@ -184,7 +185,9 @@ class _Problem:
         window = self.windows[i]
         thickness = self.ball / thinness
         gradient = dent_gradient(window.u, window.v, circle, thickness, self.ball, RIM_BLUR)
+        # colour that goes with the depth would else be explained by circles that are too large, and beside the contact
+        depth = dent_height(window.u, window.v, circle, thickness, self.ball)[:, None] / self.ball
         if self.shade is None:
-            return features(gradient, window.u, window.v, DEGREE, 0)
+            return np.concatenate([features(gradient, window.u, window.v, DEGREE, 0), depth], axis=1)
         dark = self.shade.terms(window.u, window.v, circle, thickness, self.ball)
-        return np.concatenate([self.shade.light(gradient, window.u, window.v), dark], axis=1)
+        return np.concatenate([self.shade.light(gradient, window.u, window.v), depth, dark], axis=1)

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.light.dent import contact_depth
 from calibration.light.fit import LightFit
 from tacsim.models.photometric import PhotometricLight, PhotometricModel
 
 Word = Literal["good", "usable", "do not trust"]
+Image = NDArray[np.uint8]
+
+GREY = "the pictures are grey"
 
 MIN_PRESSES, ENOUGH_PRESSES = 3, 5
 # Means over all presses, each predicted by the others: up to the first good, beyond the second not to be trusted
@@ -66,10 +70,21 @@ class KnownScale:
     gel_thickness: float | None = None  # [m]
     depths: tuple[tuple[str, float], ...] = ()  # frames whose indentation is known [m]
 
+    @property
+    def unchecked(self) -> str:
+        """In words, that ball and pitch are taken as they were given; "" where something else is known."""
+        if self.gel_size is not None or self.depths:
+            return ""
+        return "nothing checks the lengths that were given (ball, pixel pitch): a press of known depth would, --depth"
 
-def judge(fit: LightFit, scale: KnownScale) -> Verdict:
-    """All findings, the worst first."""
+
+def judge(fit: LightFit, scale: KnownScale, *, dots: bool = False) -> Verdict:
+    """All findings, the worst first. `dots` are seen on the gel, and were not told."""
     found = [*_of_presses(fit), *_of_pictures(fit), *_of_scale(fit, scale)]
+    if dots:  # a rig refuses such a bundle
+        found.insert(
+            0, Finding("do not trust", "dots are printed on the gel, and each will pass for a dent", "give --markers")
+        )
     found += [Finding("usable", *_split(warning)) for warning in fit.warnings]
     return Verdict(tuple(sorted(found, key=lambda finding: finding.word != "do not trust")))
 
@@ -79,7 +94,10 @@ def _of_presses(fit: LightFit) -> Iterable[Finding]:
     if count < ENOUGH_PRESSES:
         # depth needs one table, which one press gives; slopes need colours of all directions everywhere
         word: Word = "do not trust" if count < MIN_PRESSES and fit.darkness is None else "usable"
-        yield Finding(word, f"{count} press{'es' * (count > 1)} could be used", "press five at least, eight are good")
+        todo = "press five at least, eight are good"
+        if fit.darkness is not None:
+            todo = "that gives the table of darkness, five presses tell whether it holds"
+        yield Finding(word, f"{count} press{'es' * (count > 1)} could be used", todo)
     yield from _beyond(
         RADIUS, fit.radius_uncertainty, "the contact radii are uncertain by {:.0%}",
         "press more often and deeper; is each picture of one ball, held still?",
@@ -91,6 +109,11 @@ def _of_presses(fit: LightFit) -> Iterable[Finding]:
 
 def _of_pictures(fit: LightFit) -> Iterable[Finding]:
     unexplained = float(np.mean(fit.unexplained))
+    if fit.forward is not None and is_grey(fit.reference):
+        yield Finding(
+            "do not trust", f"{GREY}, and one number a pixel cannot tell slopes of two directions",
+            "calibrate from the camera's own pictures, in colour",
+        )  # fmt: skip
     if fit.forward is not None and undirected(fit.forward):
         yield Finding(
             "do not trust", "this light tells no direction: all flanks of a dent change alike",
@@ -128,8 +151,8 @@ def _of_scale(fit: LightFit, scale: KnownScale) -> Iterable[Finding]:
         yield Finding("usable", f"the contact of {_names(wide)} is as wide as the ball", "look at it, and leave it out")
     elif max(ratios) < NARROWEST:
         yield Finding(
-            "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, or a diameter given for "
-            "the radius", "measure the ball; press as deep as the work will",
+            "usable", f"no contact is wider than {max(ratios):.2f} of the ball: light presses, a diameter given for "
+            "the radius, or too small a pixel pitch", "measure ball and pitch; press as deep as the work will",
         )  # fmt: skip
     if scale.gel_size is not None:
         rows, columns, _ = fit.reference.shape
@@ -181,6 +204,11 @@ def _beyond(limits: tuple[float, float], value: float, what: str, todo: str) -> 
     """A finding where `value` passes the first limit; NaN is nothing."""
     if value > limits[0]:
         yield Finding("do not trust" if value > limits[1] else "usable", what.format(value), todo)
+
+
+def is_grey(image: Image) -> bool:
+    """True for a picture (H, W, 3) whose colours are all alike."""
+    return bool((image == image[..., :1]).all())
 
 
 def undirected(model: PhotometricModel) -> bool:

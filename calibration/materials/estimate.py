@@ -1,9 +1,8 @@
 """Least squares of a simulation against recorded presses: values, intervals, and what the data do not tell.
 
-Unknowns are the parameters of the materials, and for each press two nuisances that every rig has: the place of its
-sensor is off by a little along the closing direction, and the zero of its force sensor is off. These have a standard
-deviation given beforehand (a row of the system each). Gauss-Newton with Levenberg's damping: a whole Jacobian costs one
-batch of perturbed simulations.
+Unknowns are the parameters of the materials, and for each press two nuisances that every rig has: its place is off by a
+little along the closing direction, and so is the zero of its force. These have a standard deviation given beforehand.
+Gauss-Newton with Levenberg's damping: a whole Jacobian costs one batch of perturbed simulations.
 
 A coarse simulation finds the way; a finer one, run at the estimate, says by how much the coarse one is wrong there
 (space mapping: Bandler et al. 1994). How far that moved the estimate tells what is left of the mesh's error.
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from calibration.errors import CalibrationError
-from calibration.materials.parameters import Parameter, starts
+from calibration.materials.covariance import covariance_of
+from calibration.materials.parameters import Parameter, begins, starts
 from tacsim.interface import FloatArray
 
 DIFFERENCE = 0.08  # step of a free number for its column of the Jacobian; simulations are exact to some 1e-3
@@ -29,11 +29,9 @@ MOST_STEPS, FEWER_STEPS, MOST_FINE = 12, 2, 4
 SMALL_GAIN = 0.2  # of the sum of squares: the noise alone gives it a standard deviation of more than one
 SMALL_SHARE = 0.01  # of the sum of squares, where a coarse mesh keeps it large
 SMALL_SPREAD = 0.3  # of their standard deviations, likewise
-SMALL_STEP = 0.01  # of the free numbers: the finer mesh changes nothing more
+SMALL_STEP = 0.01  # of the free numbers, likewise where all is told well
 UNTOLD = 0.6  # an interval of a free number that reaches farther each way tells nothing: a factor of 1.8
-HELD = 0.5  # standard deviation of a free number that is held where it was, as far as the others' intervals go
 HOPELESS = 5.0  # an interval that reaches so far at the start: there is no use in looking for it
-UNKNOWN = 100.0  # standard deviation of a free number of which nothing is known
 COARSE_ERROR = 0.05  # of a coarse simulation, where no fine one says better: share of the signal
 SETTLED_ERROR = 0.01  # of any simulation: what its settling leaves
 MESH_LEFT = 0.5  # standard deviation of what is left of the mesh's error, over what the finer mesh changed
@@ -98,7 +96,7 @@ class Fit:
     held: NDArray[np.bool_]  # (p,) those that the data do not tell: they stayed at their start
     free: FloatArray  # (p,)
     covariance: FloatArray  # (p, p) of the free numbers, with what the mesh, and those held, may be off
-    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them
+    mesh_shift: FloatArray  # (p,) how far the finer mesh moved them, or what it changed press by press
     predicted: FloatArray  # (m,) with the zeros of the force
     sigma: FloatArray  # (m,) standard deviations that weighed: noise, and what the simulation is off
     system: FloatArray  # (m, n)
@@ -146,24 +144,6 @@ class Fit:
 
     def _index(self, name: str) -> int:
         return [each.name for each in self.parameters].index(name)
-
-
-def covariance_of(
-    system: FloatArray, sigma: FloatArray, priors: FloatArray, held: NDArray[np.bool_], spread: float = HELD
-) -> FloatArray:
-    """(n, n) of all unknowns, from the system (m, n), whose last columns have `priors`. Parameters that are held have
-    no variance themselves; `spread` is what they may be off, as far as the others go."""
-    p, n = len(held), system.shape[1]
-    free = np.concatenate([~held, np.ones(n - p, np.bool_)])
-    known = np.concatenate([np.full(p, UNKNOWN), priors])[free]
-    rows = system / sigma[:, None]
-    scaled = rows[:, free] * known  # by what is known beforehand: then the information is never singular
-    found = np.zeros((n, n))
-    found[np.ix_(free, free)] = np.linalg.inv(scaled.T @ scaled + np.eye(len(known))) * np.outer(known, known)
-    for index in np.flatnonzero(held):
-        moved = found @ (rows.T @ rows[:, index])
-        found = found + spread**2 * np.outer(moved, moved)
-    return found
 
 
 @dataclass(slots=True, eq=False)
@@ -244,6 +224,12 @@ class _Fitter:
         found: FloatArray = np.linalg.lstsq(whole, right, rcond=1e-12)[0]
         return found
 
+    def small(self, state: _State, step: FloatArray, least: float) -> bool:
+        """Whether a step changes no free number by more than `least`, or than a part of its standard deviation."""
+        p = len(self.held)
+        spread = np.sqrt(np.diag(covariance_of(state.system, self.sigma, self.priors, self.held, 0.0))[:p])
+        return bool((np.abs(step[:p]) < np.maximum(least, SMALL_SPREAD * spread)).all())
+
     def moved(self, state: _State, step: FloatArray) -> tuple[Point, FloatArray]:
         """Point and zeros after a step, within the bounds."""
         p, t = len(self.held), self.signals.presses
@@ -300,16 +286,21 @@ def estimate(
     first (`Fit.untold`). Raises NotIdentified when nothing is told, CannotSimulate when no smaller step helps.
     """
     fitter = _Fitter(signals, parameters, priors)
-    begin = Point(starts(parameters), np.zeros(signals.presses))
+    begin = Point(begins(parameters), np.zeros(signals.presses))
     on_step("first run")
     state = fitter.linearise(levels[0], begin, np.zeros(fitter.zero_columns.shape[1]))
     while fitter.hold(state, fitter.reach(state), HOPELESS):
         pass
+    kept = np.where(fitter.held, starts(parameters), begin.free)
+    if (kept != begin.free).any():
+        state = fitter.linearise(levels[0], replace(begin, free=kept), state.zeros)
     state = _coarse(fitter, levels[0], state, coarse_error, on_step, secant=len(levels) > 2)
     for level in levels[1:-1]:
         on_step("next mesh")
-        state = fitter.linearise(level, state.point, state.zeros)
-        state = fitter.stepped(_coarse(fitter, level, state, coarse_error / 2, on_step, FEWER_STEPS))
+        found = fitter.linearise(level, state.point, state.zeros)
+        state = _brought_back(fitter, level, found)
+        most = FEWER_STEPS if state is found else 2 * FEWER_STEPS
+        state = fitter.stepped(_coarse(fitter, level, state, coarse_error / 2, on_step, most))
     while fitter.hold(state, fitter.reach(state), UNTOLD):
         state = fitter.stepped(state)
     while True:
@@ -318,6 +309,17 @@ def estimate(
         if not fitter.hold(state, np.array([plain.half(each.name) for each in parameters]), UNTOLD):
             return fit
         state = fitter.stepped(state)
+
+
+def _brought_back(fitter: _Fitter, predict: Predict, state: _State) -> _State:
+    """The state, with parameters that nothing tells there (friction at which nothing slips) back where they began if
+    that tells them: a step went too far."""
+    begun, lost = begins(fitter.parameters), ~fitter.held & (fitter.reach(state) > UNTOLD)
+    if not (lost & (state.point.free != begun)).any():
+        return state
+    point = replace(state.point, free=np.where(lost, begun, state.point.free))
+    back = fitter.linearise(predict, point, state.zeros)
+    return back if (fitter.reach(back)[lost] <= UNTOLD).any() else state
 
 
 def _coarse(
@@ -334,9 +336,12 @@ def _coarse(
     damping = 1e-3
     for count in range(most):
         fitter.sigma = np.hypot(fitter.signals.noise, error * np.abs(state.predicted))
+        step = fitter.step(state, damping)
+        if fitter.small(state, step, error / 2):
+            break
         on_step(f"step {count + 1}")
         try:
-            point, zeros = fitter.moved(state, fitter.step(state, damping))
+            point, zeros = fitter.moved(state, step)
             after = fitter.secant(predict, state, point, zeros) if secant else fitter.linearise(predict, point, zeros)
         except CannotSimulate:
             if count + 1 == most:
@@ -363,13 +368,12 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         on_step(f"finer mesh, run {count + 1}")
         exact = fitter.run(fine, [state.point])[0]
         if count == 0:
-            off = np.abs(exact - coarse)
+            off = exact - coarse
         noise, settled = fitter.signals.noise, SETTLED_ERROR * np.abs(exact)
         fitter.sigma = np.sqrt(noise**2 + settled**2 + (MESH_LEFT * off) ** 2)
         here = _State(state.point, state.zeros, exact, state.system)
         state = fitter.stepped(here)
-        spread = np.diag(covariance_of(state.system, fitter.sigma, fitter.priors, fitter.held, 0.0))[:p]
-        if (np.abs(state.point.free - here.point.free) < np.maximum(SMALL_STEP, SMALL_SPREAD * np.sqrt(spread))).all():
+        if fitter.small(here, state.point.free - here.point.free, SMALL_STEP):
             break
     shift = state.point.free - begun
     fit = Fit(
@@ -386,5 +390,10 @@ def _refined(fitter: _Fitter, state: _State, fine: Predict | None, on_step: Call
         runs=fitter.runs,
     )
     scatter = float(((fitter.residual(state) / fitter.sigma) ** 2).sum() / fit.freedom)
+    if fine is not None:
+        # What each press and channel is off may cancel in this sum, and not in that of what is left of it.
+        rows = np.unique(np.stack([fitter.signals.press, fitter.signals.channel]), axis=1, return_inverse=True)[1]
+        apart = [fit.influence(np.where(rows.ravel() == k, off, 0.0)) for k in range(rows.max() + 1)]
+        fit = replace(fit, mesh_shift=np.maximum(np.abs(shift), np.sqrt(np.square(apart).sum(axis=0))))
     noisier = fit.with_sigma(fitter.sigma * max(1.0, np.sqrt(scatter)))
     return replace(fit, covariance=noisier.covariance)

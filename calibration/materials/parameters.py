@@ -27,6 +27,7 @@ class Parameter:
     high: float
     kind: Literal["log", "volume", "linear"] = "log"
     unit: float = 1.0
+    begin: float | None = None  # where a fit begins, if not at the start, where it stays if nothing tells it
 
     def free(self, value: float) -> float:
         if self.kind == "log":
@@ -52,5 +53,10 @@ class Parameter:
 
 
 def starts(parameters: Sequence[Parameter]) -> FloatArray:
-    """The free numbers to begin with."""
+    """The free numbers at which what is not told stays."""
     return np.array([each.free(each.start) for each in parameters])
+
+
+def begins(parameters: Sequence[Parameter]) -> FloatArray:
+    """The free numbers at which a fit begins."""
+    return np.array([each.free(each.start if each.begin is None else each.begin) for each in parameters])

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from calibration.materials.estimate import Signals
 from tacsim.interface import FloatArray, Pose
+from tacsim.pose import difference
 
 Quantity = Literal["force", "dent", "width", "slip"]
 QUANTITY: dict[str, Quantity] = {
     "fx": "force", "fy": "force", "fz": "force", "dent": "dent", "width": "width", "slip_x": "slip", "slip_y": "slip",
 }  # fmt: skip
+ARM = 5e-3  # about half a gel: from its middle to its edge [m]
 STILL = 1e-6  # parts that move less are in the same place [m]
 CORNER = np.cos(np.radians(20.0))  # of the directions of two steps: beyond, a path turns
 
@@ -33,8 +35,9 @@ class Press:
 
     @property
     def places(self) -> FloatArray:
-        """(n, 3 k) where the parts are [m]."""
-        return np.hstack([np.array([pose.position for pose in poses]) for poses in self.poses.values()])
+        """(n, 6 k) where the k parts are, and how far they have turned: rotation vectors times ARM [m]."""
+        turned = [[ARM * difference(poses[0], pose)[3:] for pose in poses] for poses in self.poses.values()]
+        return np.hstack([*([pose.position for pose in poses] for poses in self.poses.values()), *turned])
 
     def at(self, moments: Sequence[int]) -> Press:
         """Only these moments."""

@@ -33,7 +33,7 @@ class TacsimRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type | tuple[int, ...]]:
-        return self._rig.observation_features
+        return dict(self._rig.observation_features)
 
     @property
     def action_features(self) -> dict[str, type]:

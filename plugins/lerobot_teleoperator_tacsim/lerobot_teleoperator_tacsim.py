@@ -38,7 +38,7 @@ class TacsimTeleoperator(Teleoperator):
         known = TeleoperatorConfig.get_known_choices()
         if config.device not in known:
             raise ValueError(f"no teleoperator '{config.device}'; there are {', '.join(sorted(known))}")
-        self._device = make_teleoperator_from_config(known[config.device]())
+        self._device: Any = make_teleoperator_from_config(known[config.device]())
 
     @property
     def action_features(self) -> dict[str, type]:
@@ -46,15 +46,15 @@ class TacsimTeleoperator(Teleoperator):
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        return self._device.feedback_features
+        return dict(self._device.feedback_features)
 
     @property
     def is_connected(self) -> bool:
-        return self._device.is_connected
+        return bool(self._device.is_connected)
 
     @property
     def is_calibrated(self) -> bool:
-        return self._device.is_calibrated
+        return bool(self._device.is_calibrated)
 
     def connect(self, calibrate: bool = True) -> None:
         self._jog.reset()

@@ -110,12 +110,12 @@ def braking(now: MotionState, deceleration: float, turn_deceleration: float, per
     return MotionState(now.position + velocity * period, turn(spin * period) @ now.rotation, velocity, spin)
 
 
-def stopping_point(motion: MotionState, deceleration: float, period: float = PERIOD) -> FloatArray:
+def stopping_point(motion: MotionState, deceleration: float) -> FloatArray:
     """(3,) where the origin comes to rest when it brakes from now on [m]."""
     speed = math.sqrt(float(motion.velocity @ motion.velocity))
     if speed == 0.0:
         return motion.position
-    point: FloatArray = motion.position + motion.velocity * (stopping_distance(speed, deceleration, period) / speed)
+    point: FloatArray = motion.position + motion.velocity * (stopping_distance(speed, deceleration) / speed)
     return point
 
 

@@ -32,7 +32,7 @@ from robot.arm.start_servo import StartServo
 from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.common.kinematics import Kinematics, displacement, matrix
-from robot.common.process import Parent
+from robot.common.process import Lifeline, Parent
 from robot.common.realtime import WORKER, ask_for_realtime
 from robot.errors import DeviceBusyError, DeviceError, DeviceNotConnectedError
 from tacsim.interface import FloatArray
@@ -80,6 +80,7 @@ class Worker:
         self.servo = servo(config, commands_read=self.channel.commands.count, tactile_read=self.channel.tactile.count)
         self._periods = np.full(WINDOW, PERIOD)
         self._limit = TimeLimit(config.link_timeout + MARGIN)  # of calls into the library
+        self._driver = Lifeline(config.parent)  # opens a file: not once it is connected
         self._last = 0.0  # when the last period ended
         self._rereads = 0  # of the same package
         self._refused = 0  # periods since the controller refused a command; 0: it did not
@@ -199,7 +200,7 @@ class Worker:
                 self._rereads = 0 if self._read() else self._rereads + 1
                 connected = self.receive.isConnected() and self.control.isConnected()
             self._publish(self.servo.status)
-            orphan = os.getppid() != self.config.parent
+            orphan = self._driver.cut()
             now = time.monotonic()
             # Periods count, not time: a process that was suspended reads again first, packages may be waiting.
             blind = self._rereads > BLIND

@@ -123,12 +123,6 @@ class Camera(Closing):
             return self._stamp
 
     @property
-    def image_number(self) -> int | None:
-        """Number of the pushed picture that the newest frame shows; None without stamps."""
-        with self._changed:
-            return None if self._stamp is None else self._stamp.image
-
-    @property
     def status(self) -> CameraStatus:
         """The present state."""
         with self._changed:

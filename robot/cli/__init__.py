@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from typing import Annotated
 
 import typer
@@ -100,4 +101,7 @@ def main() -> None:
     """Entry point of the `tacsim` command."""
     # What is imported stays: to look through it every 700 new objects takes a tenth of a short command's time.
     gc.set_threshold(100_000, 20, 20)
+    # Our matrices are small: on a busy machine several threads wait for one another, spinning, and a calibration takes
+    # three times the processor time. NumPy is not loaded yet.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()

@@ -124,21 +124,34 @@ def _is_scene(a: str) -> bool:
 
 def _simulate_presses(name: str, truth: FrameSet, bundle: Path | None, overrides: list[str]) -> FrameSet:
     """A's frames by the simulator."""
-    from calibration.bundle import read_sensor_model
+    from calibration.bundle import read_bundle, read_sensor_model
     from calibration.errors import BadFrames
     from tacsim.config import load_scene
+    from tacsim.config.gel import fit_gel, says_gel_size
+    from tacsim.models.scene import Sphere
     from tacsim.models.sensor import CanonicalGrid
 
     if bundle is None:
         raise BadFrames("a scene is seen through the light of B: give B's calibration (--calibration-b)")
-    scene = load_scene(name, ["preset=standard", *overrides])
+    settings, sensor = ["preset=standard", *overrides], read_sensor_model(bundle)
+    own = name == "press" and not any(text.startswith("indenter.geometry") for text in overrides)
+    if own:
+        settings.append(f"indenter.geometry.radius={read_bundle(bundle)[0].provenance.ball_radius} m")
+    scene = load_scene(name, settings)
+    given = any(says_gel_size(text.partition("=")[0].split(".")) for text in overrides)
+    scene, said = fit_gel(scene, {"of B": sensor}, given=given)
+    if scene.indenter is not None and isinstance(ball := scene.indenter.geometry, Sphere):
+        words = ", as in the calibration; for another --set 'indenter.geometry.radius=3 mm'" if own else ""
+        said = [f"a ball of {ball.radius * 1e3:.4g} mm radius{words}", *said]
+    for words in said:
+        notes.print(words, markup=False)
     notes.print("pressing (the first run compiles the kernels, up to half a minute)")
     from robot.studies.matched_press import match_presses
 
     with counted("pressing") as on_press:
-        metric = read_sensor_model(bundle).model_copy(update={"view": None})
-        made, said = match_presses(truth, scene, metric, CanonicalGrid(), on_press)
-    return replace(made, notes=tuple(said))
+        metric = sensor.model_copy(update={"view": None})
+        made, failed = match_presses(truth, scene, metric, CanonicalGrid(), on_press)
+    return replace(made, notes=tuple(failed))
 
 
 def _rectify_corners(
@@ -224,7 +237,9 @@ def _show(result: Comparison, report: Report | None) -> None:
         for metric, overall in rows(result)
     )  # fmt: skip
     columns = ("metric", "unit", " against ".join(result.names), "95 % interval", "null", "floor", "than null")
-    show_table(f"{len(result.pairs)} pairs", columns, overall_rows, left={0, 1}, width=width)
+    show_table(
+        f"{len(result.pairs)} pair{'s' * (len(result.pairs) != 1)}", columns, overall_rows, left={0, 1}, width=width
+    )
     if report is not None:
         _show_invariance(report, width)
     notes.print(result.alignment.said, markup=False)

@@ -50,9 +50,11 @@ def explain(error: Exception) -> tuple[str, int]:
     from tacsim.config import ConfigError
     from tacsim.interface import IncompatibleRig
     from tacsim.physics.failure.dump import DumpError
-    from tacsim.tasks.task import GoalOutOfReach
+    from tacsim.record.episode import EpisodeError
+    from tacsim.tasks.task import BadDraws, GoalOutOfReach
 
     unusable = (
+        BadDraws,
         ConfigError,
         CannotOpen,
         CodeNotFound,
@@ -61,6 +63,7 @@ def explain(error: Exception) -> tuple[str, int]:
         IncompatibleRig,
         CalibrationError,
         DumpError,
+        EpisodeError,
         RunError,
         SetError,
     )

@@ -33,7 +33,7 @@ def mock(
     ] = None,
     payload: Annotated[
         str | None,
-        typer.Option(help="What hangs on each flange: kg, or kg,x,y,z with its centre [m].", show_default="nothing"),
+        typer.Option(help="What hangs on each flange: kg, or kg,x,y,z with its centre \\[m].", show_default="nothing"),
     ] = None,
     allow_network: Annotated[
         bool, typer.Option("--allow-network", help="Allow addresses that other machines reach.")

@@ -12,6 +12,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.status import Status
+from rich.text import Text
 
 from tacsim.models.text import escaped, printable
 
@@ -160,12 +161,13 @@ def show_table(
     left: Collection[int] = (),
     width: int | None = None,
 ) -> None:
-    """Prints a table on stdout; columns are flush right, except those with a number in `left`."""
+    """Prints a table on stdout; columns are flush right, except those with a number in `left`. Brackets are shown as
+    they are: they hold units."""
     from rich.table import Table
 
-    table = Table(box=None, padding=(0, 1), title=title, title_justify="left")
+    table = Table(box=None, padding=(0, 1), title=Text(title), title_justify="left")
     for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number in left else "right")
+        table.add_column(Text(column), justify="left" if number in left else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     SafeConsole(width=width, highlight=False).print(table)

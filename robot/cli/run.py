@@ -120,7 +120,9 @@ def _run(
     if not notes.is_terminal:
         notes.print(begun)
     task = None if loaded.config.task is None else make_task(loaded.config.task)
-    setup = EpisodeSetup(policy, seed, {"rig.yaml": loaded.text.encode()}, loaded.config.canonical)
+    setup = EpisodeSetup(
+        policy, seed, {"rig.yaml": loaded.text.encode()}, loaded.config.canonical, loaded.config.record.body
+    )
     recorder: Recorder | None = None
     fitting: list[Policy] = []
 

@@ -76,6 +76,13 @@ def press(
         given = config["indenter"]["edge_radius"]
         words = " (what the mesh carries; --edge-radius '0 mm' for sharp edges)" if given is None else ""
         results.print(f"edge radius      {config['edge_radius'] * 1e3:.3f} mm{' (sharp)' if given == 0 else words}")
+    if config["unfelt"] > presses.UNFELT:
+        notes.print(
+            f"warning: the gel feels {1 - config['unfelt']:.0%} of the depth: a tip or edge is too narrow for elements "
+            f"of {config['element_size'] * 1e3:g} mm, the force too small (a wedge's by 10 to 25 %); lower element_size"
+        )
+    if config["folded"]:
+        notes.print("note: the gel folds over itself; picture and height show the sheet that the camera sees")
     if not config["settled"]:
         held = "not held" if config["residual"] is None else f"relative residual {config['residual']:.2g}"
         do = "raise settling.max_substeps"

@@ -28,11 +28,9 @@ def on_cluster(
     A task whose node dies is made again on another, by Ray; so is one whose result died with its node.
 
     address: of a cluster ("HOST:6379", "ray://..."), "auto" for the one that this machine belongs to, "local" for one
-    of this machine alone. files: what the workers need, by place. Raises SetError, CollectFailed, Stopped.
+    of this machine alone; `require_cluster` has found somebody there. files: what the workers need, by place. Raises
+    SetError, CollectFailed, Stopped.
     """
-    if util.find_spec("ray") is None:
-        raise SetError("--ray needs ray, which is not installed: pip install 'tacsim[cluster]'")
-    _require_somebody(address)
     import ray
 
     try:
@@ -61,8 +59,10 @@ def on_cluster(
         ray.shutdown()
 
 
-def _require_somebody(address: str) -> None:
-    """Ray itself would try for a minute. Raises SetError where nobody listens at HOST:PORT."""
+def require_cluster(address: str) -> None:
+    """Raises SetError without Ray, and where nobody listens at HOST:PORT: Ray itself would try for a minute."""
+    if util.find_spec("ray") is None:
+        raise SetError("--ray needs ray, which is not installed: pip install 'tacsim[cluster]'")
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if colon and port.isdecimal():
         try:

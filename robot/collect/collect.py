@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from robot.collect.card import press_card, press_statistics
-from robot.collect.cluster import on_cluster
+from robot.collect.cluster import on_cluster, require_cluster
 from robot.collect.episodes import EpisodeJob
 from robot.collect.folder import CARD, SetFolder, open_set
 from robot.collect.job import Job, Piece
@@ -57,6 +57,8 @@ def collect(
     """
     settings = job.settings.model_dump(mode="json")
     found = Collected()
+    if cluster is not None:
+        require_cluster(cluster)
     with open_set(folder, job, settings, files, command) as place:
         if isinstance(job, PressJob) and not (place.path / CARD).exists():
             write_whole(place.path / "reference.png", reference(job.settings, place.path))

@@ -111,7 +111,8 @@ class EpisodeWorker:
             rig = stack.enter_context(open_rig(loaded))
             policy, task = _policy(settings, loaded, rig.spec, rig.name, number)
             canonical = loaded.config.canonical
-            setup = EpisodeSetup(settings.policy, seed, {"rig.yaml": loaded.text.encode()}, canonical)
+            attached = {"rig.yaml": loaded.text.encode()}
+            setup = EpisodeSetup(settings.policy, seed, attached, canonical, loaded.config.record.body)
             recorders: list[Recorder] = []
 
             def record(meta: EpisodeMeta) -> Recorder:

@@ -26,10 +26,10 @@ from tacsim.optics.grid import image_grid
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.noise import noise_source
 from tacsim.optics.render import Renderer
-from tacsim.optics.surface import SurfaceFolded
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.record.images import encode_png
 
+GOLDEN = 0.618034  # its multiples, without their whole parts, lie evenly in 0 to 1 however many there are
 FLOW_PITCH = 1e-3  # of the points whose flow is told of a sensor without dots [m]
 
 Range = Annotated[tuple[float, float], Field(description="least and greatest, all between equally likely")]
@@ -153,19 +153,25 @@ class PressWorker:
         self._lattice = self._set.lattice
 
     def piece(self, number: int) -> Piece:
-        """The file of this number. A press that fails is none of its rows."""
-        rows: list[Row] = []
+        """The file of this number. A press that fails is none of its rows.
+
+        Files begin with different objects, so that workers who begin together do not all compute the distances of one.
+        """
+        rows: dict[int, Row] = {}
         failures: dict[int, str] = {}
         seconds = Seconds()
-        for index in self._job.numbers(number):
+        numbers = self._job.numbers(number)
+        among = len(self._set.objects)
+        first = (int(GOLDEN * number % 1 * among) - numbers[0]) % among % len(numbers)
+        for index in (*numbers[first:], *numbers[:first]):
             try:
-                rows.append(self._row(index, seconds))
-            except (SimulationDiverged, SurfaceFolded, ValueError, MemoryError) as failure:
+                rows[index] = self._row(index, seconds)
+            except (SimulationDiverged, ValueError, MemoryError) as failure:
                 failures[index] = f"{type(failure).__name__}: {failure}"
         began = time.perf_counter()
-        data = parquet_bytes(self._set, rows) if rows else None
+        data = parquet_bytes(self._set, [rows[index] for index in sorted(rows)]) if rows else None
         seconds.add("file", time.perf_counter() - began)
-        return Piece(number, data, failures, len(rows), seconds.by_part)
+        return Piece(number, data, dict(sorted(failures.items())), len(rows), seconds.by_part)
 
     def _row(self, index: int, seconds: Seconds) -> Row:
         name, scene, motion = self._set.placed(index)

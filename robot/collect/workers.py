@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from robot.collect.job import Job, Piece, Worker
 from robot.common.process import end_with_parent, outside_working_folder, shielded
+from tacsim.geometry.tiles import share_tiles
 
 AHEAD = 2  # pieces for each worker that wait or are being made
 ONE_THREAD = ("TACSIM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")  # of a worker: as many as cores work
@@ -44,7 +46,8 @@ def in_processes(job: Job, folder: Path, numbers: Sequence[int], stop: Stop, wor
     waiting, running = deque(numbers), set[Future[Piece | str]]()
     with (
         _one_thread(),
-        ProcessPoolExecutor(min(workers, max(1, len(numbers))), context, _begin, (job, folder)) as pool,
+        tempfile.TemporaryDirectory(prefix="tacsim-collect-", ignore_cleanup_errors=True) as shared,
+        ProcessPoolExecutor(min(workers, max(1, len(numbers))), context, _begin, (job, folder, Path(shared))) as pool,
     ):
         try:
             while waiting or running:
@@ -90,8 +93,10 @@ def _one_thread() -> Iterator[None]:
 _worker: Callable[[], Worker] | None = None  # of this process
 
 
-def _begin(job: Job, folder: Path) -> None:
+def _begin(job: Job, folder: Path, shared: Path) -> None:
+    """shared: where workers leave distances of meshes to each other, which take as long as ten presses each."""
     global _worker
+    share_tiles(shared)
     parent = multiprocessing.parent_process()
     assert parent is not None and parent.pid is not None
     end_with_parent(parent.pid)

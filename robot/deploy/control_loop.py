@@ -12,6 +12,7 @@ from importlib import metadata
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robot.deploy.policy import require_fit
 from tacsim.control.contact_signal import contact_signal
@@ -21,8 +22,8 @@ from tacsim.record.episode import Episode, EpisodeMeta, Step
 from tacsim.report.series import DEEPEST, FELT, LONGEST, LOST, STEEPEST
 from tacsim.rig import Rig
 from tacsim.tasks import GoalOutOfReach, Task, judge
-from tacsim.tasks.task import Estimator
 
+PARTICLES = 5_000  # of a body go into a recorded step, at most
 PACKAGES = ("tacsim", "numpy", "taichi", "opencv-contrib-python-headless", "gymnasium")
 
 
@@ -63,6 +64,7 @@ class EpisodeSetup:
     seed: int = 0
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     canonical: CanonicalGrid = field(default_factory=CanonicalGrid)  # of the rig
+    body: bool = False  # particles of a simulated body go into the record
 
 
 def run_episode(
@@ -104,26 +106,10 @@ def run_episode(
     if task is not None and start is not None:
         _require_reachable(rig, task, start)
     rig.packages()  # those of before are not of this episode
-    meta = _meta(rig, task, setup)
-    sink = None if recorder is None else recorder(meta)
-    can_feel = task is not None and not task.needs_to_feel.missing(rig.spec)
-    feel = task.estimator(setup.canonical) if task is not None and can_feel else None
-    kept: list[Step] = []
-    episode = Episode(meta, kept if sink is None else sink.steps)
-    count, thinking = 0, False
+    log, thinking = _Log(rig, task, start, setup, recorder), False
 
     def keep(observation: Observation, action: Action | None, sent: Mapping[str, Pose | None]) -> None:
-        nonlocal count
-        seconds = time.perf_counter() - started
-        truth = rig.truth()
-        step = _step(count, rig, task, truth, start, feel, observation, action, sent, seconds)
-        count += 1
-        if sink is None:
-            kept.append(step)
-        elif not sink.write(step):
-            episode.dropped += 1
-            if sink.error is not None:
-                raise RecordingFailed(f"the recording ended early: {sink.error}")
+        step, truth = log.keep(observation, action, sent, time.perf_counter() - started)
         if on_step is not None:
             on_step(step)
         if watch is not None:
@@ -132,7 +118,7 @@ def run_episode(
     try:
         policy.reset()
         keep(observation, None, {})
-        while count <= steps and not stop():
+        while log.count <= steps and not stop():
             started = time.perf_counter()
             thinking = True
             action = policy(observation)
@@ -142,16 +128,15 @@ def run_episode(
     except (EndOfEpisode, KeyboardInterrupt):
         pass
     except (Exception, SystemExit) as failure:  # a policy may call sys.exit
-        done = max(count - 1, 0)
+        done = max(log.count - 1, 0)
         why = f"{type(failure).__name__}: {failure}"
         if thinking:
             why = f"policy '{setup.policy}' raised {why}; the arms hold. Mend it, and try it in simulation"
-        raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", episode) from failure
+        raise EpisodeFailed(f"episode ended after {done} of {steps} steps: {why}", log.episode) from failure
     finally:
         rig.stop()
-        if sink is not None:
-            sink.flush()
-    return episode
+        log.flush()
+    return log.episode
 
 
 def _require_reachable(rig: Rig, task: Task, start: Truth) -> None:
@@ -201,42 +186,84 @@ def _surfaces(observation: Observation) -> dict[str, float]:
     return found
 
 
-def _step(
-    index: int,
-    rig: Rig,
-    task: Task | None,
-    truth: Truth | None,
-    start: Truth | None,
-    feel: Estimator | None,
-    observation: Observation,
-    action: Action | None,
-    sent: Mapping[str, Pose | None],
-    seconds: float,
-) -> Step:
-    """The record of what the rig delivered, with what the task says of it."""
-    info = {f"contact_signal_{name}": contact_signal(touch) for name, touch in observation.tactile.items()}
-    info |= _surfaces(observation)
-    info |= rig.diagnostics()
-    packages = rig.packages()
-    info |= {f"{LOST}{name}": float(each.lost) for name, each in packages.items()}
-    distance = None if feel is None else feel(observation)
-    if distance is not None:
-        info[FELT] = distance
-    outcome = None
-    if truth is not None and start is not None:
-        moved = truth.position - start.position
-        info |= {"body_height": truth.height, "body_x": float(moved[0]), "body_y": float(moved[1])}
-        outcome = None if task is None else judge(task, truth, start)
-    return Step(
-        index=index,
-        time=observation.time,
-        frames=rig.frames,
-        arms=observation.arms,
-        action=action,
-        sent=sent,
-        reward=None if outcome is None else outcome.reward,
-        distance=None if outcome is None else outcome.distance,
-        info=info,
-        seconds=seconds,
-        packages=packages,
-    )
+class _Log:
+    """The steps of a running episode, judged, and kept: in its recording, or else in memory."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        task: Task | None,
+        start: Truth | None,
+        setup: EpisodeSetup,
+        recorder: Callable[[EpisodeMeta], StepRecorder] | None,
+    ) -> None:
+        meta = _meta(rig, task, setup)
+        self._rig, self._task, self._start, self._body = rig, task, start, setup.body
+        self._recorder = None if recorder is None else recorder(meta)
+        can_feel = task is not None and not task.needs_to_feel.missing(rig.spec)
+        self._feel = task.estimator(setup.canonical) if task is not None and can_feel else None
+        self._kept: list[Step] = []
+        self.episode = Episode(meta, self._kept if self._recorder is None else self._recorder.steps)
+        self.count = 0
+
+    def keep(
+        self, observation: Observation, action: Action | None, sent: Mapping[str, Pose | None], seconds: float
+    ) -> tuple[Step, Truth | None]:
+        """The step of what the rig has delivered, which took so many `seconds`; and the truth that judged it. Raises
+        RecordingFailed."""
+        truth = self._rig.truth()
+        step = self._step(truth, observation, action, sent, seconds)
+        self.count += 1
+        if self._recorder is None:
+            self._kept.append(step)
+        elif not self._recorder.write(step):
+            self.episode.dropped += 1
+            if self._recorder.error is not None:
+                raise RecordingFailed(f"the recording ended early: {self._recorder.error}")
+        return step, truth
+
+    def flush(self) -> None:
+        """Waits until the recording has all that was kept."""
+        if self._recorder is not None:
+            self._recorder.flush()
+
+    def _step(
+        self,
+        truth: Truth | None,
+        observation: Observation,
+        action: Action | None,
+        sent: Mapping[str, Pose | None],
+        seconds: float,
+    ) -> Step:
+        info = {f"contact_signal_{name}": contact_signal(touch) for name, touch in observation.tactile.items()}
+        info |= _surfaces(observation)
+        info |= self._rig.diagnostics()
+        packages = self._rig.packages()
+        info |= {f"{LOST}{name}": float(each.lost) for name, each in packages.items()}
+        distance = None if self._feel is None else self._feel(observation)
+        if distance is not None:
+            info[FELT] = distance
+        outcome = None
+        if truth is not None and self._start is not None:
+            moved = truth.position - self._start.position
+            info |= {"body_height": truth.height, "body_x": float(moved[0]), "body_y": float(moved[1])}
+            outcome = None if self._task is None else judge(self._task, truth, self._start)
+        return Step(
+            index=self.count,
+            time=observation.time,
+            frames=self._rig.frames,
+            arms=observation.arms,
+            action=action,
+            sent=sent,
+            reward=None if outcome is None else outcome.reward,
+            distance=None if outcome is None else outcome.distance,
+            info=info,
+            seconds=seconds,
+            packages=packages,
+            body=_thinned(truth.points) if self._body and truth is not None else None,
+        )
+
+
+def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(m, 3) every so many of points (n, 3), PARTICLES at most."""
+    return points[:: -(-len(points) // PARTICLES) or 1].copy()

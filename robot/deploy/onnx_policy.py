@@ -7,7 +7,6 @@ within [-1, 1]; whatever else a network does to its inputs is inside. Its metada
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ from robot.deploy.python_policy import PolicyNotFound
 from tacsim import pose as se3
 from tacsim.gym.features import FeatureEncoder
 from tacsim.interface import Action, Needs, Observation, Pose, RigSpec
+from tacsim.models.features import Numbers
 from tacsim.models.policy import METADATA_KEY, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.text import printable
@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 64 * 2**20  # of a file; ours have less than 2 MB
 ASTRAY = 2.0  # steps between where an arm was asked to go and where it is, from which on it is asked anew from there
+
+
+Goal = float | tuple[float, ...] | None  # of a task [m]
+Shape = tuple[int | None, ...]  # None: whatever it is
 
 
 class PolicyFailed(RuntimeError):
@@ -50,14 +54,14 @@ class OnnxPolicy:
     Raises PolicyNotFound for a file that is no such policy, IncompatibleRig for one whose maps do not fit the grid.
     """
 
-    def __init__(self, path: Path, canonical: CanonicalGrid, goal: float | tuple[float, ...] | None) -> None:
+    def __init__(self, path: Path, canonical: CanonicalGrid, goal: Goal) -> None:
         self._session = _session(path)
         self.spec = _spec(path, self._session)
         self._name, self._goal = path.name, goal
         self._encoder = FeatureEncoder(self.spec.features, canonical)
         self._axes = tuple(Axis(axis.arm, axis.direction) for axis in self.spec.axes)
         self._targets: dict[str, Pose] = {}
-        _require_same_inputs(path, self.spec, self._encoder, self._session)
+        _require_same_inputs(path, self.spec, self._encoder.inputs, self._session, goal)
 
     @property
     def needs(self) -> Needs:
@@ -147,8 +151,9 @@ def _session(path: Path) -> InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # small networks; the other cores simulate
     options.log_severity_level = 4  # errors are ours to tell
+    # Weights that lie in other files are looked for below a folder that cannot be: the file itself.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path.absolute()))
     try:
-        # From bytes: weights that lie in other files are refused, whatever path the file names.
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as failure:  # onnxruntime has no common base of its own
         raise PolicyNotFound(f"policy '{path}' is no ONNX file that can run here: {_words(failure)}") from None
@@ -172,33 +177,50 @@ def _spec(path: Path, session: InferenceSession) -> PolicySpec:
         ) from None
 
 
-def _require_same_inputs(path: Path, spec: PolicySpec, encoder: FeatureEncoder, session: InferenceSession) -> None:
-    """The file's inputs are those that this version's encoder makes, number by number."""
-    made = encoder.inputs
-    wanted = {*made, "goal"} if spec.features.goal else {*made}
-    graph = {each.name: each for each in session.get_inputs()}
-    if set(graph) != wanted:
+def _require_same_inputs(
+    path: Path, spec: PolicySpec, made: Mapping[str, Numbers], session: InferenceSession, goal: Goal
+) -> None:
+    """The file's inputs are those that this version's encoder makes, number by number; and it gives one action."""
+    grid, graph = spec.features.grid, {each.name: each for each in session.get_inputs()}
+    beyond = {"maps": (grid.rows, grid.columns), "flow": (None, None)}  # the markers are the rig's
+    wanted: dict[str, Shape] = {key: (1, len(each.names), *beyond.get(key, ())) for key, each in made.items()}
+    if spec.features.goal:
+        wanted["goal"] = (1, None if goal is None else np.size(goal))
+    if set(graph) != set(wanted):
         raise PolicyNotFound(
             f"policy '{path}': its graph takes {', '.join(sorted(graph))}, its metadata speak of "
             f"{', '.join(sorted(wanted))}"
         )
-    for key, numbers in made.items():
-        if spec.inputs.get(key) != numbers:
+    for key, shape in wanted.items():
+        if key in made and spec.inputs.get(key) != made[key]:
             raise PolicyNotFound(
                 f"policy '{path}': what it was trained on as '{key}' is not what this version of tacsim makes of the "
                 "same features: train it anew, or use the version that its metadata name"
             )
-        shape = graph[key].shape
-        if len(shape) < 2 or shape[1] != len(numbers.names) or graph[key].type != "tensor(float)":
+        if not _fits(graph[key], shape):
             raise PolicyNotFound(
-                f"policy '{path}': its input '{key}' is {graph[key].type} {shape}; wanted: tensor(float), 1 x "
-                f"{len(numbers.names)}{' x rows x columns' if key != 'touch' else ''}"
+                f"policy '{path}': its input '{key}' is {_array(graph[key])}; wanted: {_floats(shape)}"
             )
-    outputs = {each.name: each.shape for each in session.get_outputs()}
-    if len(outputs.get("action", ())) != 2 or outputs["action"][1] != len(spec.axes):
-        raise PolicyNotFound(
-            f"policy '{path}': it must give 'action', 1 x {len(spec.axes)}; it gives {json.dumps(outputs)}"
-        )
+    outputs = {each.name: each for each in session.get_outputs()}
+    action: Shape = (1, len(spec.axes))
+    if "action" not in outputs or not _fits(outputs["action"], action):
+        gives = ", ".join(f"'{name}', {_array(each)}" for name, each in outputs.items())
+        raise PolicyNotFound(f"policy '{path}': it must give 'action', {_floats(action)}; it gives {gives}")
+
+
+def _fits(found: Any, shape: Shape) -> bool:
+    """An array of the graph has this shape, as far as both tell."""
+    sides = zip(found.shape, shape, strict=True) if len(found.shape) == len(shape) else [(0, 1)]
+    told = ((side, wanted) for side, wanted in sides if isinstance(side, int) and wanted is not None)
+    return found.type == "tensor(float)" and all(side == wanted for side, wanted in told)
+
+
+def _array(found: Any) -> str:
+    return f"{found.type} {found.shape}"
+
+
+def _floats(shape: Shape) -> str:
+    return f"tensor(float) {' x '.join('n' if side is None else str(side) for side in shape)}"
 
 
 def _words(failure: Exception) -> str:

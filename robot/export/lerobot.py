@@ -23,6 +23,7 @@ from robot.export.lerobot_mapping import (
     outcome,
     task_in_words,
 )
+from robot.export.lerobot_video import require_video
 from robot.export.statistics import ImageCounts, Statistics
 from robot.rig.recorded import ObservedEpisode, observe_episode
 from tacsim.interface import IncompatibleRig
@@ -39,6 +40,7 @@ def export_lerobot(
     task: str | None = None,
     maps: bool = True,
     cut: bool = False,
+    video: bool = False,
     on_step: OnStep = lambda done, total: None,
 ) -> None:
     """Writes the episodes, in this order, into a new folder: all of it, or nothing.
@@ -50,19 +52,23 @@ def export_lerobot(
         task: in words, for policies that read them; None: made of the task and goal of each episode.
         maps: with heights, gradients and flow.
         cut: take recordings that were cut off, up to there.
+        video: pictures as H.264 video, with loss, instead of PNG.
         on_step: told (steps done, steps in all).
 
-    Raises ValueError for episodes that make no data set, EpisodeError, OSError, and what normalising raises.
+    Raises ValueError for episodes that make no data set, EpisodeError, OSError, VideoFailed, and what normalising
+    raises.
     """
     if util.find_spec("pyarrow") is None:
         raise ValueError("data sets are written by pyarrow, which is not installed: pip install 'tacsim[export]'")
+    if video:
+        require_video()
     episodes = [observe_episode(path) for path in paths]
     fps = _check(episodes, cut)
     home = next(place for place in folder.absolute().parents if place.is_dir())
     partial = home / f".{folder.name}.{os.getpid()}"
     partial.mkdir()
     try:
-        _write(episodes, partial, fps, task, maps, on_step)
+        _write(episodes, partial, fps, task, maps, video, on_step)
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial.rename(folder)  # onto an empty folder, or nothing: onto another it fails
     except BaseException as failure:
@@ -104,7 +110,13 @@ def _check(episodes: Sequence[ObservedEpisode], cut: bool) -> float:
 
 
 def _write(
-    episodes: Sequence[ObservedEpisode], folder: Path, fps: float, task: str | None, maps: bool, on_step: OnStep
+    episodes: Sequence[ObservedEpisode],
+    folder: Path,
+    fps: float,
+    task: str | None,
+    maps: bool,
+    video: bool,
+    on_step: OnStep,
 ) -> None:
     total, done = sum(len(each.episode.steps) for each in episodes), 0
     data: DataSet | None = None
@@ -120,13 +132,16 @@ def _write(
         mapping = LeRobotMapping(meta.spec, each.canonical, maps=maps)
         found, columns, images = _columns(each, mapping, count)
         if data is None:
-            features, data = found, DataSet(folder, fps, meta.rig, found)
-            write_json(folder / "meta" / "tacsim.json", _about(episodes, mapping))
+            features, data = found, DataSet(folder, fps, meta.rig, found, video=video)
         elif found != features:
             raise ValueError(f"{episodes[0].path} and {each.path} do not fit together: {_difference(features, found)}")
         data.add(columns, images, task_in_words(meta.task, meta.goal) if task is None else task)
     assert data is not None
     data.close()
+    about = _about(episodes, mapping)
+    if video:
+        about["video_error"] = {name: each.error.told() for name, each in data.videos.items()}
+    write_json(folder / "meta" / "tacsim.json", about)
 
 
 def _columns(

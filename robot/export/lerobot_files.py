@@ -15,6 +15,7 @@ import numpy as np
 
 from robot.export.arrow import Column, arrow_table
 from robot.export.lerobot_mapping import Feature
+from robot.export.lerobot_video import VideoColumn
 from robot.export.statistics import Statistics, column_statistics, merged
 
 if TYPE_CHECKING:
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
 VERSION = "v3.0"
 CHUNK = 1000  # files in a folder
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 FILE_SIZE = 100  # [MB] at which a file is followed by another
+VIDEO_SIZE = 200  # the same of videos [MB]
 EPISODES_AT_ONCE = 100  # rows that meta/episodes gathers into one row group
 COUNTERS = {name: Feature("int64", (1,), None) for name in ("frame_index", "episode_index", "index", "task_index")}
 OWN = {"timestamp": Feature("float32", (1,), None), **COUNTERS}  # columns that every data set has
@@ -35,9 +38,10 @@ class DataSet:
     Args:
         folder: exists, and is empty.
         features: of the columns, without LeRobot's own (`OWN`).
-        file_size: [MB] at which a file is followed by another.
+        file_size, video_size: [MB] at which a file is followed by another.
+        video: pictures as videos, instead of PNG in the data's files.
 
-    Raises OSError.
+    Raises OSError, VideoFailed.
     """
 
     def __init__(
@@ -48,9 +52,17 @@ class DataSet:
         features: Mapping[str, Feature],
         *,
         file_size: float = FILE_SIZE,
+        video_size: float = VIDEO_SIZE,
+        video: bool = False,
     ) -> None:
-        self._folder, self._fps, self._robot, self._file_size = folder, fps, robot, file_size
+        self._folder, self._fps, self._robot = folder, fps, robot
+        self._file_size, self._video_size = file_size, video_size
         self._features = {**features, **OWN}
+        self.videos = {
+            name: VideoColumn(self._video_path(name), fps, feature.shape, video_size, CHUNK)
+            for name, feature in features.items()
+            if video and feature.dtype == "image"
+        }
         self._tasks: list[str] = []
         self._rows: list[dict[str, Any]] = []  # of meta/episodes, not yet written
         self._statistics: list[dict[str, Statistics]] = []
@@ -76,7 +88,9 @@ class DataSet:
             name: images[name] if feature.dtype == "image" else column_statistics(np.asarray(whole[name]))
             for name, feature in self._features.items()
         }
-        chunk, file = self._data.write(arrow_table(self._features, whole), count)
+        in_data = {name: feature for name, feature in self._features.items() if name not in self.videos}
+        chunk, file = self._data.write(arrow_table(in_data, whole), count)
+        shown = {name: video.add(_pictures(columns[name])) for name, video in self.videos.items()}
         self._rows.append(
             {
                 "episode_index": self._episodes,
@@ -86,6 +100,7 @@ class DataSet:
                 "data/file_index": file,
                 "dataset_from_index": self._frames,
                 "dataset_to_index": self._frames + count,
+                **{f"videos/{name}/{key}": value for name, each in shown.items() for key, value in each.items()},
                 **{f"stats/{name}/{key}": v.tolist() for name, each in statistics.items() for key, v in each.items()},
             }
         )
@@ -98,6 +113,8 @@ class DataSet:
         """Writes what belongs to the whole."""
         if self._rows:
             self._write_rows()
+        for video in self.videos.values():
+            video.close()
         self._data.close()
         self._meta.close()
         _write_tasks(self._folder / "meta" / "tasks.parquet", self._tasks)
@@ -116,15 +133,20 @@ class DataSet:
             "total_tasks": len(self._tasks),
             "chunks_size": CHUNK,
             "data_files_size_in_mb": self._file_size,
-            "video_files_size_in_mb": 200,
+            "video_files_size_in_mb": self._video_size,
             "splits": {"train": f"0:{self._episodes}"},
             "data_path": f"data/{FILE}",
-            "video_path": None,
-            "features": {
-                name: {"dtype": each.dtype, "shape": list(each.shape), "names": each.names and list(each.names)}
-                for name, each in self._features.items()
-            },
+            "video_path": VIDEO if self.videos else None,
+            "features": {name: self._told(name, feature) for name, feature in self._features.items()},
         }
+
+    def _told(self, name: str, feature: Feature) -> dict[str, Any]:
+        told = {"dtype": feature.dtype, "shape": list(feature.shape), "names": feature.names and list(feature.names)}
+        return told | ({"dtype": "video", "info": self.videos[name].info} if name in self.videos else {})
+
+    def _video_path(self, name: str) -> str:
+        """What its files are called, but for their numbers."""
+        return str(self._folder / VIDEO.replace("{video_key}", name))
 
     def _write_rows(self) -> None:
         import pyarrow as pa
@@ -176,6 +198,11 @@ class _Files:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def _pictures(column: Column) -> Sequence[bytes]:
+    assert not isinstance(column, np.ndarray)
+    return column
 
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:

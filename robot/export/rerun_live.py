@@ -109,9 +109,14 @@ def send(pipe: Connection, seen: Seen | None) -> None:
 
 
 def _receive(pipe: Connection) -> Seen | None:
-    number = pipe.recv()
-    rest = pipe.recv_bytes()
-    found: Seen | None = pickle.loads(rest, buffers=[pipe.recv_bytes() for _ in range(number)])  # noqa: S301  # of `send`
+    """What `send` sent; None at the end, which a program that is killed tells by its silence, also within a message."""
+    try:
+        number = pipe.recv()
+        rest = pipe.recv_bytes()
+        arrays = [pipe.recv_bytes() for _ in range(number)]
+    except (EOFError, OSError):
+        return None
+    found: Seen | None = pickle.loads(rest, buffers=arrays)  # noqa: S301  # of `send`
     return found
 
 
@@ -128,11 +133,10 @@ def _show(pipe: Connection, spec: RigSpec, config: RigConfig, file: Path | None)
             check()
             pipe.send(None)
             begun = True
-            with contextlib.suppress(EOFError, ConnectionError):
-                while (seen := _receive(pipe)) is not None:
-                    step, observation, truth = seen
-                    log.step(step, observation, truth)
-                    check()
+            while (seen := _receive(pipe)) is not None:
+                step, observation, truth = seen
+                log.step(step, observation, truth)
+                check()
     except (OSError, RuntimeError, ValueError) as failure:
         if begun:
             raise

@@ -6,7 +6,7 @@
 | `/world/{sensor}/flow`              | displacement of its markers                                            |
 | `/world/{arm}`                      | pose of the sensor that the arm carries                                |
 | `/world/{arm}/force`                | what the object does to it, 1 mm a newton                              |
-| `/world/body`                       | particles of the plasticine; of a simulation that is looked at live    |
+| `/world/body`                       | particles of the plasticine; live, or where they were recorded         |
 | `/world/asked/{arm}`                | where the arm was asked to be                                          |
 | `/camera/{sensor}`                  | the picture as it came                                                 |
 | `/canonical/{sensor}`               | the picture as a policy sees it                                        |
@@ -82,8 +82,9 @@ class EpisodeLog:
         for name, asked in ({} if step.action is None else step.action.tool).items():
             if asked is not None:
                 self._points(f"world/asked/{name}", asked)
-        if truth is not None:
-            grains = rr.Points3D(truth.points, radii=[ARROW / 2], colors=[(200, 150, 110)])
+        particles = step.body if truth is None else truth.points
+        if particles is not None:
+            grains = rr.Points3D(particles, radii=[ARROW / 2], colors=[(200, 150, 110)])
             self._recording.log("world/body", grains)
         self._numbers(step)
         for name, packages in step.packages.items():

@@ -25,6 +25,7 @@ TRAVEL = 60.0  # longest motion to the start [s]
 STEP = 5.0  # longest step of an approach [s]
 LOOK = 5e-3  # between two looks of an approach in motion [s]
 AT_END = 0.5  # an approach that has come to its end has met nothing when nothing is told for so long [s]
+PICTURE = 15.0  # longest wait for one that shows the gels at rest [s]
 PAUSE = 0.3  # a shaken arm comes to rest before its force is zeroed [s]
 ADVICE = (
     "is the body before the sensors? The arms are back at their start (start.approach_distance in the rig file bounds "
@@ -81,7 +82,7 @@ class HardwareReset:
         self._begun: dict[str, Pose] = dict(start)
 
     def clear(self, seed: int) -> Mapping[str, TactileFrame]:
-        """Raises DeviceError when an arm is stopped, or does not get there."""
+        """Raises DeviceError when an arm is stopped, or does not get there; TimeoutError without a picture of then."""
         for arm in self._arms.values():
             arm.suspend_tactile_guard()
         offset = self._placement * np.random.default_rng(seed).uniform(-1.0, 1.0, size=2)
@@ -94,10 +95,11 @@ class HardwareReset:
         if self._arms:
             time.sleep(PAUSE)
             self._clock.wait_for_data()  # the force to be zeroed is that of now, not of before the retreat
+        rested = time.monotonic()
         for arm in self._arms.values():
             arm.driver.zero_wrench()
         self._clock.wait_for_data()
-        return {name: sensor.read(1.0) for name, sensor in self._sensors.items()}
+        return {name: _exposed_after(rested, name, sensor) for name, sensor in self._sensors.items()}
 
     def touch(self) -> None:
         """Raises NotConfirmed, and NoTouch with the arms back at their start."""
@@ -172,3 +174,14 @@ class HardwareReset:
         for name, arm in self._arms.items():  # none in a dry run
             arm.send(targets.get(name))
         wait_for_arrival(self._arms, timeout)
+
+
+def _exposed_after(since: float, name: str, sensor: TactileSource) -> TactileFrame:
+    """The first frame exposed after `since` [s]: a camera that was held up still has one of a moving arm, or of before
+    the arm was connected. Raises TimeoutError."""
+    deadline = time.monotonic() + PICTURE
+    while (frame := sensor.read(1.0)).time < since:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"sensor '{name}': no picture since the arms came to rest, {PICTURE:g} s ago")
+        time.sleep(LOOK)
+    return frame

@@ -41,8 +41,8 @@ class Dagger:
             self._folder / f"round-{number:03d}.npz",
             lambda file: np.savez(file, allow_pickle=False, action=wanted, **seen),
         )
-        loss = self._learn(*_all_met(self._folder, number), number, tell)
-        return {"steps": float(len(wanted)), **figures, "loss": loss}
+        losses = self._learn(*_all_met(self._folder, number), number, len(wanted), tell)
+        return {"steps": float(len(wanted)), **figures, **losses}
 
     def state(self) -> dict[str, Any]:
         return {"actor": self.actor.state_dict()}
@@ -74,14 +74,19 @@ class Dagger:
         data = {key: np.concatenate([state[key] for state in states]) for key in states[0]}
         return data, np.concatenate(labels), means(ends)
 
-    def _learn(self, data: Arrays, actions: NDArray[np.float32], number: int, tell: Tell) -> float:
-        """The mean loss of the last epoch."""
+    def _learn(self, data: Arrays, actions: NDArray[np.float32], number: int, new: int, tell: Tell) -> dict[str, float]:
+        """The mean loss of the last epoch; before it, but for the first round, that of the `new` states, which come
+        last: one far greater says that the student knows by heart what it has met."""
         settings = self._settings
         tensors = {key: torch.from_numpy(value) for key, value in data.items()}
         wanted = torch.from_numpy(actions)
         if number == 0:
             self.actor.layers.normalise_by(tensors)
         spread = wanted.std(dim=0, unbiased=False).clamp(min=LEAST_SPREAD)  # small steps count as much as large ones
+        losses: dict[str, float] = {}
+        if number:
+            answers = act(self.actor, {key: value[-new:] for key, value in data.items()})
+            losses["unmet_loss"] = float(np.square((answers - actions[-new:]) / spread.numpy()).mean())
         random = torch.Generator().manual_seed(self._seed * 1000 + number)
         optimiser = torch.optim.Adam(self.actor.parameters(), lr=settings.rate)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
@@ -97,7 +102,7 @@ class Dagger:
                 optimiser.step()
                 total += loss.item() * len(part)
             decay.step()
-        return total / len(wanted)
+        return losses | {"loss": total / len(wanted)}
 
 
 def act(actor: torch.nn.Module, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:

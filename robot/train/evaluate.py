@@ -115,6 +115,8 @@ def _judge(
     count = len(members)
     for first in range(0, episodes, count):
         seeds = [UNSEEN + seed + first + i for i in range(count)]
+        for at, env in enumerate(members):  # each draw once: episodes that are alike tell nothing of others
+            env.next_variant = (first + at) % len(env.variants) if env.variants else None
         _, info = envs.reset(seed=list(seeds))
         start = info["distance"]
         actors = [_actor(name, env, canonical, each) for env, each in zip(members, seeds, strict=True)]

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 
@@ -22,13 +23,19 @@ from robot.train.dagger import Dagger
 from robot.train.export import export
 from robot.train.network import PolicyNetwork
 from robot.train.run_folder import RunError, RunFolder, Tell, version
+from tacsim.config import ConfigError
+from tacsim.config.errors import Place, Problem
+from tacsim.geometry.shapes import extent
 from tacsim.gym.encode import space_of_features
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import TacsimVectorEnv
+from tacsim.interface import Pose, Truth
 from tacsim.models.policy import ActionAxis, PolicySpec
+from tacsim.models.rig import TaskConfig
+from tacsim.models.scene import Scene
 from tacsim.models.text import printable
 from tacsim.models.training import Training
-from tacsim.tasks import make_task
+from tacsim.tasks import GoalOutOfReach, make_task
 
 POLICY, CURVE = "policy.onnx", "curve.json"  # in the folder of a run
 Figures = Mapping[str, float]
@@ -65,10 +72,13 @@ def environments(training: Training) -> TacsimVectorEnv:
 
 
 def begin(training: Training, folder: Path) -> RunFolder:
-    """Makes the folder of a new run. Raises as `environments`, and FileExistsError."""
-    environments(training).close()  # what cannot be made is told before there is a folder
+    """Makes the folder of a new run. Raises as `environments`, GoalOutOfReach for a goal that can be drawn and not be
+    reached, and FileExistsError."""
+    envs = environments(training)  # what cannot be made is told before there is a folder
+    envs.close()
     config = load_with_task(training.rig, training.task, training.overrides).config
     assert config.task is not None
+    _require_playable(training, [(each.task, each.scene, each.drawn) for each in envs.members[0].variants])
     task, encoder = make_task(config.task), FeatureEncoder(training.features, config.canonical)
     spec = PolicySpec(
         task=config.task.kind,
@@ -83,15 +93,43 @@ def begin(training: Training, folder: Path) -> RunFolder:
     return RunFolder.make(folder, training, spec, {key: box.shape for key, box in space.items()})
 
 
+def _require_playable(training: Training, drawn: list[tuple[TaskConfig, Scene | None, str]]) -> None:
+    """Raises ConfigError for a range with an end that cannot be, GoalOutOfReach for a goal that the body, before
+    anything touches it, has no way to; of what is `drawn`, and of the limits, near which other seeds may draw."""
+    limits = []
+    for words in () if training.randomise is None else training.randomise.limits():
+        at = "a limit: " + "; ".join(words)
+        try:
+            config = load_with_task(training.rig, training.task, [*training.overrides, *words]).config
+        except ConfigError as error:
+            raise ConfigError([*error.problems, Problem(Place("randomise"), "", at)]) from None
+        assert config.task is not None
+        limits.append((config.task, config.scene, at))
+    for task, scene, told in [*drawn, *limits]:
+        if scene is None or scene.body is None:
+            continue
+        height = float(extent(scene.body.geometry)[2])
+        poses = dict.fromkeys(scene.sensors, Pose())
+        try:
+            make_task(task).require_reachable(
+                Truth(height, np.array([0.0, 0.0, height / 2]), np.zeros((1, 3), np.float32), poses)
+            )
+        except GoalOutOfReach as error:
+            raise GoalOutOfReach(f"randomise: {told}: {error}") from None
+
+
 def train(
     run: RunFolder,
     tell: Tell = lambda words, done, of: None,
     say: Callable[[Figures], None] = lambda figures: None,
+    warn: Callable[[str], None] = lambda words: None,
 ) -> Path:
     """Goes on with a run to its end, and writes its policy there; returns the file.
 
-    say: is told the figures of each round: its number `round`, those of the learner, and `seconds`.
-    Raises RunError, and OSError for a disk that is full: the last checkpoint is still whole.
+    say: is told the figures of each round: its number `round`, those of the learner, `refused` (draws that could not
+    begin an episode, and were drawn anew), and `seconds`. warn: is told which draws, and why, each once.
+    Raises RunError, BadDraws for too many of those, and OSError for a disk that is full: the last checkpoint is still
+    whole.
     """
     torch.set_num_threads(1)  # small networks; and sums have one order on any machine
     done, state, curve = run.last()
@@ -101,18 +139,30 @@ def train(
         if done:
             with _fitting(run):
                 learner.restore(state)
+        told: set[str] = set()
         for number in range(done, learner.rounds):
-            began = time.perf_counter()
+            began, before = time.perf_counter(), len(_refused(envs))
             figures = learner.round(number, tell)
-            curve.append({"round": number + 1, **figures, "seconds": time.perf_counter() - began})
-            run.keep(number, learner.state(), curve)
+            refused = _refused(envs)
+            for words in dict.fromkeys(refused):
+                if words not in told:
+                    warn(f"drawn anew: {words}")
+            told.update(refused)
+            count = float(len(refused) - before)
+            curve.append({"round": number + 1, **figures, "refused": count, "seconds": time.perf_counter() - began})
+            # before the checkpoint: a round that is kept is not told again
             write_whole(run.folder / CURVE, json.dumps(curve, indent=1).encode())
+            run.keep(number, learner.state(), curve)
             say(curve[-1])
     finally:
         envs.close()
     path = run.folder / POLICY
     export_policy(run, path)
     return path
+
+
+def _refused(envs: TacsimVectorEnv) -> list[str]:
+    return [words for env in envs.members for words in env.refused]
 
 
 def export_policy(run: RunFolder, path: Path) -> float:

@@ -120,8 +120,9 @@ def _sensor_file(kind: Kind, reference: str, folder: Path) -> Path:
     """Of a name or a bundle's path: the one sensor that it can mean. Raises NotFound for none, and for two."""
     places = [folder / reference / FILE]
     if is_name(reference):
-        own = folder / OWN
-        places += [config_root() / kind.folder / f"{reference}.yaml", own / reference / FILE, own / f"{reference}.yaml"]
+        places.append(config_root() / kind.folder / f"{reference}.yaml")
+    if Path(reference).name == reference:
+        places += [folder / OWN / reference / FILE, folder / OWN / f"{reference}.yaml"]
     try:
         found = list({path.resolve(): path for path in places if path.is_file()}.values())
     except (OSError, RuntimeError) as error:  # a loop of symbolic links

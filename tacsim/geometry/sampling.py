@@ -11,26 +11,15 @@ from tacsim.models.scene import Body, Shape
 ITERATIONS = 20  # of mutual repulsion
 REACH = 1.1  # particles nearer than this push each other apart [spacings]; evenly spread ones are ~1.1 apart
 STEP = 0.25  # share of the missing distance by which each of two moves
-FEWEST_LAYERS = 3  # one has no height, and two cannot bulge
 MIN_DEPTH = 0.05  # no particle nearer to the surface than this [spacings]
 
 
 def body_points(body: Body, spacing: float) -> FloatArray:
     """Particles (n, 3) [m] of a body, all inside it, about `spacing` [m] apart; each stands for volume / n.
 
-    Raises ValueError for a body of fewer than FEWEST_LAYERS, and what :func:`tacsim.geometry.shapes.particles` raises.
+    Raises what :func:`tacsim.geometry.shapes.particles` raises.
     """
     lattice = particles(body.geometry, spacing)
-    size = extent(body.geometry)
-    axis = int(np.argmin(size))
-    layers = round(size[axis] / spacing)
-    if layers < FEWEST_LAYERS:
-        found = f"{layers} layer{'s' * (layers > 1)} of particles {spacing * 1e3:.4g} mm apart"
-        raise ValueError(
-            f"the body ({body.geometry.shape}) is {size[axis] * 1e3:.4g} mm along {'xyz'[axis]}, {found}; it needs "
-            f"{FEWEST_LAYERS}: make it at least {FEWEST_LAYERS * spacing * 1e3:.4g} mm thick, or choose a "
-            f"particle_spacing of at most {size[axis] / FEWEST_LAYERS * 1e3:.4g} mm (draft has 0.5, standard 0.25 mm)"
-        )
     return lattice if body.sampling == "lattice" else scattered(body.geometry, spacing, body.seed)
 
 

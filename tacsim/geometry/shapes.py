@@ -5,6 +5,7 @@ Everything here is in the shape's own frame: axes as in the scene, origin at the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,6 +31,7 @@ FloatArray = NDArray[np.float64]
 
 MAX_PARTICLES = 5_000_000
 MAX_NODES = 20_000_000
+FEWEST_LAYERS = 3  # of particles: one has no height, and two cannot bulge
 MAX_MISFIT = 0.1  # relative error of the size or the volume that the lattice of particles may have
 LEVEL = 1e-5  # sine of an angle below which a direction is level with a face; float32 rotations are 1e-7 off
 BAND = 2  # grid spacings round a mesh in which the distance is exact
@@ -87,8 +89,8 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
     Along each axis the lattice has the whole number of layers nearest to the shape's size and is centred; the first
     layer lies half a spacing inside the face. For particles without a lattice see :mod:`tacsim.geometry.sampling`.
 
-    Raises ValueError when the lattice misses the shape's size (or a mesh's volume) by more than 10 %, holds no
-    particle, or more than 5,000,000; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
+    Raises ValueError when the lattice has fewer than FEWEST_LAYERS, misses the shape's size (or a mesh's volume) by
+    more than 10 %, holds no particle, or more than 5,000,000; and what :func:`tacsim.geometry.mesh.load_mesh` raises.
     """
     size = extent(geometry)
     estimate, lattice = volume(geometry) / spacing**3, np.prod(size / spacing)
@@ -97,8 +99,7 @@ def particles(geometry: Shape, spacing: float) -> FloatArray:
             f"{_name(geometry)} would need {estimate:,.0f} particles (on a lattice of {lattice:,.0f}) at a "
             f"spacing of {_mm(spacing)}; the limit is {MAX_PARTICLES:,}: use a larger spacing or a smaller shape"
         )
-    layers = np.rint(size / spacing).astype(int)
-    _check_layers(geometry, size, spacing, layers)
+    layers = _check_layers(geometry, size, spacing)
     axes = tuple((np.arange(n) - (n - 1) / 2) * spacing for n in layers)
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     if isinstance(geometry, Mesh):
@@ -122,21 +123,42 @@ def no_particle(geometry: Shape, spacing: float) -> ValueError:
     return ValueError(f"{_name(geometry)} holds no particle at a spacing of {_mm(spacing)}; use a smaller spacing")
 
 
-def _check_layers(geometry: Shape, size: FloatArray, spacing: float, layers: NDArray[np.int_]) -> None:
-    if (layers == 0).any():
+def _check_layers(geometry: Shape, size: FloatArray, spacing: float) -> NDArray[np.int_]:
+    """How many layers the lattice has along each axis (3,). Raises ValueError with a spacing that fits."""
+    layers = np.rint(size / spacing).astype(int)
+    if layers.min() < FEWEST_LAYERS:
         axis = int(np.argmin(size))
-        raise ValueError(
-            f"{_name(geometry)} is only {_mm(size[axis])} along {'xyz'[axis]}: no particle fits at a spacing of "
-            f"{_mm(spacing)}; use a spacing of at most {_mm(size[axis])}"
+        found = (
+            f"only {_mm(size[axis])} along {'xyz'[axis]}, {size[axis] / spacing:.2g} layers of particles "
+            f"{_mm(spacing)} apart; a body needs {FEWEST_LAYERS}"
         )
-    misfit = layers * spacing / size - 1
-    axis = int(np.argmax(np.abs(misfit)))
-    if abs(misfit[axis]) > MAX_MISFIT + 1e-9:
-        raise ValueError(
-            f"{_name(geometry)} measures {_mm(size[axis])} along {'xyz'[axis]}, but {layers[axis]} layers of particles "
-            f"{_mm(spacing)} apart make {_mm(layers[axis] * spacing)} ({misfit[axis]:+.0%}, limit {MAX_MISFIT:.0%}); "
-            f"use a spacing of {_mm(size[axis] / layers[axis])}, or a size that is a multiple of the spacing"
+    else:
+        misfit = layers * spacing / size - 1
+        axis = int(np.argmax(np.abs(misfit)))
+        if abs(misfit[axis]) <= MAX_MISFIT + 1e-9:
+            return layers
+        found = (
+            f"{_mm(size[axis])} along {'xyz'[axis]}, but {layers[axis]} layers of particles {_mm(spacing)} apart make "
+            f"{_mm(layers[axis] * spacing)} ({misfit[axis]:+.0%}, limit {MAX_MISFIT:.0%})"
         )
+    fits = fitting_spacing(size, spacing)
+    finer = f"a particle_spacing of {_mm(fits)}, or " if volume(geometry) / fits**3 <= MAX_PARTICLES else ""
+    raise ValueError(
+        f"{_name(geometry)} is {found}: choose {finer}a size that along each axis is a whole number of times "
+        f"{_mm(spacing)}, at least {FEWEST_LAYERS}"
+    )
+
+
+def fitting_spacing(size: FloatArray, spacing: float) -> float:
+    """The largest spacing [m], of `spacing` and what cuts the shortest of the sides `size` (3,) [m] into whole layers,
+    whose lattice has FEWEST_LAYERS along each and misses none by more than MAX_MISFIT. As it is printed: 4 digits."""
+    shortest, fits = float(size.min()), spacing
+    layers = max(FEWEST_LAYERS, math.ceil(shortest / spacing - 1e-9))
+    while True:
+        count = np.rint(size / fits)
+        if count.min() >= FEWEST_LAYERS and float(np.abs(count * fits / size - 1).max()) <= MAX_MISFIT:
+            return fits
+        fits, layers = float(f"{shortest / layers * 1e3:.4g}") * 1e-3, layers + 1
 
 
 def distance(geometry: Shape, points: ArrayLike, edge_radius: float = 0.0) -> FloatArray:

@@ -6,13 +6,17 @@ do not depend on when, or with which others, it is computed.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacsim.geometry.mesh import FloatArray, fingerprint, make_surface, signed_distance_on_grid
-from tacsim.geometry.shapes import BAND, MAX_NODES, centred
+from tacsim.geometry.shapes import BAND, LEVEL, MAX_NODES, centred
 from tacsim.models.scene import Mesh
 
 Index = NDArray[np.int64]
@@ -20,12 +24,22 @@ Index = NDArray[np.int64]
 TILE = 32  # nodes along an edge
 SURFACES = 64  # meshes remembered in one process, the latest used; most have 1 to 4 MB
 KEPT = 2_000  # tiles in one process, of all meshes, those used last: 260 MB; one grid has 610 at most
+SHARED = 4_000  # tiles in a folder that processes share: 520 MB
 PIECE = 4  # grid spacings: edge of the pieces that the surface is cut into for the search
 PIECES = (4_000, 100_000)  # at least, about at most
 
 # By file, content, spacing and number, so that a tile keeps no mesh in memory; the oldest first. Worlds of several
 # threads come here one after the other (`tacsim.compute.runtime.launching`).
 _kept: dict[tuple[Mesh, str, float, tuple[int, ...]], NDArray[np.float32]] = {}
+_folder: Path | None = None  # of tiles that other processes have, too
+
+
+def share_tiles(folder: Path | None) -> None:
+    """From now on tiles are also written into this folder, and taken from there: what one process has computed, others
+    with the same folder need not. A tile has the same bits either way; a folder that is full or gone costs time alone.
+    """
+    global _folder
+    _folder = folder
 
 
 class TiledDistance:
@@ -37,12 +51,37 @@ class TiledDistance:
         self.name = geometry.path
         self.spacing = spacing
         self.vertices: FloatArray = np.asarray(mesh.vertices, np.float64)  # (n, 3)
+        self._faces = np.asarray(mesh.faces, np.int64)  # (m, 3)
         self.half: FloatArray = np.asarray(mesh.extents, np.float64) / 2  # of the bounding box (3,)
         self.origin: FloatArray = -self.half - BAND * spacing
         fewest, most = PIECES
         self._surface = make_surface(mesh, int(np.clip(2.3 * mesh.area / (PIECE * spacing) ** 2, fewest, most)))
         self._last = np.ceil((self.half - self.origin) / spacing + BAND).astype(np.int64) // TILE
         self._key = geometry, content, spacing
+
+    def lowest(self, axes: FloatArray, place: FloatArray, half: FloatArray) -> FloatArray | None:
+        """The lowest point (3,) of the mesh turned by `axes` (3, 3) and then moved by `place` (3,) [m].
+
+        Where that lies beside a rectangle of half sides `half` (2,) round the origin: the lowest point of the mesh's
+        edges over the rectangle, of a level edge the middle; None where there is no edge."""
+        at = self.vertices @ axes.T + place
+        tip: FloatArray = at[np.argmin(at[:, 2])]
+        if (np.abs(tip[:2]) <= half).all():
+            return tip
+        start, end = at[self._faces].reshape(-1, 3), at[np.roll(self._faces, -1, axis=1)].reshape(-1, 3)
+        step = end - start
+        with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 of an edge along a side is within it
+            crossings = (np.stack([-half, half])[:, None] - start[:, :2]) / step[:, :2]
+        enter = np.fmax(np.nan_to_num(np.fmin(*crossings), nan=-np.inf, neginf=-np.inf).max(axis=1), 0.0)
+        leave = np.fmin(np.nan_to_num(np.fmax(*crossings), nan=np.inf, posinf=np.inf).min(axis=1), 1.0)
+        over = enter <= leave
+        if not over.any():
+            return None
+        start, step, enter, leave = start[over], step[over], enter[over], leave[over]
+        level = np.abs(step[:, 2]) <= LEVEL * np.linalg.norm(step, axis=1)
+        share = np.where(level, (enter + leave) / 2, np.where(step[:, 2] > 0, enter, leave))
+        points = start + share[:, None] * step
+        return np.asarray(points[np.argmin(points[:, 2])])
 
     def around(self, low: FloatArray, high: FloatArray) -> tuple[Index, Index]:
         """The first tile (3,) and the one after the last, along each axis, that points between two corners lie in."""
@@ -68,14 +107,36 @@ class TiledDistance:
         key = (*self._key, index)
         tile = _kept.pop(key, None)
         if tile is None:
-            x, y, z = (
-                start + self.spacing * (n * TILE + np.arange(TILE)) for start, n in zip(self.origin, index, strict=True)
-            )
-            tile = signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing).astype(np.float32)
+            tile = self._shared(index)
         _kept[key] = tile
         if len(_kept) > KEPT:
             del _kept[next(iter(_kept))]
         return tile
+
+    def _shared(self, index: tuple[int, ...]) -> NDArray[np.float32]:
+        """The tile as another process has left it, or computed and left for others."""
+        if _folder is None:
+            return self._computed(index)
+        geometry, content, spacing = self._key
+        name = repr((geometry.model_dump(exclude={"path"}), content, spacing, index))
+        path = _folder / hashlib.sha256(name.encode()).hexdigest()
+        with contextlib.suppress(OSError):
+            data = path.read_bytes()
+            if len(data) == 4 * TILE**3:
+                return np.frombuffer(data, np.float32).reshape(TILE, TILE, TILE)
+        tile = self._computed(index)
+        with contextlib.suppress(OSError):
+            if sum(1 for _ in _folder.iterdir()) < SHARED:
+                partial = path.with_suffix(f".{os.getpid()}")
+                partial.write_bytes(tile.tobytes())
+                partial.replace(path)
+        return tile
+
+    def _computed(self, index: tuple[int, ...]) -> NDArray[np.float32]:
+        x, y, z = (
+            start + self.spacing * (n * TILE + np.arange(TILE)) for start, n in zip(self.origin, index, strict=True)
+        )
+        return signed_distance_on_grid(self._surface, (x, y, z), BAND * self.spacing).astype(np.float32)
 
 
 def tiled_distance(geometry: Mesh, spacing: float) -> TiledDistance:

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from tacsim.control.approach import NoTouch
 from tacsim.gym import encode
 from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.plugin import register_envs
@@ -25,12 +26,14 @@ from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.rig import Rig
 from tacsim.sim.stage import Stage
-from tacsim.tasks import make_task
+from tacsim.tasks import BadDraws, GoalOutOfReach, make_task
 from tacsim.tasks.action import action_from, vector_of
 from tacsim.tasks.effort import Effort
 from tacsim.tasks.task import Task, judge
 
 Result = tuple[encode.Flat, float, bool, bool, dict[str, Any]]  # of a step
+CANNOT_BEGIN = (GoalOutOfReach, NoTouch, SimulationDiverged)  # with this draw
+MOST_REFUSED = 8  # draws in a row
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +58,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
 
     info: distance [m], is_success, score, body_height [m], peak_force [N] and work [J] of the arms since reset, the
     rig's diagnostics, and at the end what else the task measures; with variants also `variant`, the
-    number of the one that is played, and at reset `drawn`, what it consists of.
+    number of the one that is played, and at reset `drawn`, what it consists of, and `refused`: draws before it that
+    could not begin, and why.
 
     Args:
         space: of the observations; None: the rig is reset once to learn the shapes.
@@ -90,6 +94,8 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self.rig, self.task, self.render_mode = rig, task, render_mode
         self._variants, self._stage, self._wear = tuple(variants), stage, wear
         self._played: int | None = None  # the variant
+        self.next_variant: int | None = None  # that the next reset plays, if it can begin; None: a drawn one
+        self.refused: list[str] = []  # draws that could not begin, and why, of all resets
         if space is None:
             self._begin(seed=0)
             space = encode.space_of(self._flat)
@@ -100,6 +106,11 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
         self._sent: Mapping[str, Pose | None] = {}  # by the last begin_step
         self._failure: LimitExceeded | SimulationDiverged | None = None
         self._done: Result | None = None  # a step that is done, but not taken yet
+
+    @property
+    def variants(self) -> tuple[Variant, ...]:
+        """Those that resets draw from."""
+        return self._variants
 
     @property
     def observation(self) -> Observation:
@@ -116,19 +127,41 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[encode.Flat, dict[str, Any]]:
-        """The same seed gives the same episode.
+        """The same seed gives the same episode. A drawn variant that cannot begin (a goal out of reach, no gentle
+        contact, a simulation that diverges) is drawn anew.
 
         options: `variant`, the number of one of the environment's variants, in place of a drawn one; or `task`
         (SqueezeConfig, RepositionConfig) and `scene` (Scene), which hold until others are given. Raises ValueError for
-        others, for what cannot change between episodes, and for a goal that no policy can reach (GoalOutOfReach).
+        others, for what cannot change between episodes, for a goal that no policy can reach (GoalOutOfReach), and for
+        too many bad draws (BadDraws).
         """
         super().reset(seed=seed)
-        self._choose(dict(options or {}))
-        self._begin(seed=int(self.np_random.integers(2**31)))
+        chosen, refused = dict(options or {}), list[str]()
+        while not self._begun(chosen, refused):
+            if len(refused) == MOST_REFUSED:
+                raise BadDraws(
+                    f"{MOST_REFUSED} draws in a row cannot begin an episode, the last with {refused[-1]}; narrow the "
+                    "distributions"
+                )
         info = self._judged()[1]
         if self._played is not None:
             info["drawn"] = self._variants[self._played].drawn
+        if refused:
+            info["refused"] = "\n".join(refused)
         return self._flat, info
+
+    def _begun(self, options: dict[str, Any], refused: list[str]) -> bool:
+        """Chooses and begins an episode; False, and why in `refused`, for a drawn one that cannot begin."""
+        self._choose(options)
+        try:
+            self._begin(seed=int(self.np_random.integers(2**31)))
+        except CANNOT_BEGIN as failure:
+            if self._played is None or options:
+                raise
+            refused.append(f"{self._variants[self._played].drawn}: {failure}")
+            self.refused.append(refused[-1])
+            return False
+        return True
 
     def _choose(self, options: dict[str, Any]) -> None:
         """The task and the scene of the next episode."""
@@ -137,7 +170,7 @@ class TacsimEnv(gymnasium.Env[encode.Flat, NDArray[np.float32]]):
             raise ValueError(f"reset knows the options variant, task and scene, got {unknown}")
         chosen, played = options, None
         if self._variants and not {"task", "scene"} & set(options):
-            number = options.get("variant")
+            number, self.next_variant = options.get("variant", self.next_variant), None
             played = int(self.np_random.integers(len(self._variants))) if number is None else int(number)
             if not 0 <= played < len(self._variants):
                 raise ValueError(f"this environment has variants 0 to {len(self._variants) - 1}, got {number}")

@@ -44,6 +44,7 @@ SCALES = {
     "torque": 0.05,  # [N m]
     "pressure": 5e-3,  # where the normal force acts, less where it did at the first touch; sensor x and y [m]
     "moved": 5e-3,  # of an arm since reset, in the axes of its sensor then [m]
+    "stepped": 0.5e-3,  # of an arm since the last observation, in the axes of its sensor at reset [m]
     "between": 10e-3,  # from the first arm's sensor to another's, in the axes of the first [m]
     "turn": 0.1,  # first two columns of a rotation, less those of no rotation [-]
     "goal": 10e-3,  # [m]
@@ -64,6 +65,7 @@ PARTS: dict[str, dict[str, str]] = {
     "pressure": {"pressure_x": "pressure", "pressure_y": "pressure"},
     "moved": {f"moved_{axis}": "moved" for axis in "xyz"}
     | {f"turn_{column}{axis}": "turn" for column in "xy" for axis in "xyz"},
+    "stepped": {f"stepped_{axis}": "stepped" for axis in "xyz"},
     "between": {f"between_{axis}": "between" for axis in "xyz"},
 }
 _UNTURNED = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -86,6 +88,7 @@ class FeatureEncoder:
         self._goal: Arrays = {}
         self._start: Mapping[str, Pose] = {}
         self._pressed: dict[str, FloatArray] = {}  # where the normal force acted first
+        self._before: Mapping[str, Pose] = {}  # poses of the last observation
         self._frames: deque[Arrays] = deque(maxlen=features.frames)
 
     @property
@@ -132,7 +135,7 @@ class FeatureEncoder:
                 raise IncompatibleRig("the policy is told a goal, but the rig has no task: name one (--task)")
             self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
         self._start = {name: observation.arms[name].pose for name in self.features.arms}
-        self._pressed = {}
+        self._pressed, self._before = {}, self._start
         self._frames.extend([self._encode(observation)] * self.features.frames)
         return self._stacked()
 
@@ -155,6 +158,7 @@ class FeatureEncoder:
         if wanted.touch:
             arms = {name: observation.arms[name] for name in wanted.arms}
             arrays["touch"] = np.concatenate([self._numbers(quantity, touches, arms) for quantity in wanted.touch])
+            self._before = {name: arm.pose for name, arm in arms.items()}
         return {key: value.astype(np.float32) for key, value in arrays.items()}
 
     def _map(self, touch: TactileObservation, kind: Channel) -> FloatArray:
@@ -185,6 +189,8 @@ class FeatureEncoder:
             each = [self._pressure(name, arm) / SCALES["pressure"] for name, arm in arms.items()]
         elif quantity == "moved":
             each = [moved(self._start[name], arm.pose) for name, arm in arms.items()]
+        elif quantity == "stepped":
+            each = [self._stepped(name, arm.pose) / SCALES["stepped"] for name, arm in arms.items()]
         else:
             first, *others = arms.values()
             each = [se3.relative(first.pose, arm.pose).position / SCALES["between"] for arm in others]
@@ -194,6 +200,11 @@ class FeatureEncoder:
         """(2,) since the first touch of the episode [m]; 0 without contact."""
         here = pressed_at(arm)
         return np.zeros(2) if here is None else here - self._pressed.setdefault(name, here)
+
+    def _stepped(self, name: str, pose: Pose) -> FloatArray:
+        """(3,) since the last observation [m]."""
+        now, before = (se3.relative(self._start[name], each).position for each in (pose, self._before[name]))
+        return now - before
 
     def _centroid(self, touch: TactileObservation) -> FloatArray:
         """(2,) of what is pressed in where there is contact [m]; the middle without contact."""

@@ -13,7 +13,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from tacsim.compute.threads import map_parallel
 from tacsim.gym.env import TacsimEnv
 from tacsim.models.scene import Scene
 from tacsim.physics.failure.health import SimulationDiverged
@@ -130,7 +129,8 @@ class TacsimVectorEnv(SyncVectorEnv):
                 member.env.fail(ends[index])
             elif member.env.commanded:
                 member.clock.finish(ends[index])
-        map_parallel([member.env.end_step for member in stepping.values()])
+        for member in stepping.values():  # on threads they would wait for the interpreter more than they would win
+            member.env.end_step()
 
 
 def _listed(indices: Sequence[int]) -> str:

@@ -10,7 +10,7 @@ from tacsim.models.hardware import Name
 from tacsim.models.quantity import Config, Length
 
 Channel = Literal["height", "slope", "contact", "image", "picture"]
-Quantity = Literal["area", "depth", "centroid", "shear", "wrench", "pressure", "moved", "between"]
+Quantity = Literal["area", "depth", "centroid", "shear", "wrench", "pressure", "moved", "stepped", "between"]
 
 
 class MapGrid(Config):

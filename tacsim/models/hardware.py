@@ -208,7 +208,8 @@ class CameraSensorConfig(Config):
     def _one_geometry(self) -> Self:
         if sum(each is not None for each in (self.model, self.corners, self.calibration, self.marker_pitch)) > 1:
             raise ValueError(
-                "give one of model, corners, calibration, marker_pitch: each says where the gel lies in the picture"
+                "give one of model, corners, calibration, marker_pitch (the others null): each says where the gel lies "
+                "in the picture"
             )
         if self.region is not None and self.calibration is not None:
             raise ValueError("a calibration brings its own region: give it to `tacsim calibrate sensor --region`")

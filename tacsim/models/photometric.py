@@ -7,7 +7,8 @@ the image, each from -1/2 to 1/2 across it, the relative change of colour (I - I
     sum over normal terms nx, ny, 1 - nz, nx^2, nx ny, ny^2, nx^3, ... (up to `degree`) of weight * product.
 
 No term is constant: the flat gel shows I0. Degree 1 at position 0 is the most that directional diffuse lights can do.
-What one place of the surface hides from another is added: tacsim.models.shadows.
+Two things that the slope does not tell are added: the colour of what is pressed in, which differs from I0 where it is
+flat, too (:class:`DepthColour`), and what one place of the surface hides from another (tacsim.models.shadows).
 """
 
 from __future__ import annotations
@@ -25,8 +26,23 @@ from tacsim.models.shadows import CastShadows, shadow_terms
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Floating = NDArray[np.floating]
 
 Weight = Annotated[float, Field(allow_inf_nan=False)]
+DEPTH_TERMS = 5
+
+
+class DepthColour(Config):
+    """What depth changes of a colour, whatever the slope: pressed gel is nearer to lamps and camera, and thinner.
+
+    With w = height into the gel / `deepest`, in 0..1 (beyond, as at the end), the relative change in each channel is
+    the sum over DEPTH_TERMS w, w u, w v, w^2, w^3 of weight * term.
+    """
+
+    deepest: Annotated[float, Field(gt=0, le=10)]  # height up to which it was calibrated [widths of the picture]
+    weights: Annotated[
+        tuple[tuple[Weight, Weight, Weight], ...], Field(min_length=DEPTH_TERMS, max_length=DEPTH_TERMS)
+    ]  # of R, G, B
 
 
 class PhotometricModel(Config):
@@ -39,6 +55,7 @@ class PhotometricModel(Config):
     steepest: Annotated[float, Field(gt=0, le=10)]  # slope up to which it was calibrated; steeper ones are clipped [-]
     blur: Annotated[float, Field(ge=0, le=10)] = 0.0  # standard deviation of the camera's blur [px]
     shadows: CastShadows | None = None  # None: none are seen
+    depth: DepthColour | None = None  # None: flat gel has one colour, however deep it is pressed
 
     @model_validator(mode="after")
     def _one_weight_a_term(self) -> Self:
@@ -55,7 +72,7 @@ def term_count(degree: int, position: int) -> int:
     return math.comb(degree + 2, 2) * math.comb(position + 2, 2)
 
 
-def normal_terms(gradient: NDArray[np.floating], degree: int) -> NDArray[np.floating]:
+def normal_terms(gradient: Floating, degree: int) -> Floating:
     """(terms, ...) the terms of the normal for slopes (..., 2), in the order of the weights."""
     gx, gy = gradient[..., 0], gradient[..., 1]
     terms = np.empty((term_count(degree, 0), *gx.shape), dtype=gradient.dtype)
@@ -70,7 +87,7 @@ def normal_terms(gradient: NDArray[np.floating], degree: int) -> NDArray[np.floa
     return terms
 
 
-def position_terms(u: NDArray[np.floating], v: NDArray[np.floating], position: int) -> list[NDArray[np.floating]]:
+def position_terms(u: Floating, v: Floating, position: int) -> list[Floating]:
     """The terms of the place in the image for u, v (...,) in -1/2..1/2."""
     products = [np.ones_like(u)]  # each by u, and the last by v, from one order to the next
     last = products
@@ -78,6 +95,12 @@ def position_terms(u: NDArray[np.floating], v: NDArray[np.floating], position: i
         last = [*(term * u for term in last), last[-1] * v]
         products = products + last
     return products
+
+
+def depth_terms(height: Floating, deepest: float, u: Floating, v: Floating) -> Floating:
+    """(DEPTH_TERMS, ...) for heights (...,) into the gel, in the unit of `deepest`, at places u, v in -1/2..1/2."""
+    w = np.clip(height * height.dtype.type(1 / deepest), 0, 1)
+    return np.stack([w, w * u, w * v, w * w, w * w * w])
 
 
 def place_in_image(columns: int, rows: int) -> tuple[Float64, Float64]:
@@ -113,6 +136,7 @@ class PhotometricLight:
         weights = (np.array(model.weights) * mean).astype(np.float32).reshape(-1, self._terms, 3)
         self._weights = np.ascontiguousarray(weights.transpose(0, 2, 1)).reshape(-1, self._terms)  # place and channel
         self._shadows = None if model.shadows is None else (np.array(model.shadows.weights) * mean).astype(np.float32)
+        self._depth = None if model.depth is None else (np.array(model.depth.weights) * mean).astype(np.float32)
 
     def change(self, gradient: Float32, u: Float32, v: Float32) -> tuple[Float32, int]:
         """(..., n, 3) change of colour under slopes (..., n, 2) at places u, v (..., n) in -1/2..1/2, before blur, and
@@ -127,6 +151,13 @@ class PhotometricLight:
         at_places = (self._weights @ normals).reshape(*normals.shape[:-2], len(places), 3, -1)
         red, green, blue = np.einsum("...pcn,p...n->c...n", at_places, places)
         return np.asarray(cv2.merge([red, green, blue]), dtype=np.float32).reshape(*gradient.shape[:-1], 3), beyond
+
+    def depth(self, height: Float32, u: Float32, v: Float32) -> Float32:
+        """(..., 3) change of colour by heights (...,) [widths of the picture] at places u, v (...,), before
+        blur. Of a model with `depth`."""
+        assert self._depth is not None and self._model.depth is not None
+        terms = depth_terms(height, self._model.depth.deepest, u, v)
+        return np.asarray(np.tensordot(terms, self._depth, axes=(0, 0)), dtype=np.float32)
 
     def shadow(self, horizons: Sequence[Float32], u: Float32, v: Float32) -> Float32:
         """(..., 3) change of colour by cast shadows, for the horizons (...,) of each lamp at places u, v (...,), before

@@ -53,6 +53,10 @@ class Distribution(Config):
         first = (self.uniform or self.log_uniform or self.normal or ((),))[0]
         return f"[{', '.join(drawn)}]" if isinstance(first, tuple) else drawn[0]
 
+    def ends(self) -> list[str]:
+        """The least and the greatest that can be drawn, as YAML texts; none of a choice."""
+        return [_text(end) for end in self.within or self.uniform or self.log_uniform or ()]
+
     def _elements(self) -> list[tuple[tuple[float, ...], str]]:
         """For each element its numbers (two; of a normal four: mean, deviation, bounds), and their unit."""
         ends = [*(self.uniform or self.log_uniform or self.normal or ()), *(self.within or ())]
@@ -81,6 +85,16 @@ class Randomisation(Config):
             for number in range(self.draws)
         ]
 
+    def limits(self) -> list[list[str]]:
+        """Overrides like those of `drawn`: the first draw with one value at an end of its range, for each that has one.
+        Other seeds may draw what lies near."""
+        first = self.drawn()[0]
+        return [
+            [*first[:at], f"{key}={end}", *first[at + 1 :]]
+            for at, (key, each) in enumerate(self.values.items())
+            for end in each.ends()
+        ]
+
 
 def _numbers(row: Sequence[Number]) -> tuple[tuple[float, ...], str]:
     found = []
@@ -98,8 +112,8 @@ def _numbers(row: Sequence[Number]) -> tuple[tuple[float, ...], str]:
 def _check(elements: tuple[tuple[float, ...], str], kind: str) -> None:
     numbers, _ = elements
     least, greatest = numbers[-2:]
-    if not least < greatest:
-        raise ValueError(f"[{least:g}, {greatest:g}]: the least comes first, and is less than the greatest")
+    if not least <= greatest:
+        raise ValueError(f"[{least:g}, {greatest:g}]: the least comes first, then the greatest")
     if kind == "log_uniform" and not least > 0:
         raise ValueError(f"log_uniform from {least:g}: its bounds must be positive")
     if kind == "normal":

@@ -155,6 +155,7 @@ class RecordConfig(Config):
     """What a recording holds beyond pictures, states and actions."""
 
     arm_packages: bool = False  # every package of the controllers of UR arms, as it came (500 Hz)
+    body: bool = False  # of simulated rigs: some thousand particles of the body a step, to look at
 
 
 class RigConfig(Config):
@@ -191,6 +192,10 @@ class RigConfig(Config):
                 "no_packages",
                 "this rig has no UR arm, whose packages could be recorded; leave it out",
                 {"at": ("record", "arm_packages")},
+            )
+        if self.record.body and (self.clock != "sim" or self.scene is None or self.scene.body is None):
+            raise PydanticCustomError(
+                "no_body", "only a simulated rig with a body knows its body; leave it out", {"at": ("record", "body")}
             )
         for name, arm in self.arms.items():
             limits = None if isinstance(arm, ReplayArmConfig) else arm.limits

@@ -190,7 +190,7 @@ def _shortest_side(geometry: Box | Cylinder) -> float:
 class Settling(Config):
     """The quasi-static controller: how exact a state of rest is wanted, and how long it may take."""
 
-    tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance and change of force per check, relative
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-2  # force balance, change of force, and creep to come, relative
     mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # peak speed / wave speed; None: see Scene.peak_mach
     max_substeps: Annotated[int, Field(ge=0, le=1_000_000)] = 2000  # hold at most this long a move
     flow_mach: Annotated[float, Field(gt=0, le=0.3)] | None = None  # speed of motions that flow; None: Scene.flow_mach

@@ -33,7 +33,7 @@ def check_fits(markers: Markers, gel_size: tuple[float, float]) -> None:
 
 
 def marker_flow(surface: GelSurface, markers: Markers) -> NDArray[np.float32]:
-    """(rows, columns, 2) in-plane displacement of the dots, sensor x, y [m]."""
+    """(rows, columns, 2) in-plane displacement of the dots, sensor x, y [m]; of those behind a fold, too."""
     return _displacement(surface, markers)[..., :2].astype(np.float32)
 
 
@@ -89,7 +89,33 @@ def marker_coverage(
     return coverage
 
 
-def marker_transmission(surface: GelSurface, markers: Markers, geometry: SensorGeometry) -> NDArray[np.float32]:
-    """(H, W) fraction of its light that each pixel keeps under the dots of the deformed surface."""
-    coverage = marker_coverage(*marker_discs(surface, markers, geometry), (geometry.height, geometry.width))
+def _shown(
+    surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(rows, columns) False for dots of which no pixel round their centres shows anything."""
+    rest = rest_positions(markers)
+    places = (rest + _displacement(surface, markers)[..., :2]) / geometry.pixel_pitch + geometry.principal
+    rest = rest / geometry.pixel_pitch + geometry.principal
+    reach = max(markers.radius / geometry.pixel_pitch, 2.0)
+    shown = np.zeros(rest.shape[:2], dtype=np.bool_)
+    for step in np.ndindex(3, 3):
+        u, v = np.moveaxis(np.rint(places).astype(np.intp) + np.array(step) - 1, -1, 0)
+        there = at_rest[v.clip(0, geometry.height - 1), u.clip(0, geometry.width - 1)]
+        shown |= np.linalg.norm(there - rest, axis=-1) <= reach
+    return shown
+
+
+def marker_transmission(
+    surface: GelSurface, markers: Markers, geometry: SensorGeometry, at_rest: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """(H, W) fraction of its light that each pixel keeps under the dots of the deformed surface.
+
+    at_rest: (H, W, 2) column, row [px] where what each pixel shows lies on the untouched gel: of a surface that folds
+    over, whose hidden dots are not drawn.
+    """
+    centres, radii = marker_discs(surface, markers, geometry)
+    if at_rest is not None:
+        shown = _shown(surface, markers, geometry, at_rest)
+        centres, radii = centres[shown], radii[shown]
+    coverage = marker_coverage(centres, radii, (geometry.height, geometry.width))
     return np.float32(1.0) - np.float32(1.0 - INK) * coverage

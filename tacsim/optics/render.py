@@ -117,7 +117,8 @@ class Renderer:
     def _inked(self, surface: GelSurface, table: SurfaceTable, points: Float32) -> Callable[[slice], Float32] | None:
         """Rows of an image -> (rows, W, 1 or 3) share of its light that each pixel keeps under the dots."""
         if self._markers is not None:
-            dots = marker_transmission(surface, self._markers, self.model.geometry)
+            at_rest = table.at_rest(points, self._grid) if table.folded else None
+            dots = marker_transmission(surface, self._markers, self.model.geometry, at_rest)
             return lambda rows: dots[rows, :, None]
         if self._ink is not None:
             ink = self._ink
@@ -160,7 +161,11 @@ class Renderer:
         import cv2
 
         assert self.model.photometric is not None
-        colours, beyond = calibrated.change(table.fields[..., 1:], *self._grid.in_image(*table.place()))
+        place = self._grid.in_image(*table.place())
+        colours, beyond = calibrated.change(table.fields[..., 1:], *place)
+        if self.model.photometric.depth is not None:
+            width = np.float32(self._grid.columns * self._grid.pitch)
+            colours += calibrated.depth(table.fields[..., 0] / width, *place)
         if self.model.photometric.shadows is not None:
             colours += shadow_colours(calibrated, self.model.photometric.shadows, table, self._grid)
         self._beyond = beyond / (colours.size // 3)

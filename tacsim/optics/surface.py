@@ -9,7 +9,8 @@ x = (x, y) sees the material point X with ``X + u_xy(X) = x``; there
 On a grid of image points both are looked up in a table over the gel whose points halve the lattice cells, where the
 spline is evaluated exactly: the gradient is linear between such points, so linear interpolation keeps it. The material
 points are found by fixed-point iteration in that table, as physics finds them in contact; where that does not converge
-(stretch above 2), Newton's method on the spline itself takes over.
+(stretch above 2), Newton's method on the spline itself takes over. Where the surface folds over itself (det J <= 0
+somewhere) several X are seen at one x, and tacsim.optics.fold finds which of them the camera sees.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from tacsim.interface import SurfaceMap
 from tacsim.models.scene import GelSurface
 from tacsim.models.sensor import CanonicalGrid, Markers
+from tacsim.optics.fold import EDGE_ON, visible_points
 from tacsim.optics.grid import PixelGrid, canonical_cells
 from tacsim.optics.markers import marker_flow
 from tacsim.optics.spline import LineMatrix, displacement_and_jacobian, line_matrices
@@ -38,7 +40,7 @@ CONVERGED = 1.0 / 64.0  # largest last step [table points]: half of what OpenCV'
 
 
 class SurfaceFolded(ValueError):
-    """The gel surface folds over itself: an image point shows no single material point."""
+    """The gel surface folds over itself: Newton's method finds no single material point of an image point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +55,10 @@ class SurfaceSample:
 def sample_surface(surface: GelSurface, grid: PixelGrid) -> SurfaceSample:
     """Height and gradient of the deformed surface at the points of `grid`.
 
-    Raises ValueError for an invalid surface (shape, NaN, more sideways motion than the gel is wide),
-    SurfaceFolded where it folds over.
+    Where the surface folds over itself it is the sheet that the camera sees, and its slope is that of a sheet with
+    det J of EDGE_ON where it turns away.
+
+    Raises ValueError for an invalid surface (shape, NaN, more sideways motion than the gel is wide).
     """
     table = SurfaceTable(surface)
     seen, valid = table.seen(table.fields, grid)
@@ -65,12 +69,13 @@ class SurfaceTable:
     """A gel surface at material points that halve the cells of its lattice; rows along y, columns along x."""
 
     fields: Float32  # (rows, columns, 3) height [m], its derivatives by x and y in the image [-]
+    folded: bool  # the surface folds over itself somewhere
 
     def __init__(self, surface: GelSurface) -> None:
         """Raises what :func:`sample_surface` raises."""
         check_surface(surface)
         self._surface = surface
-        self.fields, self._lateral = _table(surface)
+        self.fields, self._lateral, self.folded = _table(surface)
         self.pitch = surface.spacing / _table_points(surface)  # [m]
 
     def of_nodes(self, values: Float32) -> Float32:
@@ -97,7 +102,7 @@ class SurfaceTable:
 
     def seen(self, values: Float32, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
         """`values` (rows, columns, n <= 4) of the table's points, linear between them, as seen at the points of `grid`:
-        (H, W, n), 0 outside the gel; and (H, W) False there. Not `fine` will do for colours. Raises SurfaceFolded.
+        (H, W, n), 0 outside the gel; and (H, W) False there. Not `fine` will do for colours.
         """
         points, inside = self.points(grid, fine=fine)
         return self.at(values, points, inside), inside
@@ -112,6 +117,17 @@ class SurfaceTable:
 
     def points(self, grid: PixelGrid, *, fine: bool = True) -> tuple[Float32, NDArray[np.bool_]]:
         """(H, W, 2) column, row in the table of what is seen at the points of `grid`; (H, W) False outside the gel."""
+        if not self.folded:
+            try:
+                return self._of_one_sheet(grid, fine)
+            except SurfaceFolded:  # between the points of the table
+                pass
+        seen = _table_coordinates(self._surface.origin, self.pitch, grid)[0, 0].astype(np.float64)
+        at = np.indices(self.fields.shape[:2], dtype=np.float64)[::-1].transpose(1, 2, 0) + self._lateral
+        return visible_points((at - seen) * (self.pitch / grid.pitch), self.fields[..., 0], grid.shape)
+
+    def _of_one_sheet(self, grid: PixelGrid, fine: bool) -> tuple[Float32, NDArray[np.bool_]]:
+        """:meth:`points` of a surface that does not fold over. Raises SurfaceFolded where it turns out to do so."""
         # Where the grid is finer than the table, points are found on a coarser one, twice as fine as the table or, not
         # `fine`, just as fine, and are linear between those: the surface's sideways motion is smooth. The first errs
         # less than the look-up rounds, the second about as much.
@@ -168,7 +184,8 @@ def surface_map(surface: GelSurface, grid: CanonicalGrid, markers: Markers | Non
 def material_points(surface: GelSurface, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 2) material points X with X + u(X) = x for image points x (n, 2) [m], by Newton on the spline itself.
 
-    Exact to 1 nm and slow; :func:`sample_surface` is fast on a grid. Raises SurfaceFolded where there is none.
+    Exact to 1 nm and slow; :func:`sample_surface` is fast on a grid. Raises SurfaceFolded where there is none, or
+    several: of those :class:`SurfaceTable` finds the one that is seen.
     """
     found = np.array(points, dtype=np.float64)
     displacement, _ = displacement_and_jacobian(surface, found)
@@ -208,26 +225,39 @@ def check_surface(surface: GelSurface) -> None:
         raise ValueError(f"gel surface moved {lateral:.3g} m sideways, more than the gel is wide ({width:.3g} m)")
 
 
-def _table(surface: GelSurface) -> tuple[Float32, Float32]:
-    """(height, gradient x, gradient y) and (u_x, u_y [table points]) at material points over the gel, rows along y."""
+def _table(surface: GelSurface) -> tuple[Float32, Float32, bool]:
+    """(height, gradient x, gradient y) and (u_x, u_y [table points]) at material points over the gel, rows along y; and
+    whether the surface folds over at some of them. The slope of what faces away is that of a sheet seen edge-on: it is
+    read only between such points and visible ones."""
+    displacement = np.asarray(surface.displacement, dtype=np.float32)
+    return _table_of(displacement.tobytes(), displacement.shape, surface.spacing, tuple(surface.origin))
+
+
+@lru_cache(maxsize=4)  # a picture and a map of one surface are asked one after the other
+def _table_of(
+    displacement: bytes, shape: tuple[int, ...], spacing: float, origin: tuple[float, float]
+) -> tuple[Float32, Float32, bool]:
+    """The same for everybody: not to be written to."""
+    control = np.frombuffer(displacement, np.float32).reshape(shape)
+    surface = GelSurface(control, spacing, origin)
     points = _table_points(surface)
-    value_x, slope_x = _table_matrices(surface.displacement.shape[0], points)
-    value_y, slope_y = _table_matrices(surface.displacement.shape[1], points)
-    control = np.asarray(surface.displacement, dtype=np.float32)
+    value_x, slope_x = _table_matrices(shape[0], points)
+    value_y, slope_y = _table_matrices(shape[1], points)
     value = _product(value_y, control, value_x)
     by_x = _product(value_y, control, slope_x) / np.float32(surface.spacing)
     by_y = _product(slope_y, control, value_x) / np.float32(surface.spacing)
     a, b, c, d = 1.0 + by_x[0], by_y[0], by_x[1], 1.0 + by_y[1]  # J = [[a, b], [c, d]]
     determinant = a * d - b * c
-    if float(determinant.min()) <= 0.0:
-        row, column = np.argwhere(determinant <= 0.0).T
-        corner = np.array(surface.origin, dtype=np.float64)
-        raise _folded(corner + np.stack([column, row], axis=1) * (surface.spacing / points))
+    folded = float(determinant.min()) <= 0.0
+    if folded:
+        determinant = np.maximum(determinant, np.float32(EDGE_ON))
     inverse = -1.0 / determinant  # the minus turns u_z into height
     gradient_x, gradient_y = (d * by_x[2] - c * by_y[2]) * inverse, (a * by_y[2] - b * by_x[2]) * inverse
     fields = np.stack([-value[2], gradient_x, gradient_y], axis=-1)
     lateral = np.stack([value[0], value[1]], axis=-1) * np.float32(points / surface.spacing)
-    return fields, lateral
+    for array in (fields, lateral):
+        array.setflags(write=False)
+    return fields, lateral, folded
 
 
 @lru_cache(maxsize=16)
@@ -287,6 +317,6 @@ def look_up(field: Float32, points: Float32) -> Float32:
 def _folded(points: NDArray[np.float64]) -> SurfaceFolded:
     x, y = points[0] * 1e3
     return SurfaceFolded(
-        f"the gel surface folds over at {len(points)} points, first at x = {x:.3f} mm, y = {y:.3f} mm: "
-        "it is no height field there. Press or slide less, or with rounder edges (edge_radius of an indenter)"
+        f"the gel surface folds over at {len(points)} points, first at x = {x:.3f} mm, y = {y:.3f} mm: it is no height "
+        "field there"
     )

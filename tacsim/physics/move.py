@@ -14,7 +14,7 @@ class MoveStats:
 
     substeps: int  # explicit substeps of motion and hold together
     hold: int  # of which hold
-    residual: float  # largest relative force imbalance or force change at the end [-]
+    residual: float  # largest relative force imbalance or change at the end, or change still to come [-]
     # residual <= the scene's tolerance; and of an indenter with friction: no faster than it may be followed (at a
     # `settling.mach`), nor slid by an edge that catches on the mesh (`Indenter.catches`)
     settled: bool

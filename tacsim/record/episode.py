@@ -83,6 +83,7 @@ class Step:
     info: Mapping[str, float] = field(default_factory=dict)  # e.g. body_height, contact_signal_upper, residual
     seconds: float = 0.0  # wall time of the step [s]
     packages: Mapping[str, ArmPackages] = field(default_factory=dict)  # by arm, where the rig file asks for them
+    body: NDArray[np.float32] | None = None  # (n, 3) particles of a simulated body, where it does; world [m]
 
     @property
     def exposed(self) -> Mapping[str, float]:

@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
@@ -38,7 +39,7 @@ from tacsim.record.protobuf import (
     six,
 )
 from tacsim.record.protobuf import Step as StepMessage
-from tacsim.record.schemas import STEP_TOPIC
+from tacsim.record.schemas import BODY_TOPIC, STEP_TOPIC
 
 Messages = Mapping[str, Sequence[bytes]]  # of one step, by topic; only of packages there are several
 
@@ -96,6 +97,8 @@ def encode_step(step: Step, pitch: float, wall_offset: int = 0) -> list[Encoded]
         messages += _encode_arm(name, arm, clock)
     for name, packages in step.packages.items():
         messages += _encode_packages(name, packages, clock)
+    if step.body is not None:
+        messages.append(Encoded(BODY_TOPIC, PointCloud, clock.now, clock.now, _encode_points(step.body, clock.now)))
     for key, value in step.info.items():
         data = Scalar(value=value).SerializeToString()
         messages.append(Encoded(f"{STEP_TOPIC}/{key}", Scalar, clock.now, clock.now, data))
@@ -138,6 +141,7 @@ def decode_step(
             distance=record.distance if record.HasField("distance") else None,
             info=info,
             seconds=record.seconds,
+            body=_decode_points(_last(messages, BODY_TOPIC)) if record.body else None,
             packages=Recorded(
                 {name: each.lost for name, each in packages.items()},
                 partial(_decode_packages, packages, messages, what),
@@ -165,6 +169,7 @@ def _step_message(step: Step) -> Any:
         flow = surface is not None and surface.flow is not None
         made.frames.add(sensor=name, time=frame.time, index=int(frame.index), surface=surface is not None, flow=flow)
     made.arms.extend(step.arms)
+    made.body = step.body is not None
     made.info.extend(step.info)
     for name, packages in step.packages.items():
         made.packages.add(arm=name, count=len(packages.stamp), lost=packages.lost)
@@ -266,6 +271,25 @@ def _decode_grid(data: bytes, fields: tuple[str, ...]) -> NDArray[np.float32]:
         raise EpisodeError(f"a grid of {'/'.join(fields)} has {len(grid.data)} bytes, rows have {grid.row_stride}")
     cells = np.frombuffer(grid.data, dtype=_FLOAT).reshape(-1, columns, len(fields))
     return cells.astype(np.float32)
+
+
+def _encode_points(points: NDArray[np.float32], time: int) -> bytes:
+    """(n, 3) [m], in the world's frame. Raises ValueError for any other type or shape."""
+    if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"particles of the body must be (n, 3) float32, got {points.shape} {points.dtype}")
+    cloud = PointCloud(timestamp=_timestamp(time), frame_id=WORLD, point_stride=3 * _FLOAT.itemsize)
+    cloud.pose.orientation.w = 1.0
+    for number, axis in enumerate("xyz"):
+        cloud.fields.add(name=axis, offset=number * _FLOAT.itemsize, type=PackedElementField.FLOAT32)
+    cloud.data = points.astype(_FLOAT, copy=False).tobytes()
+    return cloud.SerializeToString()
+
+
+def _decode_points(data: bytes) -> NDArray[np.float32]:
+    cloud = PointCloud.FromString(data)
+    if cloud.point_stride != 3 * _FLOAT.itemsize or len(cloud.data) % cloud.point_stride:
+        raise EpisodeError(f"particles of the body: {len(cloud.data)} bytes, of {cloud.point_stride} each")
+    return np.frombuffer(cloud.data, dtype=_FLOAT).reshape(-1, 3).astype(np.float32)
 
 
 def _encode_arm(name: str, arm: ArmState, clock: _Clock) -> Iterator[Encoded]:

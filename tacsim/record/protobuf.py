@@ -78,6 +78,7 @@ _MESSAGES: dict[str, dict[str, str]] = {
         "arms": "repeated string",
         "info": "repeated string",  # each is a Scalar /step/{name}
         "packages": "repeated tacsim.Packages",
+        "body": "bool",  # this step has /body
     },
 }
 

@@ -3,8 +3,9 @@
 Topics: /{sensor}/image foxglove.CompressedImage (PNG), /{sensor}/surface and /{sensor}/flow foxglove.Grid (float32),
 /{sensor}/height foxglove.RawImage (the same height once more, float32 [mm], for viewers that draw no grid),
 /{arm}/pose foxglove.PoseInFrame, /{arm}/transform foxglove.FrameTransform (the same pose as a tree of frames),
-/{arm}/arm tacsim.Arm, if asked for /{arm}/packages tacsim.ArmPackage (each package of the controller), /step/{name}
-tacsim.Scalar (each number of the step's info), and last in a step /step tacsim.Step, which names the others.
+/{arm}/arm tacsim.Arm; if asked for /{arm}/packages tacsim.ArmPackage (each package of the controller) and /body
+foxglove.PointCloud (particles of a simulated body, float32 [m]); /step/{name} tacsim.Scalar (each number of the step's
+info), and last in a step /step tacsim.Step, which names the others.
 Format 1 had JSON in place of tacsim's own messages (`format_1.py`).
 
 Clocks: every `time` in tacsim's messages is the rig's own clock [s], exact; a rig of hardware counts its computer's
@@ -31,7 +32,7 @@ READABLE = ("1", FORMAT)
 MAX_ATTACHMENT = 64 << 20  # [bytes]
 MAX_PARTS = 64  # sensors, and arms, of an episode
 META, CLOSE = "tacsim.episode", "tacsim.close"  # metadata records at the start and at the end
-STEP_TOPIC = "/step"
+STEP_TOPIC, BODY_TOPIC = "/step", "/body"
 
 _SPEC = TypeAdapter(RigSpec)
 _NAMES = TypeAdapter(dict[str, str])

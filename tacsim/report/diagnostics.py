@@ -37,7 +37,7 @@ def timing(series: Series) -> dict[str, Any] | None:
     None for an episode that was not live.
     """
     done = series.after_reset()
-    arms = _named(done, ALIGNMENT)
+    arms = done.named(ALIGNMENT)
     if len(done) < 2 or not arms:
         return None
     periods = np.diff(done.time)
@@ -48,18 +48,12 @@ def timing(series: Series) -> dict[str, Any] | None:
         "age": {name: _spread(done.time - exposed) for name, exposed in done.exposed.items()},
         "alignment": {name: _spread(values) for name, values in arms.items()},
         "limits_hit": {name: _newest(done.info.get(LIMITS + name)) for name in arms},
-        "packages_lost": {name: int(np.nansum(values)) for name, values in _named(done, LOST).items()},
+        "packages_lost": {name: int(np.nansum(values)) for name, values in done.named(LOST).items()},
         "pictures": {
-            word: {name: _newest(values) for name, values in _named(done, key).items()}
-            for word, key in PICTURES.items()
+            word: {name: _newest(values) for name, values in done.named(key).items()} for word, key in PICTURES.items()
         },
         "real_time_factor": done.meta.spec.period / median if median > 0.0 else 0.0,
     }
-
-
-def _named(series: Series, prefix: str) -> dict[str, FloatArray]:
-    """Columns of `info` whose keys begin so, by the rest of the key."""
-    return {key.removeprefix(prefix): each for key, each in series.info.items() if key.startswith(prefix)}
 
 
 def _newest(counted: FloatArray | None) -> int:
@@ -105,7 +99,7 @@ def trust(series: Series) -> dict[str, dict[str, Any]] | None:
 
     None for an episode whose sensors know their surface by themselves.
     """
-    stale = _named(series, STALE)
+    stale = series.named(STALE)
     if not stale:
         return None
 

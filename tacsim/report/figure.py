@@ -133,6 +133,13 @@ def _line(axes: Axes, series: Series, values: FloatArray, colour: str, label: st
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
+def _lines(axes: Axes, series: Series, values: Mapping[str, FloatArray], scale: float = 1.0) -> None:
+    """A line for each name, in its colour."""
+    for name, colour in _colours(values):
+        _line(axes, series, values[name] * scale, colour, name)
+    _legend(axes)
+
+
 def _legend(axes: Axes) -> None:
     axes.legend(fontsize=8, frameon=False, labelcolor=INK)
 
@@ -163,32 +170,24 @@ def _draw_distance(axes: Axes, series: Series) -> None:
 
 def _draw_force(axes: Axes, series: Series) -> None:
     plain(axes, "force on each arm, |Fz|", "step", "N")
-    for name, colour in _colours(series.force):
-        _line(axes, series, series.force[name], colour, name)
+    _lines(axes, series, series.force)
     axes.margins(y=0.12)
     axes.set_ylim(0.0, max(axes.get_ylim()[1], 1.12 * axes.dataLim.ymax))  # a nearly constant force is not cut off
-    _legend(axes)
 
 
 def _draw_signal(axes: Axes, series: Series) -> None:
     plain(axes, "contact signal", "step", "signal")
-    for name, colour in _colours(series.signals):
-        _line(axes, series, series.signals[name], colour, name)
-    _legend(axes)
+    _lines(axes, series, series.signals)
 
 
 def _draw_depth(axes: Axes, series: Series) -> None:
     plain(axes, "deepest point of each gel", "step", "mm")
-    for name, colour in _colours(series.deepest):
-        _line(axes, series, series.deepest[name] * 1e3, colour, name)
-    _legend(axes)
+    _lines(axes, series, series.deepest, 1e3)
 
 
 def _draw_flow(axes: Axes, series: Series) -> None:
     plain(axes, "longest flow of each gel's markers", "step", "mm")
-    for name, colour in _colours(series.flow):
-        _line(axes, series, series.flow[name] * 1e3, colour, name)
-    _legend(axes)
+    _lines(axes, series, series.flow, 1e3)
 
 
 def _draw_signal_against_force(axes: Axes, series: Series) -> None:
@@ -279,8 +278,8 @@ def _draw_strip(figure: Figure, place: SubplotSpec, name: str, pictures: Sequenc
             axes.set_ylabel(_literal(name), fontsize=10, color=INK)
 
 
-def save(figure: Figure, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Writes a figure as PNG. A character of a name that the font lacks is drawn as a box, without a warning."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
-        figure.savefig(path, format="png", metadata=dict(metadata or {}))
+        figure.savefig(path, format="png")

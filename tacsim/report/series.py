@@ -118,24 +118,25 @@ class Series:
     @property
     def signals(self) -> dict[str, FloatArray]:
         """The contact signal of every sensor that has one."""
-        return self._named(SIGNAL)
+        return self.named(SIGNAL)
 
     @property
     def deepest(self) -> dict[str, FloatArray]:
         """The deepest point of every gel whose height is known [m]."""
-        return self._named(DEEPEST)
+        return self.named(DEEPEST)
 
     @property
     def steepest(self) -> dict[str, FloatArray]:
         """The steepest slope of every gel whose height is known [-]."""
-        return self._named(STEEPEST)
+        return self.named(STEEPEST)
 
     @property
     def flow(self) -> dict[str, FloatArray]:
         """The longest displacement of a marker, of every gel whose flow is known [m]."""
-        return self._named(LONGEST)
+        return self.named(LONGEST)
 
-    def _named(self, prefix: str) -> dict[str, FloatArray]:
+    def named(self, prefix: str) -> dict[str, FloatArray]:
+        """Columns of `info` whose keys begin so, by the rest of the key."""
         keys = sorted(key for key in self.info if key.startswith(prefix))
         return {key.removeprefix(prefix): self.info[key] for key in keys}
 

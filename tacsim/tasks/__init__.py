@@ -9,10 +9,11 @@ from tacsim.models.rig import KneadConfig, RepositionConfig, SqueezeConfig, Task
 from tacsim.tasks.knead import Knead
 from tacsim.tasks.reposition import Reposition
 from tacsim.tasks.squeeze import Squeeze
-from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Outcome, Task, judge, tolerance
+from tacsim.tasks.task import Axis, BadDraws, Estimator, GoalOutOfReach, Outcome, Task, judge, tolerance
 
 __all__ = [
     "Axis",
+    "BadDraws",
     "Estimator",
     "GoalOutOfReach",
     "Knead",

@@ -23,6 +23,10 @@ class Axis:
     direction: tuple[float, float, float]  # unit vector, world
 
 
+class BadDraws(ValueError):
+    """Distributions from which too many episodes are drawn that cannot begin."""
+
+
 class GoalOutOfReach(ValueError):
     """No policy can reach this goal with this body."""
 

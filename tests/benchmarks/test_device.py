@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from benchmarks.cases.real import ball_touch, costs
 from benchmarks.cases.registry import CPU_ONLY, select_cases
@@ -14,7 +13,7 @@ from benchmarks.harness import machine
 from benchmarks.harness.runner import run_cases
 from benchmarks.harness.schema import Device, Failure, Missing, Report, Row, json_schema
 from benchmarks.pages.page import NO_DEVICE, markdown
-from robot.cli import app
+from tests.robot.cli.invoked import tacsim, told
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "benchmarks" / "reference.json"
@@ -39,16 +38,6 @@ def row(report: Report, case: str) -> Row:
 
 def faster(row: Row, times: float, **changes: object) -> Row:
     return row.model_copy(update={"seconds": row.seconds / times, **changes})
-
-
-def tacsim(*words: str | Path, **environment: str) -> Result:
-    variables = {"COLUMNS": "200", "TERM": "dumb", **environment}
-    return CliRunner().invoke(app, [str(word) for word in words], env=variables)
-
-
-def words_of(result: Result) -> str:
-    """An error without its frame and line breaks."""
-    return " ".join(result.output.replace("│", " ").split())
 
 
 def saved(folder: Path, **reports: Report) -> list[Path]:
@@ -193,11 +182,11 @@ def test_reports_that_make_no_page_are_refused(cpu: Report, tmp_path: Path) -> N
     ):
         result = tacsim("bench", *(word for file in files for word in ("--from", file)), "--docs", docs)
         assert result.exit_code == 2, result.output
-        assert words in words_of(result) and "Traceback" not in result.output
+        assert words in told(result.output) and "Traceback" not in result.output
     both = tacsim("bench", "--from", REFERENCE, "--from", gpu, "--json", tmp_path / "both.json")
-    assert both.exit_code == 2 and "one file holds one report" in words_of(both)
+    assert both.exit_code == 2 and "one file holds one report" in told(both.output)
     measured = tacsim("bench", "press", "--docs", docs, TACSIM_DEVICE="cuda")
-    assert measured.exit_code == 2 and "needs the CPU's report too" in words_of(measured)
+    assert measured.exit_code == 2 and "needs the CPU's report too" in told(measured.output)
     assert not docs.exists() and not (tmp_path / "both.json").exists()
 
 

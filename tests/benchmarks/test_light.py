@@ -13,9 +13,7 @@ from benchmarks.cases.real import balls, costs, invariance, known_depth, punches
 from benchmarks.cases.real.labels import BadData, read_labels
 from benchmarks.cases.registry import description, select_cases
 from benchmarks.harness.runner import run_cases
-from benchmarks.harness.schema import Row
 from benchmarks.pages.page import markdown
-from benchmarks.pages.targets import TARGETS
 from tacsim.physics.oracle.layer import layer_contact
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 
@@ -203,36 +201,3 @@ def test_presses_of_our_gel_beside_the_same_made_up_ones(
     monkeypatch.setattr(invariance, "MIN_PRESSES", 10)
     with pytest.raises(BadData, match="6 presses; 10 are the least"):
         invariance.invariance(folder, hidden, (21e-3, 16e-3, 8e-3), 1)
-
-
-def test_each_target_of_the_real_group_finds_its_rows() -> None:
-    """Rows as the cases name them, of value 0.5; a target that looks for another name finds none."""
-
-    def row(case: str, variant: str, method: str = "tacsim", **figures: float) -> Row:
-        return Row(
-            group="real", case=case, variant=variant, method=method, resolution="", seconds=0.5, spread=None,
-            cpu_seconds=0.5, repeats=1, error=0.5, error_unit="", against="", peak_mb=1.0, figures=figures,
-        )  # fmt: skip
-
-    rows = [
-        *(row("ball_presses", f"{name}: picture", ncc=0.5) for name in ("THUsight", "Taxim GelSight", "FOTS GelSight")),
-        row("ball_presses", "THUsight: normals"),
-        row("known_depth", "R 1 mm, 1 mm deep: picture", ssim=0.5, ncc=0.5),
-        row("known_depth", "R 1 mm, 1 mm deep: height", whole_percent=0.5),
-        row("punch", "prism, 1 mm deep", "layer", ncc=0.5),
-        *(
-            row("invariance", f"{way}: rho, {view}", auc_low=0.5)
-            for way in ("pictures", "surfaces")
-            for view in ("gradient", "height")
-        ),
-        row("invariance", "pictures: rho, difference", auc=0.5),
-        row("invariance", "surfaces: drift, gain −30 %", extra_deg=0.5),
-        *(row("calibrated_render", size) for size in ("640 x 480", "320 x 240")),
-        row("normaliser", "320 x 240"),
-    ]
-    first = next(k for k, one in enumerate(TARGETS) if one.name.startswith("ball presses left out"))
-    last = next(k for k, one in enumerate(TARGETS) if one.name.startswith("observation with height"))
-    found = {one.name: one.find(rows) for one in TARGETS[first : last + 1]}
-    assert {name for name, value in found.items() if value is None} == {
-        "a ball touched 24 times, against the Cramér-Rao bound"
-    }

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
-from typer.testing import CliRunner, Result
 
 from benchmarks.harness.schema import Report
 from benchmarks.pages import reliability
 from benchmarks.pages.page import cells, costs, markdown
 from benchmarks.pages.picture import PICTURE, RADII, draw, draw_radii
-from robot.cli import app
+from tests.robot.cli.invoked import tacsim
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "benchmarks" / "reference.json"
@@ -24,10 +23,6 @@ REFERENCE = ROOT / "benchmarks" / "reference.json"
 @pytest.fixture(scope="module")
 def report() -> Report:
     return Report.model_validate_json(REFERENCE.read_bytes())
-
-
-def tacsim(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
 
 
 def test_the_published_pages_are_those_of_the_published_reports(report: Report) -> None:

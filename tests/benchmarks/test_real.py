@@ -9,22 +9,17 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image
-from typer.testing import CliRunner, Result
 
 from benchmarks.cases.real import contact_radius
 from benchmarks.cases.real.labels import OWN, SHIPPED, BadData, PressLabels, read_frames, read_labels
 from benchmarks.cases.registry import select_cases
 from benchmarks.harness.runner import measure
 from benchmarks.pages.picture import draw_radii
-from robot.cli import app
 from tacsim.config import ConfigError, load
+from tests.robot.cli.invoked import tacsim
 
 Folder = tuple[Path, float]
 FRAME = Path("deep") / "presses" / "ball_a.png"
-
-
-def tacsim(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
 
 
 def test_the_radius_of_frame_and_simulation(

@@ -11,10 +11,9 @@ from tacsim.config import load_rig
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """With what `tacsim identify` writes."""
-    monkeypatch.chdir(tmp_path)
-    found = Path("study")
+def folder(tmp_path: Path) -> Path:
+    """With what `tacsim identify` writes; not below the current folder."""
+    found = tmp_path / "study"
     for kind, text in (("gel", "{youngs_modulus: 0.17 MPa, poisson_ratio: 0.48}"),
                        ("body", "{youngs_modulus: 0.25 MPa, yield_stress: 15 kPa}")):  # fmt: skip
         (found / f"my-{kind}").mkdir(parents=True)

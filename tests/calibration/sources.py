@@ -53,6 +53,21 @@ def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
     return np.clip(np.rint(moved), 0, 255).astype(np.uint8)
 
 
+def save_picture(path: Path, image: np.ndarray) -> None:
+    Image.fromarray(image).save(path)
+
+
+def write_presses(folder: Path) -> Path:
+    """A folder of five presses and the picture without contact, called Background, beside what is no picture."""
+    sensor = HiddenSensor(2)
+    folder.mkdir()
+    for i, press in enumerate(sensor.presses(5)):
+        save_picture(folder / f"press_{i}.png", press.image)
+    save_picture(folder / "Background.png", sensor.empty())
+    (folder / "notes.txt").write_text("not a picture", encoding="utf-8")
+    return folder
+
+
 def save(of: FrameSet, folder: Path, reference: str = "background.png") -> Path:
     """Writes a side as a folder of pictures."""
     folder.mkdir(parents=True)

@@ -16,8 +16,8 @@ import pytest
 
 from robot.mock import FaultClient
 from tests.plugins.commands import surroundings, words_of
-from tests.robot.arm.mocked import until
 from tests.robot.cli.lab import Lab, copy_of
+from tests.robot.waiting import until
 from tests.stops.observer import PACKAGE
 from tests.stops.watched import SETTLES, outcome
 

@@ -27,9 +27,9 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a policy trained in two steps on an episode of the small simulation."""
     home = tmp_path_factory.mktemp("policy")
     sets = [word for each in OVERRIDES for word in ("--set", each)]
-    done = tacsim("run", "sim", "--task", "squeeze", *sets, "--out", str(home / "run"))
+    done = tacsim("run", "sim", "--task", "squeeze", *sets, "--out", home / "run")
     assert done.exit_code == 0, done.output
-    done = tacsim("export", "lerobot", str(home / "run/episode.mcap"), "--out", str(home / "set"))
+    done = tacsim("export", "lerobot", home / "run/episode.mcap", "--out", home / "set")
     assert done.exit_code == 0, done.output
     run(
         home, "lerobot-train", *TINY, "--dataset.repo_id=me/set", f"--dataset.root={home / 'set'}", "--steps=2",

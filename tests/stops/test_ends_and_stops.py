@@ -14,7 +14,7 @@ import pytest
 
 from robot.mock import FaultClient
 from tests.promises import Record
-from tests.robot.arm.mocked import PATIENCE
+from tests.robot.waiting import PATIENCE
 from tests.stops.watched import Trial, judge
 
 

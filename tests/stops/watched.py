@@ -22,7 +22,8 @@ from robot.arm.status import ArmStatus
 from robot.arm.trajectory import PERIOD
 from robot.mock import MockUR
 from tests.promises import Record
-from tests.robot.arm.mocked import PATIENCE, config, until
+from tests.robot.arm.mocked import config
+from tests.robot.waiting import PATIENCE, until
 from tests.stops.observer import PACKAGE
 
 HERE = Path(__file__).parent

@@ -42,7 +42,12 @@ class BallSet(Config):
     frames: tuple[str, ...] = ()  # patterns below the user's folder; the first that finds any counts
     backgrounds: tuple[str, ...] = ()  # seen from the folder of the frames; the first that exists counts
     archive: tuple[str, ...] = ()  # or an .npz with `images` (n, H, W, 3) and `background` (H, W, 3), uint8
+    circles: str = (
+        ""  # a table beside the frames, a heading, then name, x, y, radius [px] of the clicked contacts; of an
+    )
+    # archive, `contact_centre_px` (n, 2) and `contact_radius_px` (n,) are taken
     blue_first: bool = False  # of an archive: its colours stand as B, G, R
+    dots: bool = False  # are printed on the gel: painted over in all pictures
     ball_radius: Positive  # [m]
     pixel_pitch: Positive  # [m]
 
@@ -80,11 +85,12 @@ def is_there(folder: Path, of: BallSet) -> bool:
 
 
 def read_balls(folder: Path, of: BallSet) -> tuple[Image, Frames]:
-    """The picture without contact, and names and pictures of the presses, (H, W, 3) RGB. Raises BadData."""
+    """The picture without contact, and names and pictures of the presses, (H, W, 3) RGB; without dots. Raises
+    BadData."""
     reference, frames = _of_archive(folder, of) if of.archive else _of_pictures(folder, of)
     if len(frames) < MIN_PRESSES:
         raise BadData(f"{of.name}: {len(frames)} presses; to leave one out, {MIN_PRESSES} are the least")
-    return reference, frames
+    return _without_dots(of, reference, frames) if of.dots else (reference, frames)
 
 
 @lru_cache(maxsize=4)
@@ -167,6 +173,19 @@ def _usual_slope(prediction: PressPrediction, of: BallSet) -> float:
     """Slope of the ball half-way between the middle and the rim, by area: what a flat guess misses."""
     ball, r = of.ball_radius / of.pixel_pitch, prediction.circle.radius / np.sqrt(2)
     return float(r / np.sqrt(ball**2 - r**2))
+
+
+def _without_dots(of: BallSet, reference: Image, frames: Frames) -> tuple[Image, Frames]:
+    from calibration.markers.dots import DotEraser
+    from calibration.markers.flow import find_markers
+    from calibration.markers.lattice import NoLattice
+
+    try:
+        _, radius = find_markers(reference)
+    except NoLattice as error:
+        raise BadData(f"{of.name}: {error}") from None
+    erase = DotEraser(radius)
+    return erase(reference), tuple((name, erase(image)) for name, image in frames)
 
 
 def _of_pictures(folder: Path, of: BallSet) -> tuple[Image, Frames]:

@@ -14,7 +14,15 @@ from benchmarks.cases.press import press, press_scene
 from benchmarks.harness.measure import Measurement, timed
 from benchmarks.harness.runner import Case
 from tacsim.interface import TactileFrame
-from tacsim.models.photometric import PhotometricModel, place_in_image, places_in_image, term_count
+from tacsim.models.photometric import (
+    DEPTH_TERMS,
+    DepthColour,
+    PhotometricModel,
+    depth_terms,
+    place_in_image,
+    places_in_image,
+    term_count,
+)
 from tacsim.models.scene import Sphere
 from tacsim.models.sensor import CanonicalGrid, SensorGeometry, SensorModel
 
@@ -41,6 +49,7 @@ def made_up(width: int) -> Calibration:
     forward = PhotometricModel(
         degree=DEGREE, position=POSITION, weights=tuple((float(r), float(g), float(b)) for r, g, b in weights),
         steepest=1.0, blur=0.8,
+        depth=DepthColour(deepest=DEPTH / VIEW[0], weights=((-0.1, 0.05, 0.02),) * DEPTH_TERMS),
     )  # fmt: skip
     slopes = rng.uniform(-0.6, 0.6, (*shape, 2)).astype(np.float32)
     change, _ = PhotometricLight(forward).change(slopes, *places_in_image(shape[1], shape[0]))
@@ -80,11 +89,15 @@ def calibrated_render(width: int, repeat: int) -> list[Measurement]:
     render = Renderer(model, (20e-3, 20e-3))
     timing, image = timed(partial(render, surface), max(repeat, MIN_REPETITIONS))
     # the same polynomial, term by term, in double precision and without strips
-    slopes = sample_surface(surface, image_grid(calibration.geometry)).gradient.astype(np.float64)
+    sample = sample_surface(surface, image_grid(calibration.geometry))
+    slopes, height = sample.gradient.astype(np.float64), sample.height.astype(np.float64) / VIEW[0]
     steep = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]) / forward.steepest, 1.0)
     u, v = np.meshgrid(*place_in_image(image.shape[1], image.shape[0]))
     terms = features((slopes / steep[..., None]).reshape(-1, 2), u.ravel(), v.ravel(), DEGREE, POSITION)
     change = (terms @ np.array(forward.weights)).reshape(image.shape)
+    assert forward.depth is not None
+    deep = depth_terms(height, forward.depth.deepest, u, v)
+    change += np.tensordot(deep, np.array(forward.depth.weights), axes=(0, 0))
     still = 255.0 * np.array(model.lighting.background, dtype=np.float64)
     exact = np.clip(still + still * cv2.GaussianBlur(change, (0, 0), forward.blur), 0, 255)
     return [

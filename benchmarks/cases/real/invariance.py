@@ -58,7 +58,7 @@ def _rows(
 ) -> list[Measurement]:
     from calibration.compare.invariance import invariance as invariance_of
 
-    report = invariance_of(folds, GRID)
+    report = invariance_of(folds)
     rows = [
         Measurement(
             timing, view.rho, "x", "the distance of two real presses that are neighbours in size; 1 is as far",
@@ -138,6 +138,6 @@ def cases(folder: Path) -> tuple[Case, ...]:
     try:
         of = light_of(folder, labels)
     except BadData as error:
-        return (missing_case("real", CASE, str(error), resolution),)
+        return (missing_case(CASE, str(error), resolution),)
     size = (*labels.gel_size, labels.gel_thickness[0])
     return (Case("real", CASE, "tacsim", resolution, partial(invariance, folder, of, size), long=True),)

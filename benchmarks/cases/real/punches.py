@@ -98,11 +98,12 @@ class PunchRenderer:
         assert fit.forward is not None
         self._light = PhotometricLight(fit.forward, tuple(self._mean.tolist()))
         self._places = places_in_image(self._still.shape[1], self._still.shape[0])
-        self._blur = fit.forward.blur
+        self._blur, self._deep = fit.forward.blur, fit.forward.depth is not None
         self._pitch, self._thickness = labels.pixel_pitch, labels.gel_thickness[0]
 
     def dent(self, face: PunchFace, scale: float, depth: float) -> Float32:
-        """(BOX, BOX, 2) slopes of the gel under the punch, whose axis is in the middle."""
+        """(BOX, BOX, 3) slopes and height [widths of the picture] of the gel under the punch, whose axis is in the
+        middle."""
         import cv2
 
         from tacsim.physics.oracle.layer import layer_contact
@@ -114,17 +115,19 @@ class PunchRenderer:
         )
         height = cv2.GaussianBlur(contact.displacement, (0, 0), EDGE_BLUR)
         by_y, by_x = np.gradient(height, self._pitch)
-        return np.stack([by_x, by_y], axis=-1).astype(np.float32)
+        return np.stack([by_x, by_y, height / (self._pitch * self._still.shape[1])], axis=-1).astype(np.float32)
 
-    def __call__(self, slopes: Float32, x: float, y: float) -> Image:
+    def __call__(self, dent: Float32, x: float, y: float) -> Image:
         """The picture with the punch's axis at x, y [px]."""
         import cv2
 
         rows, columns, _ = self._still.shape
         v, u = np.mgrid[:rows, :columns].astype(np.float32)
         at = [np.float32(BOX // 2) + axis - np.float32(middle) for axis, middle in ((u, x), (v, y))]
-        seen = np.asarray(cv2.remap(slopes, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
-        change, _ = self._light.change(seen, *self._places)
+        seen = np.asarray(cv2.remap(dent, at[0], at[1], cv2.INTER_LINEAR), dtype=np.float32)
+        change, _ = self._light.change(seen[..., :2], *self._places)
+        if self._deep:
+            change = change + self._light.depth(np.ascontiguousarray(seen[..., 2]), *self._places)
         if self._blur > 0:
             change = np.asarray(cv2.GaussianBlur(change, (0, 0), self._blur), dtype=np.float32)
         picture: Image = np.rint(np.clip(self._still + change, 0, 255)).astype(np.uint8)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from tacsim.models.sensor import CameraNoise, Markers
 
 UNKNOWN = "unknown"  # serial number of a sensor that nobody named
+FRAMES = "frames"  # folder in a bundle of the pictures that a camera took for it
 
 
 def write_calibration(
@@ -40,7 +41,7 @@ def write_calibration(
     from calibration.light.residual_picture import draw
     from calibration.light.verdict import judge
 
-    verdict = judge(fit, scale)
+    verdict = judge(fit, scale, dots=found is None and _shows_dots(fit))
     _show(fit, scale.pixel_pitch, found)
     if profile.directed is not None and profile.directed == (fit.darkness is not None):
         told = "tells direction" if profile.directed else "tells none"
@@ -53,7 +54,7 @@ def write_calibration(
     facts = [f"{profile.title}: {profile.source}; {profile.light}"]
     if noise is not None:
         facts.append(f"camera's noise {', '.join(f'{value:.2f}' for value in noise.deviation)} grey levels (R, G, B)")
-    with writing(folder):
+    with writing(folder, new=not (folder / FRAMES).exists()):
         written = [write_bundle(folder, bundle, fit.reference)]
         residuals = folder / "residuals.png" if fit.predictions else None
         if residuals is not None:
@@ -62,8 +63,11 @@ def write_calibration(
         written.append(folder / page.FILE)
         title = _title(serial, folder, profile)
         page.write_page(written[-1], title, fit, scale, verdict, residuals, facts)
+    if scale.unchecked:
+        notes.print(scale.unchecked, markup=False)
     for finding in verdict.findings:
-        notes.print(f"{finding.word}: {finding.what}. {finding.todo}", markup=False)
+        todo = f" Next: {finding.todo}" if finding.todo else ""
+        notes.print(f"{finding.word}: {finding.what}.{todo}", markup=False)
     results.print(f"verdict: {verdict.word}")
     say_files(*written)
     if verdict.word == "do not trust":
@@ -95,15 +99,15 @@ def _noise(read: FrameSet, fit: LightFit) -> CameraNoise | None:
     return noise
 
 
-def _look_for_dots(fit: LightFit) -> None:
-    """Warns of dots on the gel where --markers is not given."""
+def _shows_dots(fit: LightFit) -> bool:
     from calibration.markers.flow import require_no_markers
     from calibration.reference import UnusableReference
 
     try:
         require_no_markers(fit.reference)
     except UnusableReference:
-        warn("dots seem to be printed on the gel; give --markers, or each will pass for a dent")
+        return True
+    return False
 
 
 def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
@@ -134,9 +138,7 @@ def _show(fit: LightFit, pitch: float, found: Markers | None) -> None:
         )
     for name, why in fit.left_out:
         notes.print(f"left out: {name}: {why}", markup=False)
-    if found is None:
-        _look_for_dots(fit)
-    else:
+    if found is not None:
         notes.print(
             f"markers: {found.rows} x {found.columns}, {found.pitch * 1e3:.3g} mm apart, radius "
             f"{found.radius * 1e3:.2g} mm"

@@ -32,7 +32,7 @@ def lens(
     ] = None,
     corners: Annotated[
         str | None,
-        typer.Option(help="Instead of a board: u,v of the gel's top left, top right, bottom right, bottom left [px]."),
+        typer.Option(help="Instead of a board: u,v of the gel's corners, clockwise from the top left \\[px]."),
     ] = None,
     reference: Annotated[
         Path | None, typer.Option(help="The same picture without the board, where contrast is low.")
@@ -47,7 +47,7 @@ def lens(
     views: Annotated[
         int, typer.Option(min=1, max=PICTURES, help="How many, with --camera; 1: of the board on the gel, its view.")
     ] = 12,
-    centre: Annotated[str | None, typer.Option(help="u,v of the sensor's axis [px]; default: the middle.")] = None,
+    centre: Annotated[str | None, typer.Option(help="u,v of the sensor's axis \\[px]; default: the middle.")] = None,
     size: Annotated[
         Any, typer.Option(parser=quantities("length", 2), metavar="LENGTH,LENGTH", help="Width, height of the gel.")
     ] = None,

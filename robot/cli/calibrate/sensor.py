@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from robot.cli.calibrate.bundle_output import UNKNOWN, write_calibration
+from robot.cli.calibrate.bundle_output import FRAMES, UNKNOWN, write_calibration
 from robot.cli.calibrate.session import confirm_free_gel, led, named_camera, picture_keeper
 from robot.cli.errors import UNTRUSTED
 from robot.cli.options import Out, Overrides, length, quantity
@@ -74,7 +75,7 @@ def sensor(
         str | None,
         typer.Option(
             metavar="U,V U,V U,V ...",
-            help="Corners of the polygon of the picture that shows gel [px]; beyond it nothing counts.",
+            help="Corners of the polygon of the picture that shows gel \\[px]; beyond it nothing counts.",
         ),
     ] = None,
     reference: Annotated[
@@ -114,13 +115,21 @@ def sensor(
     asked = _asked(
         ball_diameter, ball_radius, kind, pixel_pitch, view, region, known_depth, serial, out, markers=markers
     )
+    _calibrate(asked, frames, reference, camera, set_ or [], presses)
+
+
+def _calibrate(
+    asked: _Asked, frames: Path | None, reference: Path | None, camera: str | None, overrides: list[str], presses: int
+) -> None:
+    """From the pictures of a folder, or of so many presses before a camera, to the bundle and its verdict."""
     if camera is not None:
-        config, name = named_camera(camera, set_ or [], asked.profile.native)
+        config, name = named_camera(camera, overrides, asked.profile.native)
         seen, pitch = _geometry(asked, (config.height, config.width))
         read = _take_presses(camera, config, name, asked, presses, seen, pitch)
     else:
         assert frames is not None
         read = _read(frames, reference)
+        _require_frames(asked.depths, [frame.name for frame in read.frames])
         seen, pitch = _geometry(asked, read.shape)
     read = _straightened(read, asked.region, seen)
     found = _markers(read, pitch) if asked.markers else None
@@ -128,7 +137,9 @@ def sensor(
     from calibration.light.verdict import KnownScale
 
     scale = KnownScale(pitch, asked.ball, asked.profile.gel_size, asked.profile.gel_thickness, asked.depths)
-    write_calibration(asked.folder, fit, read, serial, scale, found, asked.profile, view=seen, region=asked.region)
+    write_calibration(
+        asked.folder, fit, read, asked.serial, scale, found, asked.profile, view=seen, region=asked.region
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +171,7 @@ def _asked(
     markers: bool,
 ) -> _Asked:
     """Checked, before anything slow is loaded; the folder is made."""
+    from calibration.bundle import SERIAL
     from calibration.profiles import PROFILES
 
     if (radius is None) == (diameter is None):
@@ -171,9 +183,14 @@ def _asked(
     if pitch is not None and view is not None:
         raise typer.BadParameter("give either --pixel-pitch or --view")
     if pitch is None and view is None and profile.gel_size is None:
-        raise typer.BadParameter("give --pixel-pitch or --view: nothing is known beforehand of this sensor's")
-    if out is None and Path(serial).name != serial:
-        raise typer.BadParameter(f"'{serial}' cannot be a folder's name; name one by --out", param_hint="--serial")
+        raise typer.BadParameter("give --pixel-pitch or --view, or --kind with a pitch that is known beforehand")
+    if not re.fullmatch(SERIAL, serial):
+        raise typer.BadParameter(
+            f"'{serial}' is no serial number: up to 64 letters, digits, '.', '_' and '-'", param_hint="--serial"
+        )
+    if serial == UNKNOWN and out is not None and re.fullmatch(SERIAL, out.name):
+        serial = out.name
+    folder = new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration")
     from calibration.lens.view import GelView
     from tacsim.config import load
 
@@ -186,7 +203,7 @@ def _asked(
         depths=tuple(_known_depth(text) for text in known_depth or ()),
         markers=markers or profile.markers,
         serial=serial,
-        folder=new_directory(Path("sensors") / serial if out is None and serial != UNKNOWN else out, "calibration"),
+        folder=folder,
     )
 
 
@@ -231,7 +248,10 @@ def _fitted(read: FrameSet, ball: float, dot: float | None) -> LightFit:
         with busy(f"calibrating from {len(named)} press{'es' * (len(named) > 1)}"):
             return calibrate_light(read.reference, named, ball, None if dot is None else DotEraser(dot))
     except NoDirection as why:
-        notes.print(str(why), markup=False)
+        from calibration.light.verdict import GREY, is_grey
+
+        grey = f"; {GREY}: give the camera's own, in colour" if is_grey(read.reference) else ""
+        notes.print(f"{why}{grey}", markup=False)
         results.print("verdict: do not trust; no bundle is written")
         raise typer.Exit(UNTRUSTED) from None
 
@@ -242,6 +262,13 @@ def _known_depth(text: str) -> tuple[str, float]:
         raise typer.BadParameter(f"'{text}'; give FRAME=LENGTH, such as 'press_3.png=0.5 mm'", param_hint="--depth")
     value = quantity("length", 1e-6, 1e-2)(depth)
     return name, value
+
+
+def _require_frames(depths: tuple[tuple[str, float], ...], names: list[str]) -> None:
+    """Raises BadParameter for the depth of a press that is not there: it would check nothing."""
+    for name, _ in depths:
+        if name not in names:
+            raise typer.BadParameter(f"no frame '{name}'; there are {', '.join(names)}", param_hint="--depth")
 
 
 def _geometry(asked: _Asked, shape: tuple[int, int]) -> tuple[GelView | None, float]:
@@ -302,7 +329,7 @@ def _take_presses(
         require_view_size((config.height, config.width), view)
     rectify = None if view is None else metric_picture(view)
     plan = BallPressPlan(asked.ball / pitch, presses, rectify=rectify, markers=asked.markers)
-    frames = asked.folder / "frames"
+    frames = asked.folder / FRAMES
     again = f"tacsim calibrate sensor {shlex.quote(str(frames))} --serial {shlex.quote(asked.serial)} ..."
     with Camera(config, sensor) as source:
         confirm_free_gel()

@@ -76,7 +76,8 @@ def named_camera(
     rig, _, sensor = camera.rpartition("/")
     if not rig:
         raise typer.BadParameter(
-            f"'{camera}': give rig and sensor, such as ur5e/upper or my.yaml/upper", param_hint="--camera"
+            f"'{camera}': give rig and sensor, such as my.yaml/upper, or a camera at /dev/v4l/by-id/... or http://...",
+            param_hint="--camera",
         )
     return handheld_camera(load_rig(rig, overrides=overrides).config, sensor), sensor
 

@@ -23,10 +23,13 @@ def lerobot(
         bool, typer.Option("--maps/--no-maps", help="With heights, gradients and flow; without, it loads faster.")
     ] = True,
     cut: Annotated[bool, typer.Option("--cut", help="Take recordings that were cut off, up to there.")] = False,
+    video: Annotated[
+        bool, typer.Option("--video", help="Pictures as H.264 video: a sixth of the room, about 1 grey level off.")
+    ] = False,
 ) -> None:
     """Make a LeRobot data set (v3.0) of recorded episodes; for lerobot-train, Hugging Face datasets, pandas.
 
-    Pictures are PNG inside the files, without loss. Needs the extra 'export'.
+    Pictures are PNG inside the files, without loss. Needs the extra 'export'; with --video the extra 'video'.
 
     Example: tacsim export lerobot runs/*/episode.mcap --out data/squeeze
     """
@@ -35,7 +38,7 @@ def lerobot(
         from robot.export.lerobot import export_lerobot
 
     with counted("exporting") as on_step:
-        export_lerobot(_recordings(episodes), folder, task=task, maps=maps, cut=cut, on_step=on_step)
+        export_lerobot(_recordings(episodes), folder, task=task, maps=maps, cut=cut, video=video, on_step=on_step)
     notes.print(f'Load it: LeRobotDataset("{folder.name}", root="{folder}")', markup=False)
     say_files(folder)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from robot.cli.options import Overrides
-from robot.cli.output import notes, one_bar, show_table, writing
+from robot.cli.output import notes, one_bar, show_table
 
 if TYPE_CHECKING:
     from robot.train.evaluate import Interval, Judged
@@ -26,7 +27,7 @@ def evaluate(
     episodes: Annotated[int, typer.Option(min=2, max=10_000, help="Of each policy.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same episodes.")] = 0,
     json_: Annotated[
-        Path | None, typer.Option("--json", help="Write how each episode ended.", show_default=False)
+        Path | None, typer.Option("--json", help="Write how each episode ended, while it goes on.", show_default=False)
     ] = None,
     set_: Overrides = None,
 ) -> None:
@@ -44,6 +45,7 @@ def evaluate(
     from tacsim.models.training import Training
 
     training = load(Training, task, set_ or [])
+    played: dict[str, Judged] = {}
     with one_bar("starting") as bar:
 
         def tell(words: str, done: int, of: int) -> None:
@@ -51,19 +53,23 @@ def evaluate(
             bar.count(done, of)
 
         def say(so_far: Judged) -> None:
+            played[so_far.policy] = so_far
+            if json_ is not None:
+                _write(json_, played.values())
             done, success = len(so_far.episodes), interval_text(so_far.success, 100, 0)
             notes.print(f"{so_far.policy}: {done} of {episodes} episodes, success {success} %", markup=False)
 
         judged = judge_all(training, policy or ["teacher", "scripted", "random"], episodes, seed, tell, say)
     _show(judged)
-    if json_ is not None:
-        import json
 
-        with writing(json_.parent):
-            json_.write_text(
-                json.dumps({each.policy: [end._asdict() for end in each.episodes] for each in judged}, indent=1) + "\n",
-                encoding="utf-8",
-            )
+
+def _write(path: Path, judged: Iterable[Judged]) -> None:
+    import json
+
+    from robot.common.whole_file import write_whole
+
+    ends = {each.policy: [end._asdict() for end in each.episodes] for each in judged}
+    write_whole(path, (json.dumps(ends, indent=1) + "\n").encode())
 
 
 def _show(judged: list[Judged]) -> None:

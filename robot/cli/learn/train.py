@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from robot.cli.options import Out, Overrides
-from robot.cli.output import busy, new_directory, notes, one_bar, results, say_files
+from robot.cli.output import busy, new_directory, notes, one_bar, results, say_files, warn
 
 if TYPE_CHECKING:
     from robot.train.run_folder import RunFolder
@@ -58,8 +58,14 @@ def train(
         training = load(Training, task, own)
         folder = new_directory(out, f"train-{training.task}")
         run = _begin(training, folder)
+    from tacsim.tasks.task import BadDraws
+
     try:
         path = _train(run)
+    except BadDraws:
+        if run.last()[0]:
+            notes.print(f"What was learned is kept. Make a file of it: tacsim export policy {run.folder}", markup=False)
+        raise
     except (KeyboardInterrupt, OSError):
         notes.print(f"What was learned is kept. Go on: tacsim train --resume {run.folder}", markup=False)
         raise
@@ -97,7 +103,8 @@ def _train(run: RunFolder) -> Path:
         results.print(
             f"round {figures['round']:.0f}: {1e3 * figures['distance']:.3f} mm from the goal, success "
             f"{100 * figures['success']:.0f} %, {figures['peak_force']:.1f} N at most, "
-            f"{figures['steps'] / figures['seconds']:.0f} steps/s",
+            f"{figures['steps'] / figures['seconds']:.0f} steps/s"
+            + (f", {figures['refused']:.0f} draws refused" if figures["refused"] else ""),
             markup=False,
         )
 
@@ -107,4 +114,4 @@ def _train(run: RunFolder) -> Path:
             bar.say(words)
             bar.count(done, of)
 
-        return go_on(run, tell, say)
+        return go_on(run, tell, say, warn)

@@ -25,6 +25,8 @@ UNWEIGHED = (
 MOMENTS = 16  # of a press, that are simulated
 FACTOR = 30.0  # how far stiffness and yield may be from where the fit begins
 LEAST_FRICTION, MOST_FRICTION = 0.01, 5.0
+SLIPPING = 0.25  # friction at which a body slips on a gel: that tells friction, while the force of a body that sticks
+# does not depend on it
 MOST_POISSON = 0.499
 YIELD_SHARE = 0.06  # of a body that the scene thinks elastic: where the fit begins, over its stiffness
 
@@ -65,7 +67,9 @@ def parameters_of(kind: Kind, scene: Scene) -> tuple[Parameter, ...]:
     limit, (shear, _) = material.elastic_limit, lame(material)
     strength = math.sqrt(1.5) * 2 * shear * limit if math.isfinite(limit) else YIELD_SHARE * material.youngs_modulus
     frictions = (
-        Parameter(f"friction_{name}", min(max(mu, 0.1), 1.0), LEAST_FRICTION, MOST_FRICTION)
+        Parameter(
+            f"friction_{name}", min(max(mu, 0.1), 1.0), LEAST_FRICTION, MOST_FRICTION, begin=min(max(mu, 0.1), SLIPPING)
+        )
         for name, mu in scene.friction.items()
     )
     return (

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 from tacsim.geometry.shapes import extent
 from tacsim.models.scene import Scene
@@ -14,9 +15,12 @@ PRESS_DEPTH, SLIDE_DEPTH = 0.25, 0.2  # of the gel's thickness
 SLIDE, STEP = 2.0e-3, 0.1e-3  # how far a gel is slid, and in what steps it is pressed [m]
 SQUEEZED, HELD = 0.4, 0.12  # of the body's height: how far it is closed, to squeeze it and to slide on it
 BODY_STEP, BODY_SLIDE = 0.04, 0.5  # of its height: a step, a slide
-TILT = math.radians(8.0)
+TILT = math.radians(16.0)  # gels whose angles of friction differ by less than this both slip
+TILTED, EASED = 0.16, 0.06  # of the body's height: how far a tilted gel is pressed in, and goes back before it slides
+THERE, BEYOND = 0.3, 0.2  # of its height: how far a tilted gel is slid along the other's face, and on the way back
 REST = 3  # periods before the touch and after it, clear of everything: they tell the zero of the force
 CLEAR = 0.3e-3  # how far a gel goes back from where it touched [m]
+TURN = math.radians(2.0)  # how far a gel is turned in a step
 
 WHAT_TELLS = {
     "gel": {"youngs_modulus": "press", "poisson_ratio": "press", "friction": "slide"},
@@ -29,7 +33,8 @@ WORDS = {
     "press": "a ball pressed in by a quarter of the gel's thickness, heights recorded (a calibrated sensor)",
     "slide": "a gel pressed, then slid sideways until it slips",
     "squeeze": "the body closed by two fifths of its height, opened a little on the way, and closed on",
-    "tilt": "the upper gel tilted by 8 degrees and slid both ways: the gel that slips first changes with the way",
+    "tilt": "the upper gel tilted by 16 degrees, slid along the lower gel's face and back along its own: there the "
+    "lower gel slips, back the upper one, unless their angles of friction (arctan of the coefficient) differ by more",
 }
 Row = tuple[float, float, float]  # x, z [m], tilt about y [rad], along the axes of the sensor at the start
 
@@ -47,8 +52,8 @@ def motions(scene: Scene) -> dict[str, str]:
     width = float(extent(scene.body.geometry)[0])
     return {
         "squeeze": _table("upper", _squeezed(height)),
-        "slide": _table("upper", _dragged(height, width, 0.0)),
-        "tilt": _table("upper", _dragged(height, width, TILT)),
+        "slide": _table("upper", _dragged(height)),
+        "tilt": _table("upper", _tilted(height, width)),
     }
 
 
@@ -73,19 +78,31 @@ def _squeezed(height: float) -> list[Row]:
     return [*[(0.0, -CLEAR, 0.0)] * REST, *path, *[end] * REST]
 
 
-def _dragged(height: float, width: float, tilt: float) -> list[Row]:
-    lift = CLEAR + width / 2 * math.sin(tilt)  # until an edge touches
+def _dragged(height: float) -> list[Row]:
     far, deep, step = BODY_SLIDE * height, HELD * height, BODY_STEP * height
-    start = (0.0, -lift, tilt)
-    path = _line(start, (0, deep, tilt), step) + _line((0, deep, tilt), (far, deep, tilt), 2 * step)
-    path += _line((far, deep, tilt), (-far if tilt else 0.0, deep, tilt), 2 * step)
-    end = (path[-1][0], -lift, tilt)
-    return [*[start] * REST, *path, *_line(path[-1], end, 2 * step), *[end] * REST]
+    path = _line((0, -CLEAR, 0), (0, deep, 0), step) + _line((0, deep, 0), (far, deep, 0), 2 * step)
+    path += _line((far, deep, 0), (0, deep, 0), 2 * step) + _line((0, deep, 0), (0, -CLEAR, 0), 2 * step)
+    return [*[(0.0, -CLEAR, 0.0)] * REST, *path, *[(0.0, -CLEAR, 0.0)] * REST]
+
+
+def _tilted(height: float, width: float) -> list[Row]:
+    """Lifted before it is tilted: an edge that turns into the body throws it off the other gel. Eased before it slides:
+    a body pressed as far as it yields shears under the gel instead of slipping."""
+    lift = CLEAR + width / 2 * math.sin(TILT)  # until an edge touches
+    eased, step = (TILTED - EASED) * height, BODY_STEP * height
+    turns = [
+        (0.0, -lift, TILT), (0.0, TILTED * height, TILT), (0.0, eased, TILT), (THERE * height, eased, TILT),
+        (-BEYOND * height, eased + (THERE + BEYOND) * height * math.tan(TILT), TILT),  # along its own face
+    ]  # fmt: skip
+    path = [row for a, b in pairwise(turns) for row in _line(a, b, 1.5 * step if b[0] else step)]
+    end = (turns[-1][0], -lift, TILT)
+    lifted = [*_line((0, 0, 0), (0, -lift, 0), CLEAR), *_line((0, -lift, 0), turns[0], step)]
+    return [*lifted, *[turns[0]] * REST, *path, *_line(turns[-1], end, 2 * step), *[end] * REST]
 
 
 def _line(a: Sequence[float], b: Sequence[float], step: float) -> list[Row]:
     """From a to b in even steps, a left out."""
-    count = max(1, math.ceil(math.dist(a[:2], b[:2]) / step - 1e-9))
+    count = max(1, math.ceil(max(math.dist(a[:2], b[:2]) / step, abs(b[2] - a[2]) / TURN) - 1e-9))
     found = []
     for k in range(1, count + 1):
         s = k / count

@@ -2,14 +2,14 @@
 
 The change of a node's velocity in a substep, a, becomes OWN a + FILTERED (4 S - 1)^2 a, S the mean over the cells round
 a node, each of which has the mean of its nodes by mass; as the gel's accelerations do (tacsim.physics.gel.mass). A
-node keeps its velocity from the last substep, since the grid stays; the first substep of a launch has none to compare
-with, and is not filtered. Why: docs/decisions/0002.
+node keeps its velocity from substep to substep and from launch to launch; the first substep on a grid that is laid
+anew has none to compare with, and is not filtered. Why: docs/decisions/0002.
 """
 
 from tacsim.compute.runtime import ti
-from tacsim.physics.body.transfers import node_sum
+from tacsim.physics.body.transfers import has_velocities, node_sum
 from tacsim.physics.exec import layout
-from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, strip, vec3
+from tacsim.physics.exec.lanes import NODES, ON_DEVICE, bounded, part_range, vec3
 
 # In `changes` (environments, 3, nodes, 4): change of a node's momentum, and its mass; mean change of velocity of the
 # cell that a node begins; the first again, after the filter's first pass
@@ -35,22 +35,20 @@ def box_of_part(env: ti.template(), part):
 
 
 @ti.func
-def grid_changes(env: ti.template(), part, it, body: ti.template()):
-    """Changes of momentum since the last substep, and masses, of this part's nodes."""
+def grid_changes(env: ti.template(), part, body: ti.template()):
+    """Changes of momentum in this substep, and masses, of this part's nodes."""
     dt, weight = env.param(layout.STEP), env.param3(layout.GRAVITY)
     ny, nz = env.count(layout.GRID + 1), env.count(layout.GRID + 2)
-    base, to = env.index * env.count(layout.CAPACITY), changes_at(env, CHANGE, 0)
+    to = changes_at(env, CHANGE, 0)
     low, high = box_of_part(env, part)
     for i in range(low[0], high[0]):
         first, last = ((i * ny + low[1]) * nz + low[2]) // NODES, ((i * ny + high[1] - 1) * nz + high[2]) // NODES
         for at in range(first, last):
-            q, old = node_sum(env, i, at, body), strip(0.0)
-            if it > 0:
-                old = body.velocities[base + at]
+            q = node_sum(env, i, at, body)
             for n in ti.static(range(NODES)):
                 start, mass = bounded(to + 4 * (at * NODES + n), 1), q[4 * n + 3]
                 for c in ti.static(range(3)):
-                    body.changes[start + c] = q[4 * n + c] + mass * (dt * weight[c] - old[4 * n + c])
+                    body.changes[start + c] = q[4 * n + c] + mass * dt * weight[c]
                 body.changes[start + 3] = mass
 
 
@@ -117,7 +115,7 @@ def filtered_change(env: ti.template(), body: ti.template(), it, i, j, k):
     mass, change = body.changes[s + 3], vec3(0.0)
     if mass != 0.0:  # one that is not a number must show
         change = vec3([body.changes[s + c] for c in range(3)]) / mass
-        if it > 0 and i > 0 and j > 0 and k > 0:
+        if has_velocities(env, it) and i > 0 and j > 0 and k > 0:
             second = vec3([body.changes[t + c] for c in range(3)]) / mass
             change *= env.param(layout.OWN)
             change += env.param(layout.FILTERED) * (4.0 * mean_of_cells(env, body, i, j, k) - second)

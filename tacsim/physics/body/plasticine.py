@@ -16,6 +16,7 @@ from tacsim.physics.exec.lanes import CACHE_LINE, COPIES, LANES, MAX_NUMBERS, NO
 from tacsim.physics.units import MM, MPA
 
 BORDER = 4  # [cells] that a grid reaches beyond its particles' places, at most
+STENCIL_REACH = 1.501  # [cells] from a particle: at and beyond that no node gets anything of it, whatever is rounded
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,17 @@ def body_params(material: BodyMaterial, spacing: float, volume: float | None = N
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Laid:
+    """Where a body's particles lie on their grid, which they do for many launches, and what follows from it."""
+
+    rows: np.ndarray  # (3, n) [mm]
+    extents: np.ndarray  # of `BodyState.extents`
+    centre: np.ndarray  # (3,) [mm]
+    arms: np.ndarray  # (3, n) from the centre, in float64 [mm]
+    second: np.ndarray  # (3, 3) sum of arm arm^T [mm^2]
+
+
 class BodyState:
     """Particles of all environments and the grid they move on, laid out for the kernels: whole lanes and cache lines.
 
@@ -81,6 +93,8 @@ class BodyState:
         self.masses = aligned_zeros(len(points), COPIES, 1, 4 * NODES)
         self.velocities = aligned_zeros(len(points), 1, 4 * NODES)
         self.changes = aligned_zeros(len(points), 3, 1, 4 * NODES)
+        self._laid: dict[int, Laid] = {}
+        self._grid: dict[int, tuple[int, int, int]] = {}  # nodes of the grids whose velocities outlive a launch
 
     def place(self, environment: int, points: np.ndarray, planes: np.ndarray) -> None:
         """Another body in one environment, at rest, see __init__. Rows of all grow if this one has more particles."""
@@ -90,12 +104,17 @@ class BodyState:
             rows[..., :room] = self.rows
             self.rows = rows
         self.counts[environment] = count
+        self.forget_grid(environment)
         self.rows[environment] = 0.0
         self.x(environment)[...], self.plane(environment)[...] = points, planes
         self.reference(environment)[...] = points
 
     def _rows(self, environment: int, first: int, count: int) -> np.ndarray:
         return self.rows[environment, first : first + count, : self.counts[environment]]
+
+    def whole(self, environment: int) -> np.ndarray:
+        """All that its particles know (PARTICLE_ROWS, n), a view."""
+        return self._rows(environment, 0, layout.PARTICLE_ROWS)
 
     def x(self, environment: int = 0) -> np.ndarray:
         """Positions [mm], (n, 3), a view."""
@@ -157,15 +176,46 @@ class BodyState:
         c[...] = in_space + more - more.swapaxes(1, 2)
         self.reference(environment)[...] = self.x(environment)
         self.gradient(environment)[...] = 0.0
+        self.forget_grid(environment)
+
+    def grid_velocity(self, environment: int, shape: tuple[int, int, int] | None = None) -> np.ndarray:
+        """Of the nodes of its grid, (nx, ny, nz, 3), a view; of no nodes where particles alone know how they move, as
+        before the first launch and where the grid is laid anew. shape: as from `grid_kept`, if not the present one."""
+        nx, ny, nz = self.grid_kept(environment) if shape is None else shape
+        strips: np.ndarray = self.velocities[environment, : nx * ny * nz // NODES]
+        return strips.reshape(nx, ny, nz, 4)[:, :, : max(nz - NODES + 1, 0), :3]
+
+    def keep_grid(self, environment: int, counts: np.ndarray, velocities: np.ndarray | None = None) -> None:
+        """From now on the nodes of its grid, as it is laid, have the velocities that stand there, or these."""
+        nx, ny, nz = counts[environment, layout.GRID : layout.GRID + 3].tolist()
+        self._grid[environment] = (nx, ny, nz)
+        if velocities is not None:
+            self.velocities[environment] = 0.0
+            self.grid_velocity(environment)[...] = velocities
+
+    def forget_grid(self, environment: int) -> None:
+        """From now on its particles alone know how they move."""
+        self._grid.pop(environment, None)
+
+    def grid_kept(self, environment: int) -> tuple[int, int, int]:
+        """How many nodes, with padding, the grid has whose nodes have velocities; zeros if there is none."""
+        return self._grid.get(environment, (0, 0, 0))
+
+    def laid(self, environment: int) -> Laid:
+        """How its particles lie on the grid; worked out anew only if a place is another one than at the last call."""
+        rows, known = self._rows(environment, layout.REFERENCE, 3), self._laid.get(environment)
+        if known is None or not np.array_equal(known.rows, rows):
+            x = self.reference(environment)
+            centre = centre_of(x)
+            arms = (x - centre).T
+            known = Laid(rows.copy(), extents_of(x), centre, arms, arms @ arms.T)
+            self._laid[environment] = known
+        return known
 
     def extents(self, environment: int) -> np.ndarray:
         """Lowest and highest places on the grid of each part's particles [mm], (COPIES, 2, 3); of a part without any,
         infinity and minus infinity."""
-        x, found = self.reference(environment), np.empty((COPIES, 2, 3), np.float32)
-        for part in range(COPIES):
-            own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x))]
-            found[part] = bounds(own) if len(own) else ([[np.inf] * 3, [-np.inf] * 3])
-        return found
+        return self.laid(environment).extents
 
     def fit(
         self, environment: int, cell: float, margin: float, params: np.ndarray, counts: np.ndarray,
@@ -173,11 +223,12 @@ class BodyState:
     ) -> None:  # fmt: skip
         """Lays the grid of one environment round its particles' places on it, so no index is ever clamped.
 
-        margin [mm]: what is left free round them; extents: those of `extents`, if they are known. Writes origin, node
-        counts and the parts' slabs of node planes into `params` and `counts` (tacsim.physics.exec.layout).
+        margin [mm]: how far from them a node at its border is, at least; extents: those of `extents`, if they are
+        known. Writes origin, node counts and the parts' slabs of node planes into `params` and `counts`
+        (tacsim.physics.exec.layout).
 
-        The memory of all environments grows if this one needs more; what stands in it lasts no longer than a substep.
-        Raises MemoryError, with that memory as it was, where there is none.
+        The memory of all environments grows if this one needs more; of what stands in it only velocities outlive a
+        substep. Raises MemoryError, with that memory as it was, where there is none.
         """
         extents = self.extents(environment) if extents is None else extents
         origin, shape = fit_grid(*bounds_of(extents), cell, margin)
@@ -187,8 +238,8 @@ class BodyState:
         for part, (lowest, highest) in enumerate(extents[:, :, 0].tolist()):
             low, high = 0, 0
             if lowest <= highest:
-                low = max(math.floor((lowest - margin - float(origin[0])) / cell) - 1, 0)
-                high = min(math.ceil((highest + margin - float(origin[0])) / cell) + 3, shape[0])
+                low = max(math.ceil((lowest - float(origin[0])) / cell - STENCIL_REACH), 0)
+                high = min(math.floor((highest - float(origin[0])) / cell + STENCIL_REACH) + 1, shape[0])
             counts[environment, layout.SLAB + 2 * part : layout.SLAB + 2 * part + 2] = low, high
         # three planes for what particles off the grid would add
         strips = (shape[0] + 3) * shape[1] * shape[2] // NODES
@@ -196,8 +247,11 @@ class BodyState:
             # a body that spreads asks for more again and again
             room = max(strips, min(strips * 5 // 4, self.most // NODES))
             masses = aligned_zeros(*self.masses.shape[:2], room, 4 * NODES)
-            self.masses, self.velocities = masses, aligned_zeros(len(masses), room, 4 * NODES)
-            self.changes = aligned_zeros(len(masses), 3, room, 4 * NODES)
+            velocities = aligned_zeros(len(masses), room, 4 * NODES)
+            changes = aligned_zeros(len(masses), 3, room, 4 * NODES)
+            velocities[:, : self.velocities.shape[1]] = self.velocities
+            self.masses, self.velocities, self.changes = masses, velocities, changes
+        counts[environment, layout.GRID_MOVES] = self._grid.get(environment) == shape
         counts[:, layout.STRIDE], counts[:, layout.CAPACITY] = self.rows.shape[2], self.masses.shape[2]
 
     def arguments(self) -> tuple[np.ndarray, ...]:
@@ -214,6 +268,15 @@ def row_length(particles: int) -> int:
 def first_particle(part: int, particles: int) -> int:
     """Where a part of the particles begins: at a block of lanes (tacsim.physics.body.transfers.block_range)."""
     return min(padded(particles) // LANES * part // COPIES * LANES, particles)
+
+
+def extents_of(x: np.ndarray) -> np.ndarray:
+    """See `BodyState.extents`; x: places of all particles (n, 3)."""
+    found = np.empty((COPIES, 2, 3), np.float32)
+    for part in range(COPIES):
+        own = x[first_particle(part, len(x)) : first_particle(part + 1, len(x))]
+        found[part] = bounds(own) if len(own) else ([[np.inf] * 3, [-np.inf] * 3])
+    return found
 
 
 def bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +303,7 @@ def fit_grid(
     The middle of the body is a node: what is symmetric about it stays so. margin: at least a cell.
     """
     middle, reach = (least + most) / 2, np.ceil(((most - least) / 2 + margin) / cell).astype(int)
-    counts = 2 * reach + 2
+    counts = 2 * reach + 1
     return (middle - reach * cell).astype(np.float32), (
         int(counts[0]),
         int(counts[1]),

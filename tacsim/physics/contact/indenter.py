@@ -1,4 +1,4 @@
-"""A rigid indenter on the gel surface: signed distance, and contact by area-weighted quadrature on the surface.
+"""A rigid indenter on the gel surface: contact by area-weighted quadrature on the surface.
 
 Each surface cell carries 3 x 3 points of equal area. Normal pressure is what the surface's nodes carry (a multiplier
 that remembers; augmented Lagrangian, Simo & Laursen 1992) plus what a point adds to it by the overlap there: the gel
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from tacsim.compute.runtime import ti
 from tacsim.physics.contact.contact import CONTACT_DAMPING, MEMORY_RATE, friction, surface_node
+from tacsim.physics.contact.distance import GRID, DistanceGrid, box_distance, signed_distance
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import record_most, record_sum
 from tacsim.physics.exec.lanes import (
@@ -31,7 +32,6 @@ Slip = ti.types.ndarray(dtype=vec3, ndim=3)
 Pressure = ti.types.ndarray(dtype=ti.f32, ndim=3)
 Values = ti.types.ndarray(dtype=ti.f32, ndim=4)  # (environments, x, y, z)
 
-SPHERE, CYLINDER, BOX, GRID = 0, 1, 2, 3
 POINTS = 3  # quadrature points along one edge of a surface cell
 # The surface under the points is that of the nodes, smoothed by this share of (k h)^2 of each wave of number k.
 # Elements with one integration point are twice that too soft for it (0.124 along the lattice, 0.135 across), and the
@@ -39,7 +39,6 @@ POINTS = 3  # quadrature points along one edge of a surface cell
 SMOOTHING = 0.065
 SPLINE_SMOOTHING = 0.125  # of the quadratic B-spline over the same nodes
 TANGENT_STIFFNESS = 0.25  # over the normal one: meets the torsion of a bonded punch at elements of 1, 0.5 and 0.25 mm
-UNKNOWN = 1e9  # distance where none is known
 FORGOTTEN = 1e-6  # shear moduli: a pressure below that is none
 TOUCHABLE = 0.5  # elements: a point farther from the indenter touches nothing
 MARGIN = 1.0  # elements: nothing passes so much in one substep, so cells that are farther have forgotten
@@ -53,90 +52,16 @@ class Indenter(NamedTuple):
     values: Any
 
 
-class DistanceGrid(NamedTuple):
-    """Distances of one environment's mesh inside a kernel: `values` has `nodes` of them, from number `first` on."""
+class Shape(NamedTuple):
+    """One environment's indenter inside a kernel: what it is, and how it moves in the sensor frame."""
 
-    values: Any
-    first: Any
-    nodes: Any
-    origin: Any
-    spacing: Any
-
-
-@ti.func
-def corner_distance(d, sign):
-    """Distance and gradient of the region where all of d <= 0; sign: direction of each axis."""
-    outside = ti.max(d, 0.0)
-    length = outside.norm()
-    n = vec3(0.0)
-    phi = length
-    if length > 0.0:
-        n = outside / length
-    else:
-        phi = ti.max(d[0], d[1], d[2])
-        if d[0] == phi:
-            n = vec3(1.0, 0.0, 0.0)
-        elif d[1] == phi:
-            n = vec3(0.0, 1.0, 0.0)
-        else:
-            n = vec3(0.0, 0.0, 1.0)
-    return phi, n * sign
-
-
-@ti.func
-def direction(y):
-    s = vec3(1.0)
-    for d in ti.static(range(3)):
-        if y[d] < 0.0:
-            s[d] = -1.0
-    return s
-
-
-@ti.func
-def box_distance(size, y):
-    """Distance and outward normal of a box of half extents `size`."""
-    return corner_distance(ti.abs(y) - size, direction(y))
-
-
-@ti.func
-def signed_distance(env: ti.template(), kind, size, y, grid: ti.template()):
-    """Distance from the indenter's surface (negative inside) and its outward normal, at y in the indenter's frame.
-
-    size: half extents of a box; radius, -, half height of a cylinder; radius of a sphere; of a mesh half extents of
-    its bounding box. The world lays as much of a mesh's grid as can touch (`PressState.cover`).
-    """
-    phi, n = UNKNOWN, vec3(0.0, 0.0, 1.0)
-    rounding = env.param(layout.EDGE_RADIUS)
-    if kind == SPHERE:
-        r = y.norm()
-        phi = r - size[0]
-        n = y / ti.max(r, 1e-12)
-    elif kind == BOX:
-        phi, n = box_distance(size - rounding, y)
-        phi -= rounding
-    elif kind == CYLINDER:
-        r = ti.sqrt(y[0] * y[0] + y[1] * y[1])
-        beyond = vec3(r - size[0] + rounding, -UNKNOWN, ti.abs(y[2]) - size[2] + rounding)
-        phi, radial = corner_distance(beyond, vec3(1.0))
-        phi -= rounding
-        n = vec3(radial[0] * y[0] / ti.max(r, 1e-12), radial[0] * y[1] / ti.max(r, 1e-12), radial[2] * direction(y)[2])
-    else:
-        at = (y - grid.origin) / grid.spacing
-        whole = ti.floor(at)
-        cell, w = whole.cast(ti.i32) - grid.first, at - whole
-        known = True
-        for d in ti.static(range(3)):
-            known = known and cell[d] >= 0 and cell[d] < grid.nodes[d] - 1
-        if known:
-            phi = 0.0
-            n = vec3(0.0)
-            for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
-                wx, wy, wz = (w[0] if a else 1.0 - w[0]), (w[1] if b else 1.0 - w[1]), (w[2] if c else 1.0 - w[2])
-                value = grid.values[env.index, cell[0] + a, cell[1] + b, cell[2] + c]
-                phi += value * wx * wy * wz
-                n += value * vec3((2 * a - 1) * wy * wz, (2 * b - 1) * wx * wz, (2 * c - 1) * wx * wy)
-            n = n / ti.max(n.norm(), 1e-12)
-    return phi, n
+    kind: Any
+    size: Any
+    grid: Any  # DistanceGrid
+    rotate: Any
+    centre: Any
+    velocity: Any
+    spin: Any
 
 
 def point_weights() -> tuple[tuple[float, ...], ...]:
@@ -248,27 +173,101 @@ def carry(env: ti.template(), part, gels: ti.template()):
 
 
 @ti.func
-def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template(), indenter: ti.template()):
-    """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
-
-    drive: pose and velocity of the indenter in the sensor frame.
-    """
-    e, nx, ny = env.index, gels.nx, gels.ny
-    h, k_n = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS)
-    mu, dt = env.param(layout.FRICTION), env.param(layout.STEP)
+def shape_of(env: ti.template(), it, drive: ti.template(), indenter: ti.template()):
+    """The group of what says where the indenter is; drive: its pose and velocity in the sensor frame."""
     kind, size = env.count(layout.KIND), env.param3(layout.SHAPE)
     nodes = ti.Vector([env.count(layout.SHAPE_NODES + d) for d in range(3)])
     first = ti.Vector([env.count(layout.SHAPE_FIRST + d) for d in range(3)])
     origin, spacing = env.param3(layout.SHAPE_ORIGIN), env.param(layout.SHAPE_SPACING)
     grid = ti.static(DistanceGrid(indenter.values, first, nodes, origin, spacing))
-    rows = [vec3([drive[e, it, 0, r, c] for c in range(3)]) for r in range(6)]
-    rotate, centre, velocity, spin = ti.Matrix.rows([rows[0], rows[1], rows[2]]), rows[3], rows[4], rows[5]
+    rows = [vec3([drive[env.index, it, 0, r, c] for c in range(3)]) for r in range(6)]
+    rotate = ti.Matrix.rows([rows[0], rows[1], rows[2]])
+    return ti.static(Shape(kind, size, grid, rotate, rows[3], rows[4], rows[5]))
+
+
+@ti.func
+def clearance(env: ti.template(), gels: ti.template(), row, i, j, shape: ti.template()):
+    """How much farther than TOUCHABLE all points of cell (i, j) are from the indenter, at least [mm].
+
+    Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh, whose
+    distances are true only near it, that of its bounding box. A distance grows no faster than the path.
+    """
+    h = env.param(layout.GEL_SPACING)
+    middle = vec3(0.0)
+    for p, q in ti.static(ti.ndrange(2, 2)):
+        node = surface_at(gels, row + i + p + 1, j + q + 1)
+        middle += 0.25 * vec3([gels.surface[node + c] for c in range(3)])
+    at = vec3((i + 0.5 - 0.5 * gels.nx) * h, (j + 0.5 - 0.5 * gels.ny) * h, 0.0)
+    at += middle
+    far, y = 0.0, shape.rotate.transpose() @ (at - shape.centre)
+    if shape.kind == GRID:
+        far, _ = box_distance(shape.size, y)
+    else:
+        far, _ = signed_distance(env, shape.kind, shape.size, y, shape.grid)
+    # how far its points can lie from its middle
+    reach = 0.0
+    for p, q in ti.static(ti.ndrange(2, 2)):
+        node = surface_at(gels, row + i + p + 1, j + q + 1)
+        corner = vec3([gels.surface[node + c] for c in range(3)]) - middle
+        reach = ti.max(reach, (corner + h * vec3(p - 0.5, q - 0.5, 0.0)).norm_sqr())
+    return far - ti.sqrt(reach) - TOUCHABLE * h
+
+
+@ti.func
+def forget(env: ti.template(), indenter: ti.template(), i, j):
+    """What contact remembers of the quadrature point (i, j)."""
+    indenter.slip[env.index, i, j] = vec3(0.0)
+    indenter.pressure[env.index, i, j] = 0.0
+
+
+@ti.func
+def point_push(env: ti.template(), gels: ti.template(), indenter: ti.template(), shape: ti.template(), i, j, x, us, vs):
+    """What the indenter does to the gel at the quadrature point (i, j), which is at x: whether it touches, force and
+    pressure times area as a vector of four [N], overlap [mm].
+
+    us: its displacement, and behind it the pressure that the nodes carry; vs: its velocity.
+    """
+    h, k_n, dt = env.param(layout.GEL_SPACING), env.param(layout.STIFFNESS), env.param(layout.STEP)
     area = h * h / (POINTS * POINTS)
     follow = dt / (h * gels.layers)  # friction's limit follows the pressure within a wave's time through the gel
     c_n = CONTACT_DAMPING * env.param(layout.GEL_DENSITY) * h / (2.0 * dt)
-    back = rotate.transpose()
-    total, moment = vec3(0.0), vec3(0.0)
-    deepest = 0.0
+    y = shape.rotate.transpose() @ (x - shape.centre)
+    phi, n_local = signed_distance(env, shape.kind, shape.size, y, shape.grid)
+    touching, push = False, vec4(0.0)
+    if phi < TOUCHABLE * h:
+        pressure = us[3] - k_n * phi
+        n = shape.rotate @ n_local  # out of the indenter: pushes the gel
+        moving = shape.velocity + shape.spin.cross(x - shape.centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
+        closing = moving.dot(n)
+        normal = pressure + c_n * closing
+        if normal > 0.0:
+            touching = True
+            sliding = moving - closing * n
+            rest = ti.max(pressure, 0.0)
+            memory = indenter.pressure[env.index, i, j]
+            memory += follow * (rest - memory)
+            limit = env.param(layout.FRICTION) * memory
+            ft, slip = friction(
+                indenter.slip[env.index, i, j], n, sliding, limit, TANGENT_STIFFNESS * k_n, c_n, dt
+            )  # fmt: skip
+            indenter.slip[env.index, i, j] = slip
+            indenter.pressure[env.index, i, j] = memory
+            force = area * (normal * n - ft)
+            push = vec4(force[0], force[1], force[2], area * rest)
+    if not touching:
+        forget(env, indenter, i, j)
+    return touching, push, -phi
+
+
+@ti.func
+def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template(), indenter: ti.template()):
+    """Contact of the indenter with this part's cells of gel 0. Notes its force and moment on the sensor, sensor axes.
+
+    drive: pose and velocity of the indenter in the sensor frame.
+    """
+    nx, ny, h = gels.nx, gels.ny, env.param(layout.GEL_SPACING)
+    shape = ti.static(shape_of(env, it, drive, indenter))
+    total, moment, deepest = vec3(0.0), vec3(0.0), 0.0
     row, forces = surface_row(env, gels, 0), contact_force_start(env, gels, copy_of(part), 0)
     first_cell, last_cell, low, high = 0, 0, 0, ny
     points = filled(0.0, 2 * POINTS * POINTS, 4)  # of one cell: what its points feel, and what they push
@@ -280,31 +279,11 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
         first_cell, last_cell = part_range(nx, part)
     for cell_i in range(first_cell, last_cell):
         for cell_j in range(low, high):
-            # Nine points a cell, few of them near the indenter: its distance from the cell's middle decides; of a mesh,
-            # whose distances are true only near it, that of its bounding box. A distance grows no faster than the path.
-            middle = vec3(0.0)
-            for p, q in ti.static(ti.ndrange(2, 2)):
-                node = surface_at(gels, row + cell_i + p + 1, cell_j + q + 1)
-                middle += 0.25 * vec3([gels.surface[node + c] for c in range(3)])
-            at = vec3((cell_i + 0.5 - 0.5 * nx) * h, (cell_j + 0.5 - 0.5 * ny) * h, 0.0)
-            at += middle
-            far = 0.0
-            if kind == GRID:
-                far, _ = box_distance(size, back @ (at - centre))
-            else:
-                far, _ = signed_distance(env, kind, size, back @ (at - centre), grid)
-            # how far its points can lie from its middle
-            reach = 0.0
-            for p, q in ti.static(ti.ndrange(2, 2)):
-                node = surface_at(gels, row + cell_i + p + 1, cell_j + q + 1)
-                corner = vec3([gels.surface[node + c] for c in range(3)]) - middle
-                reach = ti.max(reach, (corner + h * vec3(p - 0.5, q - 0.5, 0.0)).norm_sqr())
-            spare = far - ti.sqrt(reach) - TOUCHABLE * h
+            spare = clearance(env, gels, row, cell_i, cell_j, shape)
             if spare > 0.0:
                 if spare < MARGIN * h:
                     for p, q in ti.static(ti.ndrange(POINTS, POINTS)):
-                        indenter.slip[e, cell_i * POINTS + p, cell_j * POINTS + q] = vec3(0.0)
-                        indenter.pressure[e, cell_i * POINTS + p, cell_j * POINTS + q] = 0.0
+                        forget(env, indenter, cell_i * POINTS + p, cell_j * POINTS + q)
             else:
                 if ti.static(not ON_DEVICE):
                     patch_sums(gels, row, cell_i, cell_j, points)
@@ -312,7 +291,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                 for point in range(POINTS * POINTS):
                     i, j = cell_i * POINTS + point // POINTS, cell_j * POINTS + point % POINTS
                     wx, wy = weights_of(point // POINTS), weights_of(point % POINTS)
-                    us, vs = vec4(0.0), vec4(0.0)  # displacement and the pressure that the nodes carry; velocity
+                    us, vs = vec4(0.0), vec4(0.0)
                     if ti.static(ON_DEVICE):
                         us = patch_sum(gels, row, cell_i, cell_j, wx, wy)
                         vs = patch_sum(gels, row + nx + 3, cell_i, cell_j, wx, wy)
@@ -321,34 +300,13 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
                         vs = vec4([points[POINTS * POINTS + point, c] for c in range(4)])
                     at_rest = vec3((i + 0.5) / POINTS - 0.5 * nx, (j + 0.5) / POINTS - 0.5 * ny, 0.0)
                     x = h * at_rest + vec3(us[0], us[1], us[2])
-                    phi, n_local = signed_distance(env, kind, size, back @ (x - centre), grid)
-                    touching = False
-                    push = vec4(0.0)
-                    if phi < TOUCHABLE * h:
-                        pressure = us[3] - k_n * phi
-                        n = rotate @ n_local  # out of the indenter: pushes the gel
-                        moving = velocity + spin.cross(x - centre) - vec3(vs[0], vs[1], vs[2])  # relative to the gel
-                        closing = moving.dot(n)
-                        normal = pressure + c_n * closing
-                        if normal > 0.0:
-                            touching, pushed = True, True
-                            sliding = moving - closing * n
-                            rest = ti.max(pressure, 0.0)
-                            memory = indenter.pressure[e, i, j]
-                            memory += follow * (rest - memory)
-                            ft, slip = friction(
-                                indenter.slip[e, i, j], n, sliding, mu * memory, TANGENT_STIFFNESS * k_n, c_n, dt
-                            )
-                            indenter.slip[e, i, j] = slip
-                            indenter.pressure[e, i, j] = memory
-                            force = area * (normal * n - ft)
-                            total += force
-                            moment += x.cross(force)
-                            deepest = ti.max(deepest, -phi)
-                            push = vec4(force[0], force[1], force[2], area * rest)
-                    if not touching:
-                        indenter.slip[e, i, j] = vec3(0.0)
-                        indenter.pressure[e, i, j] = 0.0
+                    touching, push, overlap = point_push(env, gels, indenter, shape, i, j, x, us, vs)
+                    if touching:
+                        pushed = True
+                        force = vec3(push[0], push[1], push[2])
+                        total += force
+                        moment += x.cross(force)
+                        deepest = ti.max(deepest, overlap)
                     if ti.static(not ON_DEVICE):
                         for c in ti.static(range(4)):
                             pushes[point, c] = push[c]
@@ -363,7 +321,7 @@ def indent(env: ti.template(), part, it, drive: ti.template(), gels: ti.template
     if ti.static(ON_DEVICE):
         record_most(env, slot, layout.OVERLAP, deepest)
     else:
-        env.partial[e, part, layout.OVERLAP] = deepest
+        env.partial[env.index, part, layout.OVERLAP] = deepest
     for d in ti.static(range(3)):
         record_sum(env, slot, layout.FORCE + d, total[d])
         record_sum(env, slot, layout.FORCE + 3 + d, moment[d])

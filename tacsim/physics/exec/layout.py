@@ -46,7 +46,8 @@ CAPACITY = 16  # strips of grid nodes that an environment has room for, in each 
 SHAPE_NODES = 17  # of an indenter's distance grid, how many are loaded along x, y, z
 ELEMENTS = 20  # of a gel along x, y, z
 SHAPE_FIRST = 23  # number of the first loaded node of an indenter's distance grid along x, y, z
-COUNTS = 26
+GRID_MOVES = 26  # 1: the grid's nodes have velocities from the launch before; 0: particles bring them
+COUNTS = 27
 
 # partial (environments, PARTS, NUMBERS) float32: what each part saw or summed
 SMALLEST_VOLUME = 0  # det F over the gel elements
@@ -71,4 +72,5 @@ VELOCITY = 13  # x, y, z
 AFFINE = 16  # affine velocity dv/dX over the grid's reference, column by column [1/mm]
 REFERENCE = 25  # place on the grid, which stays while the body moves: x, y, z [mm]
 GRADIENT = 28  # displacement gradient H = F - I since then, column by column
-PARTICLE_ROWS = 37
+PUSH = 37  # change of velocity that contact has given it in this substep: x, y, z
+PARTICLE_ROWS = 40

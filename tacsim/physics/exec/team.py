@@ -1,10 +1,10 @@
 """Threads of one environment: how a launch is spread over them.
 
 A launch runs many substeps, since starting one costs as much as a draft substep. A substep is a few stages, and each
-stage PARTS pieces of work, which the threads of a team take one after the other. A stage begins when the one before is
-done. Nobody waits for a thread that another program keeps from running, unless it has a piece in hand; and who has
-waited for long leaves the rest of the launch to the others (docs/decisions/0007). Whoever does a piece, its bits are
-the same.
+stage PARTS pieces of work, one of each part. The threads of a team take them one after the other, each first those of
+its own parts, whose arrays are in its core's cache. A stage begins when the one before is done. Nobody waits for a
+thread that another program keeps from running, unless it has a piece in hand; and who has waited for long leaves the
+rest of the launch to the others (docs/decisions/0007). Whoever does a piece, its bits are the same.
 """
 
 from collections.abc import Sequence
@@ -18,35 +18,38 @@ from tacsim.compute.threads import threads
 from tacsim.physics.exec.lanes import PARTS
 
 CHUNK = 512  # Taichi runs loops of up to 512 iterations on one thread: every member gets a chunk, and does its first
-PATIENCE = 20_000  # polls of a stage that is not done, after which a member leaves: some 0.5 ms
+PATIENCE = 8_000  # polls of a stage that is not done, after which a member leaves: some 0.5 ms
 
 # Columns of `sync`, a row (one cache line) for each environment that has substeps to do
 ENVIRONMENT = 0  # its index
-CLAIMED, DONE = 1, 2  # pieces of work so far
+DONE = 1  # pieces of work so far
+CLAIMED = 2  # stages of part 0, 1, ... that somebody has taken
 
 Sync = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
 
 @ti.func
-def next_piece(sync: ti.template(), turn, pieces):
-    """Number of the next piece of work, which the caller must do and report by `piece_done`; `pieces` if there is none
-    left for this member.
+def next_piece(sync: ti.template(), turn, own, stages):
+    """Number of the next piece of work, stage PARTS + part, which the caller must do and report by `piece_done`; stages
+    PARTS if there is none left for this member.
 
-    turn: row of `sync`; pieces: in all stages, PARTS in each. A member that leaves has nothing in hand, so somebody
-    else has what it waited for, and does the rest.
+    turn: row of `sync`; own: the first of the member's own parts; stages: how many there are. A member that leaves has
+    nothing in hand, so somebody else has what it waited for, and does the rest.
     """
     piece, polls = -1, 0
     while piece < 0:
-        following = ti.atomic_add(sync[turn, CLAIMED], 0)
-        if following >= pieces:
-            piece = pieces
-        elif ti.atomic_add(sync[turn, DONE], 0) >= following // PARTS * PARTS:
-            if ti.atomic_max(sync[turn, CLAIMED], following + 1) == following:  # nobody was faster
-                piece = following
-        else:
-            polls += 1
-            if polls > PATIENCE:
-                piece = pieces
+        stage = ti.atomic_add(sync[turn, DONE], 0) // PARTS
+        if stage >= stages:
+            piece = stages * PARTS
+        for n in range(PARTS):
+            part = (own + n) % PARTS
+            if piece < 0 and ti.atomic_add(sync[turn, CLAIMED + part], 0) == stage:
+                before = ti.atomic_max(sync[turn, CLAIMED + part], stage + 1)
+                if before == stage:  # nobody was faster
+                    piece = stage * PARTS + part
+        polls += 1
+        if piece < 0 and polls > PATIENCE:
+            piece = stages * PARTS
     return piece
 
 
@@ -67,6 +70,12 @@ def first_in_chunk(task):
 @ti.func
 def once_if(condition):
     return ti.select(condition, 1, 0)
+
+
+@ti.func
+def own_part(task, team):
+    """The first of the parts that a member does before others."""
+    return task // CHUNK % team * PARTS // team % PARTS
 
 
 def team_size(environments: int) -> int:

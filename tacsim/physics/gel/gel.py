@@ -133,6 +133,7 @@ class GelState:
             ends[0], ends[-1] = np.array([[[0.0], [0.5]], [[0.5], [0.0]]])
             self.lattice[2 + 2 * axis : 4 + 2 * axis, :nodes] = weights.reshape(2, nodes)
         self._shape = (nx + 1, row)
+        self._u, self._v, self._f = (self._view(quantity) for quantity in range(3))
 
     def _view(self, quantity: int) -> np.ndarray:
         nx1, ny1 = self._shape
@@ -144,17 +145,17 @@ class GelState:
     @property
     def u(self) -> np.ndarray:
         """Displacement [mm], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
-        return self._view(0)
+        return self._u
 
     @property
     def v(self) -> np.ndarray:
         """Velocity, (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
-        return self._view(1)
+        return self._v
 
     @property
     def f(self) -> np.ndarray:
         """Force on the nodes in the last substep [N], (E, gels, nx + 1, ny + 1, nz + 1, 3), a view."""
-        return self._view(2)
+        return self._f
 
     @property
     def carried(self) -> np.ndarray:
@@ -167,7 +168,13 @@ class GelState:
         nx1, ny1 = self._shape
         flat = self.nodes[environment, :, 0, :, :, : nx1 * ny1]
         u = flat.reshape(*flat.shape[:-1], nx1, ny1)  # gel, axis, layer, i, j
-        return spacing + min(float(np.diff(u[:, axis], axis=along).min()) for axis, along in ((0, 2), (1, 3), (2, 1)))
+        edges = u[:, 0, :, 1:] - u[:, 0, :, :-1], u[:, 1, ..., 1:] - u[:, 1, ..., :-1], u[:, 2, 1:] - u[:, 2, :-1]
+        return spacing + min(float(edge.min()) for edge in edges)
+
+    def quiet(self, environment: int, fastest: float) -> bool:
+        """Whether all displacements and velocities are finite, and no component of a velocity beyond `fastest`."""
+        moving = self.nodes[environment, :, :2]
+        return bool(np.isfinite(moving).all()) and bool(np.abs(moving[:, 1]).max() <= fastest)
 
     def refresh(self) -> None:
         """Copies the nodes' top layer to `surface`, and its rim outside: before a launch, since all may be written.
@@ -176,8 +183,8 @@ class GelState:
         """
         nx1, ny1 = self._shape
         self.nodes[..., nx1 * ny1 :] = 0.0
-        for quantity in range(2):
-            top = self._view(quantity)[..., -1, :]
+        for quantity, nodes in enumerate((self._u, self._v)):
+            top = nodes[..., -1, :]
             surface = self.surface[:, :, quantity]
             surface[:, :, 1:-1, 1:-1, :3] = top
             surface[:, :, [0, -1], 1:-1] = surface[:, :, [1, -2], 1:-1]

@@ -54,6 +54,7 @@ class Path:
     hold at its end between two readings of the forces. rise: share of the time in which the velocity rises, of `ramp`.
 
     unfollowed: friction does not follow it: too fast, or slid by an edge that catches on the mesh.
+    creeps: what it moves yields, and creeps on when it has ended.
 
     rates: velocities at start and end, each (frames, 6), linear and angular, world axes [-, rad/mm]: instead of a ramp
     from rest to rest the path is then the cubic that has them.
@@ -67,6 +68,7 @@ class Path:
     interval: int = 20
     rise: float = 0.5
     unfollowed: bool = False
+    creeps: bool = False
     rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @property
@@ -86,6 +88,9 @@ class Path:
         knots = np.arange(first * self.refine, last * self.refine + 1) / (max(self.substeps, 1) * self.refine)
         out = np.zeros((len(knots) - 1, len(self.start), 6, 3))
         for index, a in enumerate(self.start):
+            if not self.substeps:
+                out[:, index, :3], out[:, index, 3] = _matrix(*a.quaternion.tolist()), a.position * MM
+                continue
             moved = self._displacements(index, knots)
             if moved[:, 3:].any():
                 from scipy.spatial.transform import Rotation  # slow to import, and most motions turn nothing
@@ -101,8 +106,6 @@ class Path:
 
     def _displacements(self, index: int, knots: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 6) of a frame from its start: [mm], rotation vector [rad], at shares `knots` (n,) of the time."""
-        if not self.substeps:
-            return np.zeros((len(knots), 6))
         t = np.clip(knots, 0.0, 1.0)[:, None]
         whole = displacement_between(self.start[index], self.end[index])
         if self.rates is None:
@@ -114,6 +117,8 @@ class Path:
 
     def span(self, names: Iterable[str], first: int, last: int) -> LaunchSpan:
         """Substeps first..last in words, and where the frames called `names` are at their end."""
+        if not self.substeps:
+            return LaunchSpan("in the hold after the motion", dict(zip(names, self.start, strict=True)))
         words = f"in substeps {first} to {last} of {self.substeps} of the motion"
         at, poses = np.array([last / max(self.substeps, 1)]), {}
         for index, (name, a) in enumerate(zip(names, self.start, strict=True)):
@@ -123,7 +128,7 @@ class Path:
 
                 quaternion = (Rotation.from_rotvec(moved[3:]) * Rotation.from_quat(quaternion)).as_quat()
             poses[name] = Pose(a.position + moved[:3] / MM, quaternion)
-        return LaunchSpan(words if self.substeps else "in the hold after the motion", poses)
+        return LaunchSpan(words, poses)
 
 
 @lru_cache(maxsize=64)

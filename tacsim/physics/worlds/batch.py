@@ -17,7 +17,8 @@ from tacsim.physics.motion.controller import ForceReading, Launch, Motion
 from tacsim.physics.motion.load import LoadNotReached
 from tacsim.physics.move import MoveCommand, MoveStats
 from tacsim.physics.worlds.base import NotCopyable
-from tacsim.physics.worlds.hybrid import HybridState, HybridWorld
+from tacsim.physics.worlds.hybrid import HybridWorld
+from tacsim.physics.worlds.hybrid_state import HybridState
 from tacsim.physics.worlds.press import PressState, PressWorld
 
 Result = MoveStats | SimulationDiverged | LoadNotReached | None

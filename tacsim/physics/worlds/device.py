@@ -162,7 +162,7 @@ def scatter_of_hybrid(
             body = ti.static(Body(particles, masses, velocities))
             for g in range(2):
                 gel_contact(env, p, g, clock[0], drive, body, histories, gels, ceiling[e, g, clock[0] % 2])
-            particles_to_grid(env, p, body)
+            particles_to_grid(env, p, clock[0], body)
     columns = lattice.shape[0] // LATTICE_ROWS
     for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
@@ -173,7 +173,7 @@ def scatter_of_hybrid(
                 gel_means(env, n, gels)
             elif n - 2 * columns < grid_nodes(env):
                 body = ti.static(Body(particles, masses, velocities, changes))
-                grid_changes(env, n - 2 * columns, clock[0], body)
+                grid_changes(env, n - 2 * columns, body)
     for e, n in ti.ndrange(counts.shape[0], 2 * columns + most_nodes):
         env = ti.static(Environment(e, params, counts, partial))
         if is_active(env, clock):

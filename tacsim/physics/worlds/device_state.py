@@ -101,7 +101,12 @@ class DeviceState(ABC):
             now = {name: host.copy() for name, host in hosts.items()}
             try:
                 for name, host in hosts.items():
-                    host[...] = self.arrays.look(f"{name} before {moment}").reshape(host.shape)
+                    kept = self.arrays.look(f"{name} before {moment}")
+                    if kept.size == host.size:
+                        host[...] = kept.reshape(host.shape)
+                    else:  # room for more nodes of grids since then
+                        kept = kept.reshape(len(self._params), -1)
+                        host.reshape(len(self._params), -1)[:, : kept.shape[1]] = kept
                 yield
             finally:
                 for name, host in hosts.items():
@@ -215,14 +220,17 @@ class DeviceHybrid(DeviceState):
         return self._body.counts[index]
 
     def _state(self) -> dict[str, tuple[np.ndarray, Any]]:
-        particles, histories = self._body.arguments()[0], self._contact_history()
-        return {**super()._state(), "particles": (particles, ti.f32), "histories": (histories, ContactHistory)}
+        particles, _, velocities = self._body.arguments()
+        own = {
+            "particles": (particles, ti.f32), "velocities": (velocities, strip),
+            "histories": (self._contact_history(), ContactHistory),
+        }  # fmt: skip
+        return {**super()._state(), **own}
 
     def _own(self) -> dict[str, Any]:
-        _, masses, velocities = self._body.arguments()
+        masses = self._body.arguments()[1]
         return {
             "masses": self.arrays.allocate("masses", strip, masses.shape[:-1]),
-            "velocities": self.arrays.allocate("velocities", strip, velocities.shape[:-1]),
             "changes": self.arrays.allocate("changes", ti.f32, (self._body.changes.size,)),
             "sums": self.arrays.allocate("sums", ti.f32, (len(self._params), MOMENTS, BLOCKS)),
             "most_particles": max(self._body.counts),

@@ -129,12 +129,29 @@ class FemWorld(BaseWorld):
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        return snapshot_of({**self.arrays(), **self._scalars()}, self._poses)
+        return snapshot_of({**self.arrays(), **self._grid(self._grid_kept()), **self._scalars()}, self._poses)
+
+    def _grid_kept(self) -> tuple[int, int, int]:
+        """The grid that a snapshot holds, see `BodyState.grid_kept`."""
+        return 0, 0, 0
+
+    def _grid(self, shape: tuple[int, int, int]) -> dict[str, NDArray[Any]]:
+        """What a snapshot holds of that."""
+        return {}
+
+    def _lay(self, state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Room for the same of a state that is to be restored."""
+        return {}
+
+    def _take_up(self, grid: Mapping[str, NDArray[Any]]) -> None:
+        """Goes on with a grid that has been restored."""
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See World."""
-        numbers = self._scalars()
-        self._poses = restore_arrays({**self.arrays(), **numbers}, list(self._poses), state, finite=list(numbers))
+        numbers, grid = self._scalars(), self._lay(state)
+        arrays = {**self.arrays(), **grid, **numbers}
+        self._poses = restore_arrays(arrays, list(self._poses), state, finite=list(numbers))
+        self._take_up(grid)
         self._use_inertia(self._true if numbers["true_inertia"] else self._scaled)
 
     def place(self, poses: Mapping[str, Pose]) -> None:
@@ -174,9 +191,11 @@ class FemWorld(BaseWorld):
     def _kept(self, device: DeviceState, moment: str, also: State) -> State:
         """This world's arrays as the device has kept them before the last "motion" or "launch", and `also`."""
 
+        shape = self._grid_kept()
+
         def fetch() -> State:
             with device.as_kept(moment):
-                return {**copies(self.arrays()), **also}
+                return {**copies({**self.arrays(), **self._grid(shape)}), **also}
 
         return Kept(fetch)
 
@@ -258,6 +277,7 @@ class FemWorld(BaseWorld):
         path = plan(
             start, end, mach, self._scaled.step, lever, gel.thickness, remembered=remembered, short=short
         )  # fmt: skip
+        path = replace(path, creeps=self.yields)
         indenter = self.scene.indenter
         if indenter is None or indenter.friction == 0.0:
             return path
@@ -269,7 +289,8 @@ class FemWorld(BaseWorld):
 
     def _plan_flow(self, start: Sequence[Pose], end: Sequence[Pose]) -> Path:
         mach, gel = self.scene.flow_mach, self._gel
-        return plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
+        path = plan_flow(start, end, self._rates.copy(), mach, self._scaled.step, max(gel.half), gel.thickness)
+        return replace(path, creeps=self.yields)
 
     @launching()  # around all of it: worlds of a batch share arrays, among them those that say which take part
     def _advance(self, path: Path, first: int, last: int) -> ForceReading:

@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacsim.compute.runtime import start
-from tacsim.geometry.sampling import body_points
-from tacsim.geometry.shapes import extent, volume
+from tacsim.geometry.shapes import extent
 from tacsim.interface import Pose, Truth
 from tacsim.models.scene import Scene
-from tacsim.physics.body.moments import Moments, moments_of
+from tacsim.physics.body.moments import Moments
 from tacsim.physics.body.plasticine import (
     BORDER,
-    BodyParams,
-    BodyState,
-    body_params,
+    STENCIL_REACH,
+    bounds,
     bounds_of,
-    centre_of,
+    fit_grid,
 )
-from tacsim.physics.body.surface import surface_points, tangent_planes
-from tacsim.physics.contact.contact import ContactHistory
+from tacsim.physics.body.surface import surface_points
 from tacsim.physics.contact.gel_overlap import apart, gel_overlap
-from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
+from tacsim.physics.exec.lanes import NODES
 from tacsim.physics.exec.layout import (
     BACKING,
     BODY_DAMPING,
     BODY_MASS,
     CARRIED,
     CENTRE,
-    COUNTS,
-    ELEMENTS,
     FILTERED,
     FORCE,
     FRICTION,
@@ -45,34 +36,37 @@ from tacsim.physics.exec.layout import (
     HOUSING,
     HOUSING_FORCE,
     INVERSE_INERTIA,
-    NUMBERS,
     OWN,
-    PARAMS,
     REFERENCE_CENTRE,
     RIGID_MASS_SCALE,
     STEP,
     STIFFNESS,
     WIDENING,
 )  # fmt: skip
-from tacsim.physics.exec.team import run_team
 from tacsim.physics.failure.diagnosis import volume_range
-from tacsim.physics.failure.health import NO_ROOM, Health, SimulationDiverged, check_launch, require_room
-from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
+from tacsim.physics.failure.health import (
+    FASTEST,
+    NO_ROOM,
+    SMALLEST_VOLUME_RATIO,
+    Health,
+    SimulationDiverged,
+    check_launch,
+    require_room,
+)
 from tacsim.physics.motion.controller import ForceReading, Integration, Launch, PreparedLaunch, force_floor
 from tacsim.physics.motion.inertia import Inertia, kernel_density, kernel_second
+from tacsim.physics.snapshot import State
 from tacsim.physics.units import MM, MPA
-from tacsim.physics.worlds.fem import FemState, FemWorld, stack_drives
-from tacsim.physics.worlds.hybrid_kernels import substeps
+from tacsim.physics.worlds.fem import FemWorld
+from tacsim.physics.worlds.hybrid_state import CLEARANCE, HybridState
 from tacsim.pose import HALF_TURN_X
-
-if TYPE_CHECKING:
-    from tacsim.physics.worlds.device_state import DeviceHybrid
 
 # dt / (smallest spacing / wave speed). At 0.8 the contact of body and gel fails, without a NaN.
 COURANT = 0.5
 # Damping of a driven motion falsifies its path, since gels yield and the body spreads; damping of the hold does not.
 ZETA_GEL, ZETA_GEL_HELD = 0.8, 1.6  # zeta in rate = zeta c / thickness
-ZETA_BODY, ZETA_BODY_HELD = 0.4, 0.8  # zeta in rate = zeta c / gel thickness, against the driven affine motion
+ZETA_BODY, ZETA_BODY_HELD = 0.6, 1.2  # zeta in rate = zeta c / gel thickness, against the driven affine motion
+ZETA_YIELDING_HELD = 0.3  # of a held body that yields: what creeps has only this drag to overcome
 # How nodes answer to forces: by their own acceleration, and by that filtered by (4 S - 1)^2, S the mean over the cells
 # round them. What the mesh resolves, S = 1, is six times as light; the shortest waves, S = 0, are as heavy as they are.
 TRUE_INERTIA = {OWN: 1.0, FILTERED: 0.0}
@@ -84,117 +78,6 @@ GEL_OVERLAP = 0.25  # of a gel's thickness: deeper in one another, gels that do 
 # strains that no node of the grid feels (docs/physics.md)
 TENSION = 3.0
 LARGEST_GREEN = 0.3  # norm of F^T F - I since the reference of the body's grid: beyond, the grid is laid anew
-CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
-
-
-class HybridState(FemState):
-    """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
-
-    Environments share the gels' lattice; each has its own body, materials, friction and settling.
-    """
-
-    device: DeviceHybrid | None = None
-
-    def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Raises ValueError for gels that are not cut alike."""
-        start()
-        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
-        self._gels = GelState(common_lattice(self.gel), len(scenes), 2)
-        placed = [_body_at_start(scene) for scene in scenes]
-        self.body = [body for body, _, _ in placed]
-        self._particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
-        # of the contact law [mm]
-        self._contact_history = np.zeros((len(scenes), 2, max(self._particles.counts), ContactHistory.n), np.float32)
-        self.params = np.zeros((len(scenes), PARAMS), np.float32)
-        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
-        self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
-        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
-        if ON_DEVICE:
-            from tacsim.physics.worlds.device_state import DeviceHybrid
-
-            numbers = self.params, self.counts, self.partial
-            self.device = DeviceHybrid(self._gels, numbers, self._particles, lambda: self._contact_history)
-
-    @property
-    def particles(self) -> BodyState:
-        self._bring_back()
-        return self._particles
-
-    @property
-    def contact_history(self) -> np.ndarray:
-        self._bring_back()
-        return self._contact_history
-
-    def extents(self, index: int) -> np.ndarray:
-        """See `BodyState.extents`; what follows is likewise of one environment, wherever its arrays are."""
-        return self._particles.extents(index) if self.device is None else self.device.survey(index).extents
-
-    def fit(self, index: int, cell: float, extents: np.ndarray) -> None:
-        """Lays its grid. Raises MemoryError."""
-        # a node at its border has no mass: the cells round each that has are all there (tacsim.physics.body.mass)
-        self._particles.fit(index, cell, 2.0 * cell, self.params, self.counts, extents)
-
-    def moments(self, index: int) -> Moments:
-        return moments_of(self._particles, index) if self.device is None else self.device.moments(index)
-
-    def centre(self, index: int) -> np.ndarray:
-        """Of the particles (3,) [mm]."""
-        return centre_of(self._particles.x(index)) if self.device is None else self.device.moments(index).centre
-
-    def outside(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [mm] and tangent planes [1/mm] of the particles, (n, 3) both."""
-        if self.device is not None:
-            return self.device.outside(index)
-        return self._particles.x(index), self._particles.plane(index)
-
-    @property
-    def most_nodes(self) -> int:
-        """Of a grid, see `BodyState.most`."""
-        return self._particles.most
-
-    def place(self, index: int, scene: Scene) -> None:
-        """One environment as it is at the construction of another scene. Raises ValueError for gels cut otherwise."""
-        gel = gel_params(scene.gel, scene.element)
-        common_lattice([*self.gel, gel])
-        body, points, planes = _body_at_start(scene)
-        self.gel[index], self.body[index] = gel, body
-        self.gels.u[index], self.gels.v[index] = 0.0, 0.0
-        self.particles.place(index, points, planes)
-        missing = max(self.particles.counts) - self.contact_history.shape[2]
-        if missing > 0:
-            self._contact_history = np.pad(self.contact_history, ((0, 0), (0, 0), (0, missing), (0, 0)))
-        self.contact_history[index], self.params[index], self.partial[index] = 0.0, 0.0, 0.0
-        self.counts[index] = 0
-        self.counts[index, ELEMENTS : ELEMENTS + 3] = gel.elements
-
-    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
-        drive = stack_drives(drives, self.counts)
-        if self.device is not None:
-            self.device.run(drive)
-            return
-        self._gels.refresh()
-        run_team(
-            substeps, drive, self._gels.arguments(), self._particles.arguments(),
-            self._particles.changes.reshape(-1), self._contact_history, self.params,
-            self.counts, self.partial, active=list(drives),
-        )  # fmt: skip
-
-
-@lru_cache(maxsize=256)
-def _inverse_of(second: bytes) -> np.ndarray:
-    """Pseudo-inverse of second moments (3, 3) float64: those of a reference stay for many launches."""
-    inverse: np.ndarray = np.linalg.pinv(np.frombuffer(second).reshape(3, 3), rcond=1e-6, hermitian=True)
-    return inverse
-
-
-def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
-    """A scene's body: parameters, particles at construction (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
-    assert scene.body is not None
-    height = float(extent(scene.body.geometry)[2])
-    points = body_points(scene.body, scene.spacing)
-    body = body_params(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
-    planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM
-    return body, (points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM, planes
 
 
 class HybridWorld(FemWorld):
@@ -245,8 +128,9 @@ class HybridWorld(FemWorld):
             RIGID_MASS_SCALE: max(1.0, height / self._body.spacing - FILTERED_RIGID),
         }  # fmt: skip
         held = {
-            GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness, BODY_DAMPING: ZETA_BODY_HELD / self._gel.thickness,
-        }  # fmt: skip
+            GEL_DAMPING: ZETA_GEL_HELD / self._gel.thickness,
+            BODY_DAMPING: (ZETA_YIELDING_HELD if self.yields else ZETA_BODY_HELD) / self._gel.thickness,
+        }
         masses = {**self._masses(self._gel.density, self._body.density, step), **SELECTIVE_INERTIA}
         # the filter makes a body lighter, so its particles bear less: between stiff gels they shook, untold
         masses[STIFFNESS] = min(masses[STIFFNESS], LARGEST_SHARE * masses[BODY_MASS] / step**2)
@@ -277,6 +161,7 @@ class HybridWorld(FemWorld):
         b, i = self._state.particles, self._index
         for moving in (self._state.gels.v[i], b.v(i), b.c(i)):
             moving[...] = 0.0
+        b.forget_grid(i)
 
     def _courant(self) -> float:
         """Of gels and body: the larger; the body's grid does not shrink with it."""
@@ -295,6 +180,30 @@ class HybridWorld(FemWorld):
             "reference": b.reference(i), "gradient": b.gradient(i), "planes": b.plane(i),
             "contact": state.contact_history[i, :, : b.counts[i]], "sums": state.partial[i],
         }  # fmt: skip
+
+    def _grid_kept(self) -> tuple[int, int, int]:
+        return self._state.grid_kept(self._index)
+
+    def _grid(self, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
+        return {"grid_velocity": self._state.particles.grid_velocity(self._index, shape)}
+
+    def _lay(self, state: State) -> dict[str, np.ndarray]:
+        own = self._state.particles.reference(self._index)
+        places = np.asarray(state.get("reference", own))
+        if places.shape != own.shape or not np.can_cast(places.dtype, own.dtype, "same_kind"):
+            places = own  # of a state that will be refused
+        if np.size(state.get("grid_velocity", ())) == 0 or not np.isfinite(places).all():
+            return {}
+        _, (nx, ny, nz) = fit_grid(*bounds(places.astype(np.float32)), self._body.cell, STENCIL_REACH * self._body.cell)
+        return {"grid_velocity": np.empty((nx, ny, nz - NODES + 1, 3), np.float32)}
+
+    def _take_up(self, grid: State) -> None:
+        state, i = self._state, self._index
+        if not grid:
+            state.particles.forget_grid(i)
+            return
+        state.fit(i, self._body.cell, state.extents(i))
+        state.particles.keep_grid(i, state.counts, grid["grid_velocity"])
 
     def truth(self) -> Truth:
         x, planes = self._state.outside(self._index)
@@ -329,10 +238,8 @@ class HybridWorld(FemWorld):
         """Centre, inverse moment of inertia and mean motion of the particles since their reference, for the kernels."""
         params = self._state.params[self._index]
         params[REFERENCE_CENTRE : REFERENCE_CENTRE + 3] = moments.reference_centre
-        params[CARRIED : CARRIED + 9] = (moments.moved @ _inverse_of(moments.reference_second.tobytes())).ravel()
-        second = moments.second * float(params[BODY_MASS])
-        inertia = np.trace(second) * np.eye(3) - second
-        inverse = _pseudo_inverse(inertia)
+        params[CARRIED : CARRIED + 9] = moments.carried().ravel()
+        inverse = moments.inverse_inertia(float(params[BODY_MASS]))
         params[CENTRE : CENTRE + 3] = moments.centre
         params[INVERSE_INERTIA : INVERSE_INERTIA + 6] = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
@@ -340,7 +247,9 @@ class HybridWorld(FemWorld):
         """The forces after the launch. Raises SimulationDiverged if its state is unphysical."""
         partial = self._state.partial[self._index]
         seen = self._survey()
-        health = Health.read(partial, self._courant(), sound=seen is not None and seen.sound)
+        volumes = volume_range(self.arrays()) if seen is None else seen.volumes
+        sound = self._sound(volumes[0]) if seen is None else seen.sound
+        health = Health.read(partial, self._courant(), sound=sound)
         check_launch(self.arrays, prepared.before, health, prepared.span)
         rotations, origins = prepared.drive[-1, :, :3], prepared.drive[-1, :, 3]
         sums = partial.astype(np.float64)
@@ -350,16 +259,25 @@ class HybridWorld(FemWorld):
         contact = np.einsum("gij,gj->gi", rotations, force)
         backing = np.einsum("gij,gj->gi", rotations, backing)
         centre = self._state.centre(self._index)
-        torque = (np.einsum("gij,gj->gi", rotations, moment) + np.cross(origins - centre, contact)).sum(axis=0)
+        torque = (np.einsum("gij,gj->gi", rotations, moment) + _cross(origins - centre, contact)).sum(axis=0)
         lever = max(self._gel.half)
         gel_overlap = self._gel_overlap(prepared)
-        volumes = volume_range(self.arrays()) if seen is None else seen.volumes
         hits = health.capped + (gel_overlap > 0.0) + self._torn(volumes[1])
         return ForceReading(
             contact, backing, self._floor, health.overlap, hits,
             moment / lever, self._weight, torque / lever,
             Integration(prepared.launch.path.step, self._damping(), health.courant), gel_overlap, volumes,
         )  # fmt: skip
+
+    def _sound(self, smallest_volume: float) -> bool:
+        """See Health.sound. Of whole arrays, since there are many small ones; what is wrong where, others find out."""
+        state, i = self._state, self._index
+        others = state.particles.whole(i), state.contact_history[i], state.partial[i]
+        return (
+            smallest_volume > 2.0 * SMALLEST_VOLUME_RATIO
+            and state.gels.quiet(i, FASTEST)
+            and all(np.isfinite(a).all() for a in others)
+        )
 
     def _torn(self, largest: float) -> bool:
         """Whether the largest elastic volume ratio needs a tension of more than TENSION yield stresses; of a body that
@@ -385,10 +303,6 @@ class HybridWorld(FemWorld):
         return found
 
 
-def _pseudo_inverse(inertia: np.ndarray) -> np.ndarray:
-    """Of a moment of inertia (3, 3). Particles on a line have none about it, and do not turn about it."""
-    moments, axes = np.linalg.eigh(inertia)
-    moments, axes = moments[::-1], np.ascontiguousarray(axes[:, ::-1])
-    inverse = np.divide(1.0, moments, out=np.zeros(3), where=moments > 1e-6 * moments[0])
-    turns: np.ndarray = axes @ (inverse[:, None] * axes.T)
-    return turns
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products of rows (n, 3); np.cross takes three times as long for two."""
+    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)

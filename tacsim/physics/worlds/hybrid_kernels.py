@@ -8,6 +8,7 @@ from tacsim.physics.body.transfers import (
     block_range,
     clear_masses,
     grid_to_particles,
+    has_velocities,
     particles_to_grid,
 )
 from tacsim.physics.contact.contact import ContactHistory, contact_ceiling, particle_contact, support_radius
@@ -28,7 +29,7 @@ from tacsim.physics.exec.lanes import (
     three,
     vec3,
 )
-from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, piece_done
+from tacsim.physics.exec.team import CHUNK, ENVIRONMENT, Sync, first_in_chunk, next_piece, once_if, own_part, piece_done
 from tacsim.physics.gel.kernels import (
     Lattice,
     contact_force_start,
@@ -137,7 +138,7 @@ def grid_update(env: ti.template(), part, it, drive: ti.template(), body: ti.tem
             for k in range(k0, k1):
                 at = (i * ny + j) * nz + k
                 old = strip(0.0)
-                if it > 0:
+                if has_velocities(env, it):
                     old = body.velocities[base + at]
                 moved = strip(0.0)
                 for n in ti.static(range(NODES)):
@@ -201,9 +202,9 @@ def gel_contact(
                 )
                 histories[env.index, g, p] = history
                 if in_contact:
-                    moving += rate * (rotate @ force)
+                    kick = rate * (rotate @ force)
                     for d in ti.static(range(3)):
-                        body.particles[at + (layout.VELOCITY + d) * stride] = moving[d]
+                        body.particles[at + (layout.PUSH + d) * stride] += kick[d]
                     total -= force
                     moment -= local.cross(force)
                     if housed:
@@ -238,10 +239,10 @@ def substeps(
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 2))
             body = ti.static(Body(particles, masses, velocities, changes))
             steps = env.count(layout.STEPS)
-            pieces = PARTS * (6 * steps + 1)
+            stages, own = 6 * steps + 1, own_part(task, team)
             highest, known = ti.Vector([0.0, 0.0]), -1  # of the two gels, in this stage
-            piece = next_piece(sync, turn, pieces)
-            while piece < pieces:
+            piece = next_piece(sync, turn, own, stages)
+            while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 it, scatters = stage // 6, stage % 6 == 0
                 for _new in range(once_if(scatters and stage != known)):
@@ -255,11 +256,11 @@ def substeps(
                     for g in range(2):
                         gel_contact(env, part, g, it, drive, body, histories, gels, highest[g])
                     clear_masses(env, part, body)
-                    particles_to_grid(env, part, body)
+                    particles_to_grid(env, part, it, body)
                     gel_forces(env, part, gels)
                 for _totals in range(once_if(stage % 6 == 1)):
                     gel_means(env, part, gels)
-                    grid_changes(env, part, it, body)
+                    grid_changes(env, part, body)
                 for _even in range(once_if(stage % 6 == 2)):
                     gel_even(env, part, gels)
                 for _cells in range(once_if(stage % 6 == 2 or stage % 6 == 4)):
@@ -270,4 +271,4 @@ def substeps(
                 for _motion in range(once_if(stage % 6 == 5)):
                     grid_update(env, part, it, drive, body)
                 piece_done(sync, turn)
-                piece = next_piece(sync, turn, pieces)
+                piece = next_piece(sync, turn, own, stages)

@@ -11,13 +11,10 @@ from tacsim.geometry.shapes import MAX_NODES, extent, farthest
 from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
 from tacsim.interface import Pose
 from tacsim.models.scene import Box, Cylinder, GelSurface, Mesh, Scene, Shape, Sphere
+from tacsim.physics.contact.distance import BOX, CYLINDER, GRID, SPHERE
 from tacsim.physics.contact.indenter import (
-    BOX,
-    CYLINDER,
-    GRID,
     POINTS,
     SMOOTHING,
-    SPHERE,
     SPLINE_SMOOTHING,
     Indenter,
     Pressure,
@@ -55,6 +52,7 @@ from tacsim.physics.exec.team import (
     first_in_chunk,
     next_piece,
     once_if,
+    own_part,
     piece_done,
     run_team,
 )
@@ -93,9 +91,9 @@ def press_substeps(
             env = ti.static(Environment(index, params, counts, partial))
             gels = ti.static(gels_of(env, nodes, surface, contact_force, corners, lattice, 1))
             indenter = ti.static(Indenter(slip, pressure, values))
-            pieces = 2 * PARTS * env.count(layout.STEPS)  # two stages a substep: forces, then motion
-            piece = next_piece(sync, turn, pieces)
-            while piece < pieces:
+            stages, own = 2 * env.count(layout.STEPS), own_part(task, team)  # two a substep: forces, then motion
+            piece = next_piece(sync, turn, own, stages)
+            while piece < stages * PARTS:
                 stage, part = piece // PARTS, piece % PARTS
                 for _forces in range(once_if(stage % 2 == 0)):
                     indent(env, part, stage // 2, drive, gels, indenter)
@@ -104,7 +102,7 @@ def press_substeps(
                     carry(env, part, gels)
                     gel_advance(env, part, gels)
                 piece_done(sync, turn)
-                piece = next_piece(sync, turn, pieces)
+                piece = next_piece(sync, turn, own, stages)
 
 
 def contact_stiffness(gel: GelParams, step: float) -> float:
@@ -238,6 +236,7 @@ class PressWorld(FemWorld):
     sensors = ("lower",)
     balanced = False
     yields = False
+    unfelt = 0.0  # share of the indenter's depth in the untouched gel that no contact point feels, when last at rest
 
     def __init__(self, scene: Scene, state: PressState | None = None, index: int = 0) -> None:
         """The environment of scene number `index` in a `state` of several; or one alone in a state of its own."""
@@ -338,25 +337,29 @@ class PressWorld(FemWorld):
         )  # fmt: skip
 
     def _require_seen(self, prepared: PreparedLaunch, overlap: float) -> None:
-        """Raises SimulationDiverged if the indenter's lowest point has come into the gel between its contact points,
-        the deepest of which has an `overlap` with it [mm]."""
+        """Raises SimulationDiverged if the indenter's lowest point over the gel has come into it between its contact
+        points, the deepest of which has an `overlap` with it [mm]."""
         assert self.scene.indenter is not None
         rows, spacing = prepared.drive[-1, 0].astype(np.float64), self._gel.spacing
         down = rows[:3].T @ [0.0, 0.0, -1.0]
+        half, self.unfelt = np.array(self._gel.half) - spacing, 0.0  # not at the gel's rim
         mesh, geometry = self._state.meshes[self._index], self.scene.indenter.geometry
         if isinstance(geometry, Mesh):
             assert mesh is not None
-            lowest = mesh.vertices[np.argmax(mesh.vertices @ down)]
+            lowest = mesh.lowest(rows[:3], rows[3] / MM, half / MM)
+            if lowest is None:
+                return
+            tip = lowest * MM
         else:
-            lowest = farthest(geometry, down, self.scene.indenter.rounding(self.scene.element))
-        tip = rows[:3] @ (lowest * MM) + rows[3]
-        if (np.abs(tip[:2]) > np.array(self._gel.half) - spacing).any():
-            return  # beside the gel, or at its rim
+            tip = rows[:3] @ (farthest(geometry, down, self.scene.indenter.rounding(self.scene.element)) * MM) + rows[3]
+            if (np.abs(tip[:2]) > half).any():
+                return
         nodes = self._surface_nodes()
         near = np.abs(nodes[:, :2] - tip[:2]).max(axis=1) < 2 * spacing
         depth = float(nodes[near, 2].min(initial=np.inf) - tip[2])
-        # where points do touch, deeper by no more than half of its way into the untouched gel
-        if depth - overlap > max(UNSEEN * spacing / POINTS, 0.0 if overlap == 0.0 else -tip[2] / 2):
+        self.unfelt = max(depth - overlap, 0.0) / -float(tip[2]) if tip[2] < 0.0 else 0.0
+        # where points do touch, deeper by no more than a quarter of its way into the untouched gel
+        if depth - overlap > max(UNSEEN * spacing / POINTS, 0.0 if overlap == 0.0 else -tip[2] / 4):
             cause = f"the indenter is {depth:.3g} mm deep in the gel and touches no contact point of it"
             if overlap > 0.0:
                 cause = (

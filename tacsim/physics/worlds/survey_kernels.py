@@ -3,6 +3,7 @@
 from typing import Any
 
 from tacsim.compute.runtime import ti
+from tacsim.physics.body.transfers import Strips
 from tacsim.physics.contact.contact import ContactHistory
 from tacsim.physics.exec import layout
 from tacsim.physics.exec.environment import Counts, Floats, Params
@@ -231,6 +232,15 @@ def keep_entries(dtype: Any) -> Any:
 
 
 @ti.kernel
+def keep_strips(first: ti.i32, last: ti.i32, counts: Counts, source: Strips, target: Strips):
+    """The same of nodes of grids."""
+    nodes = source.shape[0] // counts.shape[0]
+    for e, n in ti.ndrange((first, last), nodes):
+        if last == first + 1 or counts[e, layout.STEPS] > 0:
+            target[e * nodes + n] = source[e * nodes + n]
+
+
+@ti.kernel
 def take_outer(particles: Floats, outer: Sums):
     """The rows of the particles' tangent planes and positions."""
     for e, r, p in ti.ndrange(outer.shape[0], outer.shape[1], outer.shape[2]):
@@ -245,5 +255,5 @@ keep_gels = (keep_floats, _named("nodes")), (keep_floats, _named("surface", marg
 keep_press = Graph(*keep_gels, (keep_entries(vec3), _named("slip")), (keep_entries(ti.f32), _named("pressure")))
 keep_hybrid = Graph(
     *keep_gels, (keep_floats, _named("particles", margin="no_margin")),
-    (keep_entries(ContactHistory), _named("histories")),
+    (keep_strips, _named("velocities")), (keep_entries(ContactHistory), _named("histories")),
 )  # fmt: skip

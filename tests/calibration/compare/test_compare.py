@@ -10,19 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from calibration.compare.alignment import by_geometry, by_size
 from calibration.compare.compare import METRICS, Comparison, Options, Pairing, bootstrap, compare_frames, paired
 from calibration.compare.judgement import judgement
 from calibration.compare.report import as_json, figures, write
 from calibration.errors import BadFrames
-from calibration.frame_set import Frame, FrameSet, read_folder, read_frame_set, rectified_by_corners, rectified_shape
+from calibration.frame_set import Frame, FrameSet, rectified_by_corners, rectified_shape
 from calibration.lens.view import BadCorners
 from tacsim.interface import SurfaceMap
 from tacsim.models.sensor import SensorGeometry
 from tests.calibration.presses import COLUMNS, ROWS, HiddenSensor
-from tests.calibration.sources import blank, changed, save, shifted, side
+from tests.calibration.sources import blank, changed, shifted, side
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +76,6 @@ def test_another_light_is_told_from_the_right_one(other: FrameSet, real: FrameSe
     assert result.overall["contact_mae"].mean > 5 * compared.overall["contact_mae"].mean
     assert result.overall["contact_ncc"].mean < 0.9
     assert math.hypot(*result.alignment.shift) < 3  # contacts are found in any light
-
-
-def test_the_whole_picture_flatters_where_the_contact_does_not(real: FrameSet) -> None:
-    """A blank scores high on all of the picture: the reason for the null and the contact region."""
-    result = compare_frames(blank(real), real)
-    assert result.overall["ssim"].mean > result.overall["contact_ssim"].mean + 0.1
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (3.4, -2.7), (-8.25, 5.5)])
@@ -264,89 +257,6 @@ def test_the_bootstrap_has_the_width_of_the_mean() -> None:
     assert low < values.mean() < high
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
     assert all(math.isnan(bound) for bound in bootstrap(values[:2]))
-
-
-# folders
-
-
-def test_a_folder_is_read_with_its_references(real: FrameSet, tmp_path: Path) -> None:
-    read = read_frame_set(save(real, tmp_path / "real"))
-    assert read.reference_from == "background.png"
-    assert [frame.name for frame in read.frames] == [frame.name for frame in real.frames]
-    assert [frame.name for frame in read.untouched] == ["background_2.png", "background_3.png"]
-    assert np.array_equal(read.frames[2].image, real.frames[2].image)
-
-
-def test_a_named_reference_comes_first(real: FrameSet, tmp_path: Path) -> None:
-    folder = save(replace(real, untouched=()), tmp_path / "real", reference="first.png")
-    read = read_frame_set(folder, folder / "first.png")
-    assert read.reference_from == "first.png" and len(read.frames) == 5
-
-
-def test_the_median_stands_for_a_missing_reference(real: FrameSet, tmp_path: Path) -> None:
-    folder = save(replace(real, untouched=()), tmp_path / "real")
-    (folder / "background.png").unlink()
-    read = read_frame_set(folder)
-    assert read.reference_from == "median of 5 frames"
-    assert np.abs(read.reference.astype(int) - real.reference).mean() < 3
-    (folder / "press_0.png").unlink()
-    with pytest.raises(BadFrames, match=r"no frame without contact.*--reference-a.*background\.png"):
-        read_frame_set(folder)
-
-
-def test_every_unreadable_picture_is_named(real: FrameSet, tmp_path: Path) -> None:
-    folder = save(real, tmp_path / "real")
-    whole = (folder / "press_1.png").read_bytes()
-    for name in ("press_1.png", "press_3.png"):
-        (folder / name).write_bytes(whole[: len(whole) // 2])  # a head, but no body
-    with pytest.raises(BadFrames) as caught:
-        read_frame_set(folder)
-    assert "press_1.png" in str(caught.value) and "press_3.png" in str(caught.value)
-    (folder / "press_1.png").write_bytes(b"nothing")
-    with pytest.raises(BadFrames, match=r"press_1\.png: no readable picture"):
-        read_frame_set(folder)
-
-
-def test_mixed_sizes_empty_folders_and_other_files_are_refused(real: FrameSet, tmp_path: Path) -> None:
-    folder = save(real, tmp_path / "real")
-    Image.fromarray(real.reference[:100]).save(folder / "press_9.png")
-    with pytest.raises(BadFrames, match=r"press_9\.png: 260 x 100 pixels"):
-        read_frame_set(folder)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(BadFrames, match="no pictures in this folder"):
-        read_frame_set(tmp_path / "empty")
-    with pytest.raises(BadFrames, match="no such file or folder"):
-        read_frame_set(tmp_path / "nowhere")
-    (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(BadFrames, match="no recording"):
-        read_frame_set(tmp_path / "notes.txt")
-    (tmp_path / "bad.mcap").write_bytes(b"\0" * 100)
-    with pytest.raises(BadFrames, match=r"bad\.mcap"):
-        read_frame_set(tmp_path / "bad.mcap")
-
-
-def test_a_reference_alone_or_of_another_size_is_refused(real: FrameSet, tmp_path: Path) -> None:
-    folder = save(replace(real, frames=()), tmp_path / "real")
-    with pytest.raises(BadFrames, match="no frame beside the one without contact"):
-        read_frame_set(folder)
-    pressed = save(replace(real, untouched=()), tmp_path / "pressed")
-    Image.fromarray(real.reference[:150]).save(tmp_path / "small.png")
-    with pytest.raises(BadFrames, match=r"press_0\.png is 260 x 200 px.*small\.png\) 260 x 150"):
-        read_frame_set(pressed, tmp_path / "small.png")
-    with pytest.raises(BadFrames, match=r"none\.png"):
-        read_frame_set(pressed, tmp_path / "none.png")
-
-
-def test_a_huge_picture_is_refused_before_it_is_decoded(real: FrameSet, tmp_path: Path) -> None:
-    folder = save(real, tmp_path / "real")
-    Image.new("1", (5000, 10)).save(folder / "huge.png")
-    with pytest.raises(BadFrames, match=r"huge\.png: 5000 x 10 pixels"):
-        read_frame_set(folder)
-
-
-def test_too_many_frames_are_refused(tmp_path: Path, real: FrameSet) -> None:
-    with pytest.raises(BadFrames, match="more than 3 frames"):
-        read_folder(save(real, tmp_path / "real"), max_frames=3)
 
 
 # files

@@ -37,3 +37,10 @@ def test_what_shows_no_ball_is_refused(press_image: Callable[..., Any]) -> None:
         contact_circle(noisy, empty, 48.0)
     with pytest.raises(ValueError, match="of one camera"):
         contact_circle(empty[:100], empty, 48.0)
+
+
+def test_a_contact_wider_than_the_ball_is_told_as_such(press_image: Callable[..., Any]) -> None:
+    """A ball of 5 mm pressed 0.8 mm deep touches within 2 mm: no ball of 1 mm does."""
+    image, empty, _ = press_image(5e-3, 0.8e-3, (110, 95))
+    with pytest.raises(NoCircle, match=r"wider than the ball .* pixel pitch"):
+        contact_circle(image, empty, 1e-3 / PITCH)

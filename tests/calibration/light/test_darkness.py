@@ -16,6 +16,7 @@ from calibration.height.darkness import DarknessSlopes
 from calibration.light.calibrator import NoDirection, calibrate_light
 from calibration.light.darkness import tells_no_direction
 from calibration.light.fit import LightFit
+from calibration.light.page import write_page
 from calibration.light.verdict import KnownScale, judge
 from calibration.normaliser import normaliser_for_calibration, normaliser_for_pictures
 from robot.cli import app
@@ -93,13 +94,16 @@ def test_heights_of_an_unseen_press_come_back(share: float) -> None:
     assert judge(fit, KnownScale(PITCH, BALL)).word == "usable"  # four presses
 
 
-def test_one_press_gives_the_table_and_is_said_to_be_one() -> None:
+def test_one_press_gives_the_table_and_is_said_to_be_one(tmp_path: Path) -> None:
     sensor = DarkSensor(2, 0.4)
     press = sensor.press(0.65e-3, 130, 100)
     fit = calibrate_light(sensor.empty(), [("one", press.image)], BALL_PX)
     assert height_error(fit, sensor, sensor.press(0.4e-3, 90, 80)) < 0.06
     verdict = judge(fit, KnownScale(PITCH, BALL))
-    assert verdict.word == "usable" and "1 press could be used" in str(verdict)
+    assert verdict.word == "usable" and "1 press could be used: that gives the table" in str(verdict)
+    write_page(tmp_path / "page.html", "dark", fit, KnownScale(PITCH, BALL), verdict, None, [])
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "darkness that no depth explains" in page and "fewer than 3" not in page
 
 
 def test_the_pictures_tell_which_light_it_is() -> None:

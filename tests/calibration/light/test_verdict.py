@@ -69,7 +69,7 @@ def test_two_solutions_for_the_radii_are_told(fit: LightFit) -> None:
     ("ball", "pitch", "words", "word"),
     [
         (0.4, 1.0, "pitch or radius is wrong: contact radius over ball radius a/R = 0.9", "do not trust"),
-        (2.0, 1.0, "or a diameter given for the radius", "usable"),
+        (2.0, 1.0, "a diameter given for the radius, or too small a pixel pitch", "usable"),
         (1.0, 1.6, "of the gel are to be seen", "do not trust"),
         (1.0, 1 / 1.6, "of the gel are to be seen", "do not trust"),
     ],

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from calibration.materials.checks import findings
-from calibration.materials.estimate import CannotSimulate, Fit, NotIdentified, Point, Priors, Signals, estimate
+from calibration.materials.estimate import CannotSimulate, Fit, NotIdentified, Point, Predict, Priors, Signals, estimate
 from calibration.materials.parameters import Parameter
 from tacsim.interface import FloatArray
 
@@ -100,6 +101,49 @@ def test_what_a_half_space_does_not_tell_is_refused() -> None:
     assert low < E < high  # it knows that the ratio is a guess
 
 
+def sticking(log: Callable[[float], float], share: float, most: float) -> Predict:
+    """Stiffness and friction, a share of what it is, of a ball that sticks beyond the friction `most`."""
+    right = model(["youngs_modulus", "friction"])
+
+    def predict(points: Sequence[Point]) -> list[FloatArray]:
+        return right([
+            replace(point, free=np.array([point.free[0], min(point.free[1] + log(share), log(most))]))
+            for point in points
+        ])  # fmt: skip
+
+    return predict
+
+
+def test_a_way_that_leads_to_where_nothing_slips_goes_on_from_its_start() -> None:
+    """The coarsest mesh passes on 0.4 of the friction, and asks for 1.1. Beyond 0.6 the others stick: there nothing
+    tells friction, and it would be held where it began."""
+    parameters, signals = (STIFFNESS, Parameter("friction", 0.3, 0.01, 5.0)), recorded(9)
+    log = parameters[1].free
+    fit = estimate(
+        [sticking(log, 0.4, 5.0), sticking(log, 1.0, 0.6), sticking(log, 1.0, 0.6)], signals, parameters, PRIORS
+    )
+    assert fit.untold == () and fit.value("friction") == pytest.approx(MU, rel=0.03)
+
+
+def test_friction_is_found_from_where_things_slip_although_they_stick_at_what_was_thought() -> None:
+    """The force of what sticks does not depend on friction; nothing told of it stays what was thought, 0.8."""
+    thought = replace(FRICTION, begin=0.25)
+    level = sticking(thought.free, 1.0, 0.6)
+    fit = estimate([level], recorded(9), (STIFFNESS, thought), PRIORS, coarse_error=0.0)
+    assert fit.untold == () and fit.value("friction") == pytest.approx(MU, rel=0.03)
+    level = sticking(thought.free, 1.0, 0.2)
+    fit = estimate([level], recorded(9), (STIFFNESS, thought), PRIORS, coarse_error=0.0)
+    assert [each.name for each in fit.untold] == ["friction"] and fit.value("friction") == pytest.approx(0.8)
+
+
+def test_steps_that_move_less_than_a_mesh_is_wrong_are_not_made() -> None:
+    """Meshes that are 5 % and 2 % off, three presses: 22 points each with steps that only noise asks for."""
+    names, signals = ["youngs_modulus", "friction"], recorded(10)
+    levels = [model(names, stiffer=stiffer) for stiffer in (1.05, 1.02, 1.0)]
+    fit = estimate(levels, signals, (STIFFNESS, FRICTION), PRIORS)
+    assert fit.value("youngs_modulus") == pytest.approx(E, rel=0.03) and fit.runs <= 3 * 17
+
+
 def test_a_press_that_does_not_slide_tells_no_friction() -> None:
     signals = recorded(3)
     still = Signals(
@@ -151,6 +195,16 @@ def test_a_coarse_simulation_is_put_right_by_a_finer_one() -> None:
     assert fit.mesh_shift[0] == pytest.approx(np.log(1.15), abs=0.03)
     low, high = fit.interval("youngs_modulus")
     assert np.log(high / low) / 2 > 1.9 * 0.5 * np.log(1.15)
+
+
+def test_errors_of_a_mesh_that_cancel_in_one_fit_still_count() -> None:
+    """A coarse mesh that is 15 % too stiff in one press and too soft in the other: together they move nothing, and what
+    is left of each, half of it, moves the stiffness by up to 0.5 log(1.15) / 2, twice in quadrature."""
+    signals, right = recorded(7, presses=2), model(["youngs_modulus"], presses=2)
+    stiffer = np.where(signals.press == 0, 1.15, 1 / 1.15)
+    fit = estimate([lambda points: [stiffer * each for each in right(points)], right], signals, (STIFFNESS,), PRIORS)
+    low, high = fit.interval("youngs_modulus")
+    assert low < E < high and np.log(high / low) / 2 > 1.96 * 0.7 * 0.5 * np.log(1.15) / np.sqrt(2)
 
 
 def test_a_step_that_cannot_be_simulated_is_made_smaller() -> None:

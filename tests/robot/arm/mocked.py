@@ -8,7 +8,6 @@ from __future__ import annotations
 import gc
 import os
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -24,9 +23,9 @@ from robot.mock import Input, MockState
 from tacsim import pose as se3
 from tacsim.interface import Pose
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Payload, Placement, UrArmConfig, Workspace
+from tests.robot.waiting import until
 
 HOST, OTHER = (f"127.{net}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}" for net in (23, 123))
-PATIENCE = 60.0  # for anything that has to happen [s]
 CARRIED = (0.4, 0.0, 0.0, 0.04)  # what a mock has on its flange: mass [kg], centre [m]
 SERVO, SERVO_STOP, ZERO = 11, 16, 8  # numbers of the commands servoJ, servoStop and zeroFtSensor in the registers
 STILL = 1e-3  # slower than this an arm stands [m/s]
@@ -55,15 +54,6 @@ def config(host: str = HOST, *, realtime: bool = False, **changes: object) -> Ur
     )
     # model_copy does not validate: a watchdog of 1 Hz leaves the worker a second of starvation.
     return made.model_copy(update={"watchdog": 1.0, **changes})
-
-
-def until(done: Callable[[], bool], what: str, pause: float = 1e-3, why: Callable[[], str] = str) -> float:
-    """Waits; returns when it was seen to be so, by the monotonic clock [s]. `why` tells how things stand, if not."""
-    deadline = time.monotonic() + PATIENCE
-    while not done():
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE} s; {why()}"
-        time.sleep(pause)
-    return time.monotonic()
 
 
 def moved(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:

@@ -12,7 +12,7 @@ from robot.arm.channel import STATE
 from robot.arm.package_log import PackageLog
 from robot.arm.shared_ring import Ring, create
 from robot.arm.ur import URArm
-from tests.robot.arm.mocked import until
+from tests.robot.waiting import until
 
 PERIOD = 2e-3
 

@@ -15,7 +15,8 @@ from robot.arm.ur import URArm
 from robot.errors import DeviceError, SafetyViolation
 from robot.mock import MockUR
 from tacsim.models.hardware import UrArmConfig, Workspace
-from tests.robot.arm.mocked import config, moved, servo_targets, until
+from tests.robot.arm.mocked import config, moved, servo_targets
+from tests.robot.waiting import until
 
 TURN = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.05])
 ELSEWHERE = Workspace(lower=(1.0, 1.0, 1.0), upper=(1.1, 1.1, 1.1))

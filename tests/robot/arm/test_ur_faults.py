@@ -38,8 +38,8 @@ from tests.robot.arm.mocked import (
     sensor_path,
     servo_targets,
     servo_ticks,
-    until,
 )
+from tests.robot.waiting import until
 
 # -- force -----------------------------------------------------------------------------------------------------------
 

@@ -26,7 +26,6 @@ from tests.promises import Record
 from tests.robot.arm.mocked import (
     HOST,
     OTHER,
-    PATIENCE,
     at_full_speed,
     config,
     go,
@@ -35,8 +34,8 @@ from tests.robot.arm.mocked import (
     moved,
     servo_targets,
     stands,
-    until,
 )
+from tests.robot.waiting import PATIENCE, until
 
 
 @pytest.mark.promise(4)

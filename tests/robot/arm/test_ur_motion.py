@@ -36,8 +36,8 @@ from tests.robot.arm.mocked import (
     restarts,
     servo_targets,
     servo_ticks,
-    until,
 )
+from tests.robot.waiting import until
 
 LOOKS = 100_000
 

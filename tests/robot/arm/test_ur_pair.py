@@ -21,19 +21,8 @@ from robot.errors import (
 from robot.mock import MockUR
 from tacsim.models.hardware import Workspace
 from tests.promises import Record
-from tests.robot.arm.mocked import (
-    BASE,
-    CARRIED,
-    OTHER,
-    PATIENCE,
-    config,
-    go,
-    in_motion,
-    leftovers,
-    moved,
-    records,
-    until,
-)
+from tests.robot.arm.mocked import BASE, CARRIED, OTHER, config, go, in_motion, leftovers, moved, records
+from tests.robot.waiting import PATIENCE, until
 
 KEEP_OUT = 0.04  # of two arms that begin 60 mm apart [m]
 ROOT = Path(__file__).resolve().parents[3]

@@ -30,7 +30,6 @@ from robot.errors import (
 from robot.mock import MockUR
 from tests.promises import Record
 from tests.robot.arm.mocked import (
-    PATIENCE,
     SERVO_STOP,
     ZERO,
     at_full_speed,
@@ -45,8 +44,8 @@ from tests.robot.arm.mocked import (
     servo_targets,
     servo_ticks,
     stands,
-    until,
 )
+from tests.robot.waiting import PATIENCE, alive, until
 
 # -- death -----------------------------------------------------------------------------------------------------------
 
@@ -99,14 +98,6 @@ time.sleep(60)
 """
 
 
-def running(process: int) -> bool:
-    """False also for one that has ended and that nobody has asked for its exit status."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
 @pytest.mark.promise(6, 14)
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.deep)])
 def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
@@ -135,7 +126,7 @@ def test_a_policy_that_dies_leaves_a_standing_arm_and_nothing_else(
         assert went < 0.05  # ten times 5 mm
     until(lambda: not mock.faults.state().program, "end of the program")
     until(lambda: 30004 not in mock.faults.state().clients, "closed sockets")
-    until(lambda: not running(int(worker)), "end of the worker")
+    until(lambda: not alive(int(worker)), "end of the worker")
     figure("processes, sockets left by a killed policy", 0, promise=14)  # else one of these waits failed
 
 
@@ -181,7 +172,7 @@ def test_a_signal_to_every_process_ends_with_a_ramp(mock: MockUR, program: str, 
         os.kill(worker, number)
         os.killpg(policy.pid, number)
         assert policy.wait(PATIENCE) == (128 + number if program == COMMAND else -number)
-    until(lambda: not running(worker), "end of the worker")
+    until(lambda: not alive(worker), "end of the worker")
     until(lambda: not mock.faults.state().program, "end of the program")
     assert "watchdog" not in mock.faults.state().stop_reason.lower()
     entries = mock.faults.received(since).entries
@@ -263,7 +254,7 @@ def test_nothing_is_left_after_close(
     arm.close()
     figure(
         "processes, shared memory, files left by close()",
-        sum((running(worker.pid), leftovers(), abs(open_files() - before))),
+        sum((alive(worker.pid), leftovers(), abs(open_files() - before))),
     )
     assert worker.exit_status == 0  # it ended by itself
     assert leftovers() == 0

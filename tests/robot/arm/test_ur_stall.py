@@ -21,16 +21,8 @@ from robot.arm.trajectory import PERIOD
 from robot.arm.ur import URArm
 from robot.mock import MockUR
 from tests.promises import Record
-from tests.robot.arm.mocked import (
-    PATIENCE,
-    at_full_speed,
-    config,
-    moved,
-    sensor_path,
-    servo_targets,
-    servo_ticks,
-    until,
-)
+from tests.robot.arm.mocked import at_full_speed, config, moved, sensor_path, servo_targets, servo_ticks
+from tests.robot.waiting import PATIENCE, until
 from tests.stops import observer
 
 WINDOW = 20  # periods

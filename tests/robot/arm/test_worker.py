@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import json
 import os
@@ -19,7 +18,8 @@ from robot.arm.status import ArmStatus
 from robot.arm.worker_config import worker_config as config_of
 from robot.mock import MOCK_SERIAL, MockUR
 from tacsim.models.hardware import ArmLimits, MockArmConfig, Placement, UrArmConfig, Workspace
-from tests.robot.arm.mocked import HOST, PATIENCE, until
+from tests.robot.arm.mocked import HOST
+from tests.robot.waiting import PATIENCE, until
 
 ROOT = Path(worker.__file__).parents[2]
 CHANGES = (29, 17, 35)  # numbers of the commands setTcp, setPayload, setWatchdog
@@ -68,19 +68,6 @@ def test_every_variable_is_in_the_librarys_own_table() -> None:
     library = Path(receive.__file__).read_bytes()
     # The compiled library carries its table's names as text.
     assert [name for name in worker.VARIABLES if name.encode() not in library] == []
-
-
-def test_nobody_else_imports_the_library() -> None:
-    names = {"rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "script_client"}
-    found = set()
-    for path in (path for package in ("tacsim", "calibration", "robot") for path in (ROOT / package).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            imported = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                imported = [node.module]
-            if names & {module.partition(".")[0] for module in imported}:
-                found.add(path.relative_to(ROOT).as_posix())
-    assert found == {"robot/arm/worker.py"}
 
 
 def test_a_failure_is_one_line_of_json_and_the_rest_stays_out_of_it() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -28,13 +27,6 @@ def stamped(mock: MockCamera, **options: object) -> CameraSensorConfig:
 
 def grey(value: int) -> np.ndarray:
     return np.full((240, 320, 3), value, dtype=np.uint8)
-
-
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT
-    while not holds():
-        assert time.monotonic() < deadline, "it never came"
-        time.sleep(0.005)
 
 
 def newer(camera: Camera, than: TactileFrame) -> TactileFrame:

@@ -16,8 +16,8 @@ from robot.camera.capture import PlayedCapture, UvcCapture, source_kind
 from robot.camera.mjpeg import MjpegCapture
 from robot.camera.picture import WrongSource
 from robot.errors import DeviceNotConnectedError
-from tests.robot.camera.mocked import until
 from tests.robot.camera.servers import STREAM, Server, config, encoded, says, seen
+from tests.robot.waiting import until
 
 
 @pytest.mark.promise(11)

@@ -12,8 +12,9 @@ from robot.camera.camera import Camera, StaleFrame
 from robot.camera.picture import DamagedFrame, WrongSource, decode_jpeg
 from robot.mock.camera.camera import MockCamera
 from tests.promises import Record
-from tests.robot.camera.mocked import HOST, WAIT, newer, stamped, until
+from tests.robot.camera.mocked import HOST, WAIT, newer, stamped
 from tests.robot.camera.servers import Server, config, encoded, films, seen
+from tests.robot.waiting import until
 
 SIZE = (240, 320)
 END = b"\xff\xd9"

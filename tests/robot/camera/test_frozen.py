@@ -14,9 +14,10 @@ from robot.camera import mjpeg
 from robot.camera.camera import Camera, StaleFrame
 from robot.mock.camera.camera import MockCamera
 from tests.promises import Record
-from tests.robot.camera.mocked import HOST, WAIT, newer, until
+from tests.robot.camera.mocked import HOST, WAIT, newer
 from tests.robot.camera.mocked import config as mock_config
 from tests.robot.camera.servers import Server, config, encoded, films, seen
+from tests.robot.waiting import until
 
 pytestmark = pytest.mark.usefixtures("nothing_is_left")
 SAME = "has shown the same picture for"

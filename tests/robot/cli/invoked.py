@@ -14,8 +14,13 @@ TINY = ("--set", "scene.particle_spacing=1 mm", "--set", "scene.element_size=2 m
 START = (sys.executable, "-c", "from robot.cli import main; main()")
 
 
-def tacsim(*words: str) -> Result:
-    return CliRunner().invoke(app, list(words), env={"COLUMNS": "200"})
+def tacsim(*words: object, **environment: str) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", **environment})
+
+
+def told(output: str) -> str:
+    """Without the frame and line breaks of an error's box."""
+    return " ".join(output.replace("│", " ").split())
 
 
 def environment() -> dict[str, str]:

@@ -41,6 +41,20 @@ def test_help_lists_all_commands_and_loads_nothing_heavy() -> None:
     assert not {"taichi", "cv2", "matplotlib", "scipy", "numpy", "pydantic"} & set(loaded)
 
 
+@pytest.mark.parametrize(("said", "threads"), [(None, "1"), ("3", "3")])
+def test_the_command_multiplies_small_matrices_on_one_thread(said: str | None, threads: str) -> None:
+    """A busy machine's threads wait for one another, spinning: a calibration took three times the processor time."""
+    code = (
+        "import os, sys; sys.argv = ['tacsim', '--version']; from robot.cli import main\n"
+        "try: main()\n"
+        "finally: print('threads', os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    own = {} if said is None else {"OPENBLAS_NUM_THREADS": said}
+    given = {key: value for key, value in environment().items() if key != "OPENBLAS_NUM_THREADS"} | own
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=given)
+    assert f"threads {threads}" in ran.stdout
+
+
 def test_version() -> None:
     result = tacsim("--version")
     assert result.exit_code == 0
@@ -95,9 +109,11 @@ def test_wrong_words_end_with_2_and_write_nothing(words: tuple[str, ...], said: 
         (("replay", "missing.mcap"), "missing.mcap"),
     ],
 )
-def test_what_cannot_be_done_ends_with_1_and_writes_nothing(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_a_recording_that_is_missing_ends_with_2_and_writes_nothing(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
     result = tacsim(*words)
-    assert result.exit_code == 1, result.output
+    assert result.exit_code == 2, result.output
     assert said in result.stderr
     assert "Traceback" not in result.output
     assert list(tmp_path.iterdir()) == []
@@ -115,7 +131,7 @@ def test_an_existing_folder_is_refused_and_left_alone(words: tuple[str, ...], tm
 
 def test_exit_codes_of_errors() -> None:
     assert explain(ConfigError([]))[1] == 2
-    assert explain(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 1)
+    assert explain(EpisodeError("x.mcap: is no episode")) == ("x.mcap: is no episode", 2)
     assert explain(IncompatibleRig("it lacks truth"))[1] == 2
     assert explain(PermissionError(13, "Permission denied", "out")) == ("out: Permission denied", 1)
     assert "--debug" in explain(KeyError("slip"))[0]

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from calibration.bundle import write_bundle
 from calibration.frame_set import FrameSet, read_frame_set
-from robot.cli import app
 from tacsim.interface import RigSpec, SensorSpec, SurfaceMap, TactileFrame
 from tacsim.record.episode import EpisodeMeta, Step
 from tacsim.record.images import reference_attachments
 from tacsim.record.writer import Recorder
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import blank, calibrated, changed, save, side
+from tests.robot.cli.invoked import tacsim, told
 
 
 @pytest.fixture(scope="module")
@@ -42,41 +42,38 @@ def folders(real: FrameSet, good: FrameSet, tmp_path: Path, monkeypatch: pytest.
     save(good, Path("sim"))
 
 
-def tacsim(*words: str) -> Result:
-    return CliRunner().invoke(app, ["compare", *words], env={"COLUMNS": "200"})
-
-
-def said(result: Result) -> str:
-    """Output without the frame and line breaks of typer's error box."""
-    return " ".join(result.output.replace("│", " ").split())
+def compared(*words: object) -> Result:
+    return tacsim("compare", *words)
 
 
 def test_it_writes_its_files_and_a_table() -> None:
-    result = tacsim("sim", "real", "--out", "out")
+    result = compared("sim", "real", "--out", "out")
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in Path("out").iterdir()) == ["compare.csv", "compare.html", "compare.json"]
     assert "contact NCC" in result.stdout and "null" in result.stdout and "floor" in result.stdout
     assert "gradient" not in result.stdout  # not known without calibrations
     config = json.loads(Path("out/compare.json").read_text())
     assert config["overall"]["contact_mae"]["mean"] < 3
-    assert tacsim("sim", "real", "--out", "out").exit_code == 2  # nothing is overwritten
+    assert compared("sim", "real", "--out", "out").exit_code == 2  # nothing is overwritten
 
 
 def test_limits_decide_the_exit_code() -> None:
-    kept = tacsim("sim", "real", "--fail-above", "contact_mae=5", "--fail-below", "contact_ncc=0.9", "--out", "kept")
+    kept = tacsim(
+        "compare", "sim", "real", "--fail-above", "contact_mae=5", "--fail-below", "contact_ncc=0.9", "--out", "kept"
+    )
     assert kept.exit_code == 0, kept.output
-    above = tacsim("sim", "real", "--fail-above", "contact_mae=0.5", "--out", "above")
+    above = compared("sim", "real", "--fail-above", "contact_mae=0.5", "--out", "above")
     assert above.exit_code == 1
-    assert "contact_mae is 1." in said(above) and "above 0.5" in said(above)
+    assert "contact_mae is 1." in told(above.output) and "above 0.5" in told(above.output)
     assert Path("above/compare.html").is_file()  # to see why
-    below = tacsim("sim", "real", "--fail-below", "contact_ssim=0.9999", "--out", "below")
-    assert below.exit_code == 1 and "below 0.9999" in said(below)
+    below = compared("sim", "real", "--fail-below", "contact_ssim=0.9999", "--out", "below")
+    assert below.exit_code == 1 and "below 0.9999" in told(below.output)
 
 
 def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: FrameSet) -> None:
     save(blank(real), Path("blank"))
-    assert tacsim("blank", "real", "--fail-below", "ssim=0.8", "--out", "a").exit_code == 0
-    assert tacsim("blank", "real", "--fail-below", "contact_ncc=0.5", "--out", "b").exit_code == 1
+    assert compared("blank", "real", "--fail-below", "ssim=0.8", "--out", "a").exit_code == 0
+    assert compared("blank", "real", "--fail-below", "contact_ncc=0.5", "--out", "b").exit_code == 1
 
 
 @pytest.mark.parametrize(
@@ -92,9 +89,9 @@ def test_a_blank_fails_a_limit_that_a_whole_picture_would_let_through(real: Fram
     ],
 )
 def test_limits_that_mean_nothing_are_refused(limit: str, words: str) -> None:
-    result = tacsim("sim", "real", "--fail-above", limit, "--out", "out")
+    result = compared("sim", "real", "--fail-above", limit, "--out", "out")
     assert result.exit_code == 2
-    assert words in said(result)
+    assert words in told(result.output)
     assert not Path("out").exists()
 
 
@@ -113,26 +110,26 @@ def test_limits_that_mean_nothing_are_refused(limit: str, words: str) -> None:
     ],
 )
 def test_what_cannot_be_compared_is_said_without_a_traceback(words: tuple[str, ...], message: str) -> None:
-    result = tacsim(*words, "--out", "out")
+    result = compared(*words, "--out", "out")
     assert result.exit_code == 2
-    assert message in said(result)
+    assert message in told(result.output)
     assert "Traceback" not in result.output
     assert not Path("out").exists()
 
 
 def test_counts_that_differ_and_the_way_out(real: FrameSet) -> None:
     Path("sim/press_4.png").unlink()
-    refused = tacsim("sim", "real", "--out", "out")
-    assert refused.exit_code == 2 and "--pair name" in said(refused)
-    named = tacsim("sim", "real", "--pair", "name", "--out", "out")
-    assert named.exit_code == 0 and "no partner of their name" in said(named)
+    refused = compared("sim", "real", "--out", "out")
+    assert refused.exit_code == 2 and "--pair name" in told(refused.output)
+    named = compared("sim", "real", "--pair", "name", "--out", "out")
+    assert named.exit_code == 0 and "no partner of their name" in told(named.output)
 
 
 def test_warnings_reach_the_person(good: FrameSet, real: FrameSet) -> None:
     save(changed(good, lambda image: np.ascontiguousarray(image[..., ::-1]), "all"), Path("bgr"))
-    assert "red and blue look swapped" in said(tacsim("bgr", "real", "--out", "a"))
+    assert "red and blue look swapped" in told(compared("bgr", "real", "--out", "a").output)
     save(blank(real), Path("blank"))
-    assert "A: no contact" in said(tacsim("blank", "real", "--out", "b"))
+    assert "A: no contact" in told(compared("blank", "real", "--out", "b").output)
 
 
 def test_calibrations_bring_surfaces_and_invariance() -> None:
@@ -140,7 +137,7 @@ def test_calibrations_bring_surfaces_and_invariance() -> None:
     Path("bundle").mkdir()
     write_bundle(Path("bundle"), calibration, reference)
     both = ("--calibration-a", "bundle", "--calibration-b", "bundle")
-    result = tacsim("sim", "real", *both, "--invariance", "--fail-above", "height_rmse=0.05 mm", "--fail-above",
+    result = compared("sim", "real", *both, "--invariance", "--fail-above", "height_rmse=0.05 mm", "--fail-above",
                     "rho_height=1", "--fail-above", "drift_gain_down=0.5", "--out", "out")  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "rho" in result.stdout and "gain −30 %" in result.stdout
@@ -151,9 +148,9 @@ def test_calibrations_bring_surfaces_and_invariance() -> None:
     Path("small").mkdir()
     for name in ("background.png", "press_0.png"):
         Image.fromarray(reference[:100]).save(Path("small") / name)
-    wrong = tacsim("small", "real", *both, "--pair", "name", "--out", "wrong")
+    wrong = compared("small", "real", *both, "--pair", "name", "--out", "wrong")
     assert wrong.exit_code == 2
-    assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in said(wrong)
+    assert "small is 260 x 100 px, the calibration of A is of 260 x 200" in told(wrong.output)
 
 
 def test_an_episode_is_a_side_with_its_surfaces(real: FrameSet) -> None:
@@ -174,8 +171,8 @@ def test_an_episode_is_a_side_with_its_surfaces(real: FrameSet) -> None:
     assert read.reference_from == "the recording's own"
     assert np.array_equal(read.reference, real.reference)
     assert len(read.frames) == 5 and read.frames[0].surface is not None
-    result = tacsim("e.mcap", "real", "--out", "out")
+    result = compared("e.mcap", "real", "--out", "out")
     assert result.exit_code == 0, result.output
     assert json.loads(Path("out/compare.json").read_text())["overall"]["mae"]["mean"] == 0.0
-    unknown = tacsim("real", "e.mcap", "--sensor-b", "left", "--out", "again")
+    unknown = compared("real", "e.mcap", "--sensor-b", "left", "--out", "again")
     assert unknown.exit_code == 0, unknown.output

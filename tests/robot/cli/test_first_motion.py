@@ -37,7 +37,7 @@ def one_arm(folder: Path) -> Iterator[Lab]:
 
 
 def test_a_dry_run_on_a_copy_of_the_one_arm_file(one_arm: Lab, folder: Path, tmp_path: Path) -> None:
-    result = tacsim("run", str(folder / "my.yaml"), "--dry-run", "--steps", "2", "--out", "dry")
+    result = tacsim("run", folder / "my.yaml", "--dry-run", "--steps", "2", "--out", "dry")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "dry" / "report.html").exists()
 

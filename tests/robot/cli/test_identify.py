@@ -36,10 +36,10 @@ def test_what_cannot_be_is_said(
 
 
 def test_motions_are_written_with_the_commands_that_run_them(tmp_path: Path) -> None:
-    result = tacsim("identify", "body", "--motions", str(tmp_path / "m"))
+    result = tacsim("identify", "body", "--motions", tmp_path / "m")
     assert result.exit_code == 0 and "tacsim run sim --policy" in result.output
     assert sorted(path.name for path in (tmp_path / "m").iterdir()) == ["slide.csv", "squeeze.csv", "tilt.csv"]
-    assert tacsim("identify", "body", "--motions", str(tmp_path / "m")).exit_code == 2  # nothing is overwritten
+    assert tacsim("identify", "body", "--motions", tmp_path / "m").exit_code == 2  # nothing is overwritten
 
 
 @pytest.mark.deep

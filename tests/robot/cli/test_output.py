@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from rich.progress import Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from robot.cli import errors
+from robot.cli import app, errors
 from robot.cli.doctor import print_checks
-from robot.cli.output import SafeConsole
+from robot.cli.output import SafeConsole, show_table
 from robot.doctor.machine import Check
 from tacsim.interface import RigSpec, SensorSpec, TactileFrame
 from tacsim.record.episode import EpisodeMeta, Step
@@ -82,3 +85,27 @@ def test_a_sensor_in_a_recording_has_a_name() -> None:
     result = tacsim("replay", "e.mcap", "--out", "r")
     assert result.exit_code != 0
     check(result.stderr)
+
+
+def test_a_table_says_its_units(capsys: pytest.CaptureFixture[str]) -> None:
+    show_table("of [N]", ("frame", "radius [mm]", "of [grey levels]"), [("a [1].png", "1.5", "40")])
+    shown = capsys.readouterr().out
+    assert all(words in shown for words in ("of [N]", "radius [mm]", "of [grey levels]", "a [1].png")), shown
+
+
+def _options(command: Any, name: str) -> Iterator[tuple[str, str]]:
+    """Name and help of every option and argument."""
+    for parameter in command.params:
+        yield f"{name} {parameter.name}", getattr(parameter, "help", None) or ""
+    for word, each in getattr(command, "commands", {}).items():
+        yield from _options(each, f"{name} {word}")
+
+
+def test_the_help_of_every_option_says_its_units() -> None:
+    """Brackets are markup there: a unit in them would not be shown."""
+    lost = [
+        name
+        for name, words in _options(typer.main.get_command(app), "tacsim")
+        if Text.from_markup(words).plain != words.replace("\\[", "[")
+    ]
+    assert lost == []

@@ -56,7 +56,7 @@ def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("hello")
     for name, words in (("empty", "is empty"), ("text", "not an MCAP file"), ("none", "no such file")):
         result = tacsim("recover", f"{name}.mcap")
-        assert result.exit_code == 1 and words in result.stderr
+        assert result.exit_code == 2 and words in result.stderr
     assert len(list(tmp_path.iterdir())) == 2
 
 

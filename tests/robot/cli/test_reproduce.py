@@ -27,6 +27,7 @@ from robot.studies.experiment import (
 from tacsim.interface import TactileFrame
 from tacsim.report.figure4 import Trial
 from tests.robot.cli.invoked import START, environment, tacsim
+from tests.robot.waiting import alive, until
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -90,18 +91,7 @@ def test_a_signal_ends_the_reproduction_and_its_processes(
     if number != signal.SIGKILL:  # a process that is being started by one that is gone says so in Python's way
         assert "Traceback" not in errors
     assert not (tmp_path / "f").exists()
-    end = time.monotonic() + 60
-    while any(map(_lives, children)) and time.monotonic() < end:
-        time.sleep(0.1)
-    assert not list(filter(_lives, children))
-
-
-def _lives(number: int) -> bool:
-    """True while the process runs; an ended one may wait for its parent (state Z)."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+    until(lambda: not any(map(alive, children)), "its processes have ended")
 
 
 def _wait_for_children(process: subprocess.Popen[str]) -> list[int]:

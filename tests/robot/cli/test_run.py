@@ -8,6 +8,7 @@ import subprocess
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tacsim.record.reader import read_episode
@@ -44,6 +45,20 @@ def test_run_without_out_makes_a_folder_below_runs(tmp_path: Path) -> None:
     assert f"runs/{folder.name}/report.html" in result.stdout
 
 
+def test_particles_of_the_body_are_recorded_where_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("robot.deploy.control_loop.PARTICLES", 7)
+    for name, more in (("with", ["--set", "record.body=true"]), ("without", [])):
+        result = tacsim("run", "--steps", "1", "--out", name, *TINY, *more)
+        assert result.exit_code == 0, result.output
+    first, last = (step.body for step in read_episode(tmp_path / "with/episode.mcap").steps)
+    assert first is not None and last is not None and 4 <= len(first) <= 7 and not np.array_equal(first, last)
+    assert np.ptp(first[:, 2]) > 1e-3 and first[:, 2].min() > -1e-3  # spread over the body, on the lower gel
+    assert all(step.body is None for step in read_episode(tmp_path / "without/episode.mcap").steps)
+    for rig in ("ur5e-one", "press"):  # hardware; an indenter
+        refused = tacsim("run", rig, "--set", "record.body=true", "--out", "refused")
+        assert refused.exit_code == 2 and "only a simulated rig with a body" in refused.stderr.replace("\n", " ")
+
+
 def test_an_error_of_the_policy_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here.py").write_text("def act(observation):\n    raise RuntimeError('no idea')\n")
     result = tacsim("run", "--policy", "here:act", "--steps", "3", "--out", "r", *TINY)
@@ -62,7 +77,7 @@ def test_an_episode_without_steps_ends_with_its_own_error_alone(tmp_path: Path) 
     assert "no gripper" in result.stderr
     assert "report" not in result.stderr
     again = tacsim("replay", "r/episode.mcap", "--out", "again")
-    assert again.exit_code == 1
+    assert again.exit_code == 2
     assert "no step can be read" in again.stderr
     assert not (tmp_path / "again").exists()
 

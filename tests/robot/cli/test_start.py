@@ -11,10 +11,10 @@ import pytest
 
 from robot.procedures.to_start import Guide, lead_to_start
 from tacsim import pose as se3
-from tests.robot.arm.mocked import until
 from tests.robot.cli.invoked import tacsim
 from tests.robot.cli.lab import Lab, copy_of
 from tests.robot.cli.terminal import Terminal
+from tests.robot.waiting import until
 
 if find_spec("rtde_control") is None:
     pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)

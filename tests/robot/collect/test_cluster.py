@@ -84,3 +84,4 @@ def test_nodes_with_another_version_are_told(cluster: Any, tmp_path: Path, monke
 def test_no_cluster_at_the_address_is_an_error_in_words(tmp_path: Path) -> None:
     with pytest.raises(SetError, match=r"--ray 127\.0\.0\.1:1: no Ray cluster answers there"):
         collect(job(2), tmp_path / "set", {}, "x", cluster="127.0.0.1:1")
+    assert not (tmp_path / "set").exists()

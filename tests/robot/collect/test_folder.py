@@ -7,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from robot.collect.job import Piece, SetError
 from robot.collect.objects import find_objects
 from robot.collect.workers import Stopped
 from tacsim.models.scene import Sphere
-from tests.robot.cli.invoked import START, environment, tacsim
+from tests.robot.cli.invoked import START, environment, tacsim, told
 from tests.robot.collect.small import contents, job, rows
 
 
@@ -155,6 +156,13 @@ def test_a_piece_where_all_fails_is_done_without_a_file(tmp_path: Path) -> None:
     assert asked.seconds == {}
 
 
+@pytest.mark.skipif(find_spec("ray") is not None, reason="ray is here")
+def test_without_ray_it_says_what_to_install_and_begins_nothing(tmp_path: Path) -> None:
+    with pytest.raises(SetError, match=r"pip install 'tacsim\[cluster\]'"):
+        collect(job(2), tmp_path / "set", {}, "x", cluster="auto")
+    assert not (tmp_path / "set").exists()
+
+
 @pytest.mark.deep
 def test_killed_by_a_signal_that_nobody_can_catch_it_goes_on_to_the_same_files(tmp_path: Path) -> None:
     """Two workers, kill -9 of the command, twice; workers end with it. Against one process that nobody killed."""
@@ -253,7 +261,7 @@ def test_bad_input_is_refused_before_anything_is_written(words: tuple[str, ...],
     if own:
         _balls(tmp_path / "few")
     done = tacsim("collect", "press", "--preset", "learn", "--count", "1", *own, *words, "--out", "set")
-    assert done.exit_code == 2 and says in " ".join(done.output.replace("│", " ").split())
+    assert done.exit_code == 2 and says in told(done.output)
     if "--ray" not in words:
         assert not (tmp_path / "set").exists()
 

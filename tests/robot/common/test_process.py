@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,24 +17,9 @@ import pytest
 from robot.common import process
 from robot.common.process import LARGEST, Child, read_message, write_message
 from robot.errors import DeviceError
+from tests.robot.waiting import PATIENCE, alive, until
 
-PATIENCE = 60.0  # for anything that has to happen [s]
 ROOT = Path(__file__).resolve().parents[3]
-
-
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not done():
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE} s"
-        time.sleep(0.01)
-
-
-def alive(pid: int) -> bool:
-    """False for a zombie, too: who reaps an orphan is not this project's matter."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 # -- messages --------------------------------------------------------------------------------------------------------
@@ -278,3 +262,21 @@ def test_a_child_dies_with_its_parent(tmp_path: Path, end: signal.Signals, state
         finally:
             if copy > 1:
                 os.kill(copy, signal.SIGKILL)
+
+
+def test_a_killed_parent_is_noticed_before_its_children_get_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as parent:
+        monkeypatch.setattr(os, "getppid", lambda: parent.pid)  # as long as nobody has waited for it
+        lifeline = process.Lifeline(parent.pid)
+        assert not lifeline.cut()
+        parent.kill()
+        until(lifeline.cut, "its end")
+        assert parent.returncode is None  # it has an entry still, as while it gives its memory back
+    assert lifeline.cut()
+
+
+def test_without_proc_the_childs_parent_tells(monkeypatch: pytest.MonkeyPatch) -> None:
+    lifeline = process.Lifeline(2**22 + 1)  # beyond the largest process id
+    assert lifeline.cut()
+    monkeypatch.setattr(os, "getppid", lambda: 2**22 + 1)
+    assert not lifeline.cut()

@@ -178,6 +178,13 @@ def external_data(folder: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
     return model, spec()
 
 
+def external_data_here(folder: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
+    """In the current folder, where onnxruntime looks for the weights of what it reads from memory."""
+    model, said = external_data(folder)
+    model.graph.initializer[0].external_data[0].value = "weights.bin"
+    return model, said
+
+
 def other_version(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
     return graph(), spec(version=2)
 
@@ -200,8 +207,23 @@ def misshapen_input(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
     return graph(maps=(1, 3, 4, 4)), spec()
 
 
+def other_rows(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
+    return graph(maps=(1, 4, 7, 4)), spec()
+
+
+def many_at_once(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
+    return graph(maps=(3, 4, 4, 4)), spec()
+
+
 def misshapen_action(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
     return graph(out=2), spec(axes=spec()["axes"][:1])
+
+
+def action_of_texts(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
+    model = graph()
+    model.graph.node[-1].CopyFrom(helper.make_node("Cast", ["all"], ["action"], to=TensorProto.STRING))
+    model.graph.output[0].type.tensor_type.elem_type = TensorProto.STRING
+    return model, spec()
 
 
 @pytest.mark.parametrize(
@@ -209,16 +231,23 @@ def misshapen_action(_: Path) -> tuple[onnx.ModelProto, Mapping[str, Any]]:
     [
         (no_spec, "does not say what it sees: it has no metadata 'tacsim.spec'"),
         (unknown_operator, "no ONNX file that can run here: .*Levitate"),
-        (external_data, "no ONNX file that can run here: .*external"),
+        (external_data, "no ONNX file that can run here: .*[Ee]xternal"),
+        (external_data_here, "no ONNX file that can run here: .*[Ee]xternal"),
         (other_version, "metadata 'tacsim.spec' cannot be read: version: Input should be 1"),
         (no_json, "cannot be read: period"),
         (other_inputs, "its graph takes goal, maps, touch, its metadata speak of maps, touch"),
         (other_scale, "trained on as 'touch' is not what this version"),
-        (misshapen_input, "its input 'maps' is tensor.float. .*3"),
-        (misshapen_action, "it must give 'action', 1 x 1"),
+        (misshapen_input, r"its input 'maps' is tensor.float. \[1, 3, 4, 4\]; wanted: .* 1 x 4 x 4 x 4"),
+        (other_rows, r"its input 'maps' is tensor.float. \[1, 4, 7, 4\]; wanted: .* 1 x 4 x 4 x 4"),
+        (many_at_once, r"its input 'maps' is tensor.float. \[3, 4, 4, 4\]; wanted: .* 1 x 4 x 4 x 4"),
+        (misshapen_action, "it must give 'action', tensor.float. 1 x 1"),
+        (action_of_texts, "it must give 'action', tensor.float. 1 x 2; it gives .*string"),
     ],
 )
-def test_a_file_that_is_no_policy_says_why(wrong: Any, words: str, write: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_file_that_is_no_policy_says_why(
+    wrong: Any, words: str, write: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(PolicyNotFound, match=f"(?s){words}") as caught:
         read(write(*wrong(tmp_path)))
     assert "\n" not in str(caught.value)

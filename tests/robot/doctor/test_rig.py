@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import robot.doctor.rig
-from robot.cli import app
 from robot.doctor.machine import Check
 from robot.doctor.rig import examine_rig
 from robot.mock import FaultClient, MockCamera, MockUR
@@ -18,6 +16,7 @@ from robot.mock.cell.cell import MockCell
 from robot.mock.fixtures import mock_host
 from tacsim.config import load_rig
 from tacsim.models.rig import RigConfig
+from tests.robot.cli.invoked import tacsim
 
 RIG = """
 name: looked at
@@ -191,6 +190,6 @@ def test_a_rig_without_hardware_has_nothing_to_check() -> None:
 
 def test_the_command_ends_with_1_if_something_must_be_mended(file: Path) -> None:
     for overrides, code in (((), 0), (("--set", "sensors.finger.width=100"), 1)):
-        done = CliRunner().invoke(app, ["doctor", "--rig", str(file), *overrides], env={"COLUMNS": "200"})
+        done = tacsim("doctor", "--rig", file, *overrides)
         assert done.exit_code == code, done.output
     assert "expected are 100 x" in done.output

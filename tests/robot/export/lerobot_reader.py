@@ -19,9 +19,11 @@ STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", 
 def read_dataset(folder: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """info.json, and all columns over all frames, pictures decoded. AssertionError for what is not as it has to be."""
     info = json.loads((folder / "meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0" and info["chunks_size"] == 1000 and info["video_path"] is None
+    assert info["codebase_version"] == "v3.0" and info["chunks_size"] == 1000
     assert isinstance(info["fps"], int) and info["fps"] > 0
     features = info["features"]
+    in_data = {name: feature for name, feature in features.items() if feature["dtype"] != "video"}
+    videos = _videos(folder, info)
     assert all("/" not in name for name in features)
     episodes = _episodes(folder, info)
     tasks = _tasks(folder, info)
@@ -34,8 +36,8 @@ def read_dataset(folder: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]
         group = in_files.get(path, 0)
         in_files[path] = group + 1
         file = parquet.ParquetFile(path)
-        _check_told(file.schema_arrow.metadata[b"huggingface"], features)
-        assert file.schema_arrow.names == list(features)
+        _check_told(file.schema_arrow.metadata[b"huggingface"], in_data)
+        assert file.schema_arrow.names == list(in_data)
         columns = file.read_row_group(group).to_pydict()  # one episode is one row group
         length = episode["length"]
         assert episode["episode_index"] == number and {len(column) for column in columns.values()} == {length}
@@ -45,8 +47,11 @@ def read_dataset(folder: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]
         assert columns["index"] == [episode["dataset_from_index"] + frame for frame in frames]
         assert columns["timestamp"] == [float(np.float32(frame / info["fps"])) for frame in frames]
         assert {tasks[index] for index in columns["task_index"]} == set(episode["tasks"])
-        for name, feature in features.items():
+        for name, feature in in_data.items():
             parts[name].append(_column(columns[name], feature, length))
+        for name, files in videos.items():
+            parts[name].append(_shown(files, name, episode, info["fps"]))
+    assert all(frame is None for files in videos.values() for frames in files.values() for frame in frames)  # all taken
     assert sorted(in_files) == sorted((folder / "data").rglob("*.parquet"))
     assert all(parquet.ParquetFile(path).num_row_groups == count for path, count in in_files.items())
     whole = {name: np.concatenate(each) for name, each in parts.items()}
@@ -101,6 +106,54 @@ def _column(values: list[Any], feature: dict[str, Any], length: int) -> NDArray[
     return found
 
 
+def _videos(folder: Path, info: dict[str, Any]) -> dict[str, dict[tuple[int, int], list[Any]]]:
+    """By column, the frames of each of its files, which must lie evenly in time."""
+    names = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
+    found: dict[str, dict[tuple[int, int], list[Any]]] = {name: {} for name in names}
+    paths = sorted((folder / "videos").rglob("*.mp4"))
+    assert (info["video_path"] is None) == (not names) and bool(paths) == bool(names)
+    for name in names:
+        feature = info["features"][name]
+        told = {"video.height": feature["shape"][0], "video.width": feature["shape"][1], "video.channels": 3}
+        told |= {"video.fps": info["fps"], "is_depth_map": False, "has_audio": False}
+        assert told.items() <= feature["info"].items()
+        for number in range(len(list((folder / "videos" / name).rglob("*.mp4")))):
+            at = divmod(number, info["chunks_size"])
+            path = folder / info["video_path"].format(video_key=name, chunk_index=at[0], file_index=at[1])
+            paths.remove(path)
+            found[name][at] = _frames(path, feature, info["fps"])
+    assert not paths
+    return found
+
+
+def _frames(path: Path, feature: dict[str, Any], fps: int) -> list[NDArray[Any]]:
+    import av
+
+    with av.open(str(path)) as container:
+        (stream,) = container.streams
+        assert stream.codec.canonical_name == feature["info"]["video.codec"]
+        assert stream.pix_fmt == feature["info"]["video.pix_fmt"] and stream.base_rate == fps
+        decoded = list(container.decode(stream))
+    assert np.allclose([frame.time for frame in decoded], np.arange(len(decoded)) / fps, atol=1e-4)  # LeRobot's bound
+    found = [frame.to_ndarray(format="rgb24") for frame in decoded]
+    assert all(list(each.shape) == feature["shape"] for each in found)
+    return found
+
+
+def _shown(files: dict[tuple[int, int], list[Any]], name: str, episode: dict[str, Any], fps: int) -> NDArray[Any]:
+    """The frames of one episode: those of its file that no episode before it has."""
+    place, begin, end = (
+        tuple(episode[f"videos/{name}/{key}"] for key in keys)
+        for keys in (("chunk_index", "file_index"), ("from_timestamp",), ("to_timestamp",))
+    )
+    frames = files[place]
+    begins, ends = (round(each[0] * fps) for each in (begin, end))
+    assert begins == sum(each is None for each in frames) and ends - begins == episode["length"]
+    found = np.stack(frames[begins:ends])
+    frames[begins:ends] = [None] * len(found)
+    return found
+
+
 def _check_told(text: bytes, features: dict[str, Any]) -> None:
     """What tells Hugging Face's `datasets` the types."""
     told = json.loads(text)["info"]["features"]
@@ -121,10 +174,11 @@ def _check_statistics(statistics: dict[str, Any], features: dict[str, Any], fram
     assert set(statistics) == set(features)
     for name, each in statistics.items():
         assert set(each) == STATISTICS and each["count"] == [frames]
-        shape = (3, 1, 1) if features[name]["dtype"] == "image" else tuple(features[name]["shape"])
+        picture = features[name]["dtype"] in ("image", "video")
+        shape = (3, 1, 1) if picture else tuple(features[name]["shape"])
         for key in STATISTICS - {"count"}:
             found = np.array(each[key])
             assert np.isfinite(found).all() and found.ndim == len(shape)
             assert np.broadcast_shapes(found.shape, shape) == shape
-            if features[name]["dtype"] == "image":
+            if picture:
                 assert found.shape == shape and found.min() >= 0.0 and found.max() <= 1.0

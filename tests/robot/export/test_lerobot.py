@@ -148,6 +148,11 @@ def cut_off() -> list[str]:
     return ["cut.mcap"]
 
 
+def no_recording() -> list[str]:
+    Path("text.mcap").write_text("hello")
+    return [str(record("a.mcap")[0]), "text.mcap"]
+
+
 def two_rates() -> list[str]:
     record("a.mcap")
     spec = replace(read_episode("a.mcap").meta.spec, period=0.05)
@@ -185,6 +190,7 @@ BAD: list[tuple[Callable[[], list[str]], str]] = [
     (lambda: [str(record("a.mcap", names=("left/one",))[0])], "'left/one': LeRobot allows no '/' in names"),
     (lambda: [str(record("a.mcap")[0]), str(record("b.mcap", names=("upper",))[0])], "a.mcap and b.mcap do not fit"),
     (lambda: ["none.mcap"], "none.mcap: no such file"),
+    (no_recording, "text.mcap: not an MCAP file"),
     (without_surface, "b.mcap: step 2 lacks what the recording says it has: the policy sees heights"),
 ]
 
@@ -196,7 +202,7 @@ def test_what_makes_no_data_set_is_refused_and_nothing_left(
     given = make()
     before = sorted(tmp_path.iterdir())
     done = tacsim("export", "lerobot", *given, "--out", "data/set")
-    assert done.exit_code in (1, 2) and words in done.stderr.replace("\n", " "), done.stderr
+    assert done.exit_code == 2 and words in done.stderr.replace("\n", " "), done.stderr
     assert sorted(tmp_path.iterdir()) == before
 
 

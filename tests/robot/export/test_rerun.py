@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import util
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 from robot.export.rerun_log import EpisodeLog, _colours, _triangles
 from robot.rig.recorded import observe_episode
 from tacsim.optics.grid import canonical_cells
-from tests.robot.cli.invoked import START, environment, tacsim
+from tests.robot.cli.invoked import START, environment, tacsim, told
 from tests.robot.export.made_up import NAMES, record
 
 needs_rerun = pytest.mark.skipif(util.find_spec("rerun") is None, reason="needs the extra 'viz'")
@@ -89,6 +90,35 @@ def test_all_of_a_step_is_logged_at_its_time() -> None:
     assert height is not None
     assert np.allclose(corners[:, 2], -height[valid]) and np.ptp(corners[:, 2]) > 1e-3  # pressed in: below the rest
     assert np.allclose(corners[:, :2], canonical_cells(observed.canonical).points()[valid])
+
+
+@needs_rerun
+def test_recorded_particles_are_shown() -> None:
+    path, _ = record("a.mcap", 2)
+    observed, kept = observe_episode(path), Kept()
+    log = EpisodeLog(kept, observed.episode.meta.spec, observed.canonical, {})  # type: ignore[arg-type]
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+    for step, observation in observed.steps():
+        log.step(replace(step, body=points), observation)
+    shown = [value.positions.as_arrow_array().to_pylist() for _, value in kept.logged["world/body"]]
+    assert shown == [points.tolist()] * 2
+
+
+def test_a_rig_is_looked_at_live_and_hardware_does_not_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr("robot.cli.episode.view.run", lambda rig, **more: asked.append((rig, more)))
+    assert tacsim("view", "ur5e-one", "--steps", "3").exit_code == 0
+    assert tacsim("view", "sim", "--task", "squeeze", "--save", "live.rrd").exit_code == 0
+    (first, one), (second, two) = asked
+    assert (first, one["dry_run"], one["view"], one["save_view"], one["steps"]) == ("ur5e-one", True, True, None, 3)
+    assert (second, two["dry_run"], two["view"], two["task"]) == ("sim", False, False, "squeeze")
+    assert two["save_view"] == Path("live.rrd")
+    wrong = tacsim("view", "no-such-rig")
+    assert wrong.exit_code == 2 and "no rig 'no-such-rig'" in wrong.stderr.replace("\n", " ")
+    Path("first").mkdir()
+    assert "name the episode.mcap in it" in told(tacsim("view", "first").stderr)
+    path, _ = record("a.mcap", 2)
+    assert "for rigs" in tacsim("view", str(path), "--steps", "3").stderr
 
 
 @needs_rerun

@@ -10,6 +10,7 @@ import threading
 import time
 from dataclasses import replace
 from importlib import util
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,19 @@ def test_a_viewer_that_dies_does_not_disturb() -> None:
         view(*each)
     view.close()
     assert not Path("live.rrd").exists()
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-4, 0.1, 0.5, 0.9])
+def test_a_message_cut_short_is_the_end(tmp_path: Path, share: float) -> None:
+    _, steps = seen()
+    path = tmp_path / "sent"
+    with Connection(os.open(path, os.O_WRONLY | os.O_CREAT)) as line:
+        rerun_live.send(line, steps[0])
+    with Connection(os.open(path, os.O_RDONLY)) as line:
+        assert rerun_live._receive(line) is not None
+    os.truncate(path, int(share * path.stat().st_size))
+    with Connection(os.open(path, os.O_RDONLY)) as line:
+        assert rerun_live._receive(line) is None
 
 
 @needs_rerun

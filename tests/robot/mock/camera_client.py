@@ -6,9 +6,6 @@ import http.client
 import io
 import os
 import socket
-import time
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -18,21 +15,6 @@ from robot.mock.camera.camera import MockCamera
 
 HOST = f"127.22.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # parallel sessions stay apart
 WAIT = 20.0  # for what must come, however slow the machine [s]
-
-
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT
-    while not holds():
-        assert time.monotonic() < deadline, "it never came"
-        time.sleep(0.005)
-
-
-def running(pid: int) -> bool:
-    """False for a zombie, too: who reaps an orphan is not this project's matter."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def get(camera: MockCamera, path: str) -> tuple[int, str, bytes]:

@@ -5,20 +5,12 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-import time
-from collections.abc import Callable
 
 import numpy as np
 
 from robot.mock import FaultClient
 from tests.robot.mock.wire_client import TIMEOUT, RtdeClient
-
-
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not done():
-        assert time.monotonic() < deadline, f"never: {what}"
-        time.sleep(0.005)
+from tests.robot.waiting import until
 
 
 class Innocent:

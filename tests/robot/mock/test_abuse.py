@@ -20,8 +20,9 @@ from robot.mock.ur.wire.connection import Connection
 from robot.mock.ur.wire.controller import Controller
 from robot.mock.ur.wire.inputs import Inputs
 from robot.mock.ur.wire.rtde import MAX_NAMES, InputRecipe, package
-from tests.robot.mock.innocent import Innocent, until
-from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, wire_host
+from tests.robot.mock.innocent import Innocent
+from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, wire_host
+from tests.robot.waiting import until
 
 SET_TCP, MOVE_J, MOVE_L, SOLVE, MOVE_PATH = 29, 1, 3, 46, 45
 
@@ -49,23 +50,6 @@ def stopped(faults: FaultClient) -> str:
     """Why the program ended."""
     until(lambda: not faults.state().program, "the program ends")
     return faults.state().stop_reason
-
-
-@pytest.mark.parametrize(
-    ("command", "doubles"), [(SET_TCP, [1e160] * 6), (MOVE_L, [1e200] * 6 + [0.1, 0.5]), (SOLVE, [1e300] * 6)]
-)
-def test_numbers_no_arm_can_follow(arms: MockArms, command: int, doubles: list[float]) -> None:
-    with ControlClient(arms.hosts[0]) as client:
-        assert client.call(command, doubles) is None  # runtime_state says that the program has stopped
-        assert "beyond 1e+06" in stopped(arms.fault_clients[0])
-        client.upload(control_script())
-    assert arms.fault_clients[1].state().stop_reason == ""
-
-
-def test_a_program_that_is_refused_says_why(arms: MockArms) -> None:
-    with socket.create_connection((arms.hosts[0], 30003), TIMEOUT) as line:
-        line.sendall(control_script(9999).encode())
-        until(lambda: "register offset 9999" in arms.fault_clients[0].state().stop_reason, "it says so")
 
 
 def test_a_command_without_all_its_numbers_ends_the_program(arms: MockArms) -> None:

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robot.common import stamp
 from robot.errors import DeviceError, DeviceNotConnectedError
 from robot.mock.camera.camera import MockCamera
-from tests.robot.mock.camera_client import HOST, Client, get, running, until
+from tests.robot.mock.camera_client import HOST, Client, get
+from tests.robot.waiting import alive, until
 
 FPS = 200.0
 
@@ -128,82 +128,6 @@ def test_a_slow_client_loses_frames_instead_of_filling_memory() -> None:
         assert sent() <= stuck + 1  # one frame hangs in the socket; no other was handed out
 
 
-def test_stall(camera: MockCamera) -> None:
-    with Client(camera) as client:
-        client.frame()
-        camera.stall(True)
-        frames = camera.state().frames
-        number = camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
-        time.sleep(0.1)
-        assert camera.state().frames == frames and camera.state().stall
-        camera.stall(False)
-        while client.frame()[1].image != number:
-            pass
-
-
-def test_drop(camera: MockCamera) -> None:
-    with Client(camera) as client:
-        camera.drop(0.5)
-        numbers = [client.frame()[1].frame for _ in range(40)]
-        state = camera.state()
-    missing = numbers[-1] - numbers[0] - 39
-    assert missing >= 5 and state.dropped + state.skipped >= missing
-    assert np.all(np.diff(numbers) > 0)
-
-
-def test_delay(camera: MockCamera) -> None:
-    camera.delay(0.25)
-    with Client(camera) as client:
-        since = time.monotonic_ns() // 1000
-        while (mark := client.frame()[1]).clock < since:  # those of before the delay
-            pass
-        assert time.monotonic_ns() // 1000 - mark.clock > 249_000
-
-
-def test_corrupt(camera: MockCamera) -> None:
-    with Client(camera) as client:
-
-        def broken() -> bool:
-            try:
-                return stamp.read(np.array(Image.open(io.BytesIO(client.jpeg())).convert("RGB"))) is None
-            except Exception:
-                return True
-
-        camera.corrupt(True)
-        until(broken)  # what was under way is whole
-        assert sum(broken() for _ in range(30)) >= 20
-        camera.corrupt(False)
-        until(lambda: not any(broken() for _ in range(5)))
-
-
-def test_freeze_sends_the_same_jpeg(camera: MockCamera) -> None:
-    with Client(camera) as client:
-        camera.freeze(True)
-        until(lambda: client.jpeg() == client.jpeg())
-        last = client.jpeg()
-        assert all(client.jpeg() == last for _ in range(10)) and camera.state().freeze
-        camera.freeze(False)
-        until(lambda: client.jpeg() != last)
-
-
-def test_cut_and_flip(camera: MockCamera) -> None:
-    with Client(camera) as client:
-        whole = client.jpeg()
-        camera.cut(True)
-        until(lambda: len(client.jpeg()) < 0.6 * len(whole))
-        assert client.jpeg().endswith(b"\xff\xd9")
-        camera.cut(False)
-        camera.freeze(True)
-        camera.flip(3)
-
-        def apart() -> int:
-            """Bytes that two frames differ in; three are flipped in each."""
-            one, two = client.jpeg(), client.jpeg()
-            return sum(a != b for a, b in zip(one, two, strict=True)) if len(one) == len(two) else -1
-
-        until(lambda: 0 < apart() <= 6)  # what was under way may be older
-
-
 def test_an_unstamped_camera_has_noise_as_a_real_one() -> None:
     with MockCamera(host=HOST, width=64, height=48, stamped=False) as camera:
         camera.push(np.full((48, 64, 3), 77, dtype=np.uint8))
@@ -223,17 +147,6 @@ def test_resize_and_brightness(camera: MockCamera) -> None:
         camera.resize(320, 240)
         until(lambda: client.frame()[0].shape == (240, 320, 3))
         assert camera.state().size is None
-
-
-def test_disconnect_cuts_clients(camera: MockCamera) -> None:
-    with Client(camera) as client:
-        client.frame()
-        assert camera.disconnect() == 1
-        with pytest.raises(OSError):
-            [client.frame() for _ in range(1000)]
-    until(lambda: camera.state().clients == 0)
-    with Client(camera) as client:
-        client.frame()
 
 
 def test_refuse_closes_the_port_and_opens_it_again(camera: MockCamera) -> None:
@@ -332,7 +245,7 @@ def test_close_is_idempotent_and_leaves_nothing() -> None:
     with Client(camera):
         camera.close()
         camera.close()
-    assert not running(camera.pid)
+    assert not alive(camera.pid)
     with pytest.raises(DeviceNotConnectedError, match="closed"):
         camera.push(np.zeros((240, 320, 3), dtype=np.uint8))
 
@@ -360,9 +273,9 @@ def test_ends_with_its_parent() -> None:
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
         pid = int(parent.stdout.readline())
-        assert running(pid)
+        assert alive(pid)
         parent.kill()
-    until(lambda: not running(pid))
+    until(lambda: not alive(pid))
 
 
 def test_a_command_that_is_none_is_refused(camera: MockCamera) -> None:

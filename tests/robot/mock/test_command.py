@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 
 import pytest
-from typer.testing import CliRunner
 
 from robot.camera.camera import Camera
-from robot.cli import app
 from robot.mock import FaultClient
 from tacsim.models.hardware import CameraSensorConfig
+from tests.robot.cli.invoked import START, tacsim
 from tests.robot.mock.wire_client import TIMEOUT, dashboard, wire_host
-
-START = (sys.executable, "-c", "from robot.cli import main; main()", "mock")
 
 
 def test_it_serves_until_ctrl_c() -> None:
     hosts = [wire_host(40), wire_host(41)]
     options = [word for host in hosts for word in ("--host", host)]
     options += ["--model", "ur3e", "--version", "5.23.1", "--payload", "0.5,0,0,0.03"]
-    process = subprocess.Popen([*START, *options], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*START, "mock", *options], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process, process.stdout:
         said = [process.stdout.readline() for _ in range(3)]
@@ -41,7 +37,7 @@ def test_it_serves_until_ctrl_c() -> None:
 def test_cameras_stand_at_the_arms_addresses() -> None:
     host = wire_host(42)
     options = ["--host", host, "--cameras", "1", "--camera-port", "8090"]
-    process = subprocess.Popen([*START, *options], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*START, "mock", *options], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process, process.stdout:
         said = [process.stdout.readline() for _ in range(3)]
@@ -70,5 +66,5 @@ def test_cameras_stand_at_the_arms_addresses() -> None:
     ],
 )
 def test_what_it_refuses(options: list[str], words: str, code: int) -> None:
-    done = CliRunner().invoke(app, ["mock", *options], env={"COLUMNS": "200"})
+    done = tacsim("mock", *options)
     assert done.exit_code == code and words in done.stderr and "Traceback" not in done.stderr

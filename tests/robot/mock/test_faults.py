@@ -13,13 +13,7 @@ import pytest
 from robot.mock import FaultClient, FaultError, MockUR
 from robot.mock.ur.wire.controller import PORTS
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard, wire_host
-
-
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not done():
-        assert time.monotonic() < deadline, f"never: {what}"
-        time.sleep(0.005)
+from tests.robot.waiting import until
 
 
 def streaming(mock: MockUR, *names: str) -> RtdeClient:

@@ -17,8 +17,9 @@ from robot.mock.ur.fault_server import ACTIONS
 from robot.mock.ur.wire.controller import DASHBOARD, RTDE, SCRIPTS
 from robot.mock.ur.wire.fields import FORMATS, INPUTS, OUTPUTS
 from robot.mock.ur.wire.rtde import DATA, INPUT_RECIPE, MESSAGE, OUTPUT_RECIPE, PAUSE, PROTOCOL, START, VERSION, package
-from tests.robot.mock.innocent import Innocent, until
+from tests.robot.mock.innocent import Innocent
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, control_script, wire_host
+from tests.robot.waiting import until
 
 KINDS = (PROTOCOL, VERSION, MESSAGE, DATA, OUTPUT_RECIPE, INPUT_RECIPE, START, PAUSE)
 NUMBERS = (0.0, 1.0, -1.0, 0.5, 1e-300, 1e6, -1e160, 1e300, float("nan"), float("inf"), 3.2, 255.0)

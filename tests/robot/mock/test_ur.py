@@ -9,7 +9,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 
 import pytest
 
@@ -17,16 +16,11 @@ from robot.mock import FaultError, MockArms, MockError, MockUR
 from robot.mock.cell.cell import MockCell
 from tacsim.config import ConfigError, load_rig
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, dashboard, wire_host
+from tests.robot.waiting import until
 
 
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not done():
-        assert time.monotonic() < deadline, f"never: {what}"
-        time.sleep(0.01)
-
-
-def alive(pid: int) -> bool:
+def exists(pid: int) -> bool:
+    """True for a zombie, too."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -39,7 +33,7 @@ def test_close_leaves_nothing_and_may_be_repeated() -> None:
     assert mock.running and mock.faults.state().tick >= 0
     mock.close()
     mock.close()
-    assert not alive(mock.pid) and not mock.running
+    assert not exists(mock.pid) and not mock.running
     with pytest.raises(FaultError):
         mock.faults.state()
     with MockUR(wire_host(10), ready_timeout=60):
@@ -124,10 +118,10 @@ def test_it_dies_with_its_parent(end: signal.Signals) -> None:
     assert parent.stdout is not None
     with parent, parent.stdout:
         pid = int(parent.stdout.readline())
-        assert alive(pid)
+        assert exists(pid)
         parent.send_signal(end)
         parent.wait(TIMEOUT)
-        until(lambda: not alive(pid), "the mock is gone")
+        until(lambda: not exists(pid), "the mock is gone")
 
 
 def test_a_stopped_process_is_ended_too() -> None:
@@ -136,7 +130,7 @@ def test_a_stopped_process_is_ended_too() -> None:
         os.kill(mock.pid, signal.SIGSTOP)
         with pytest.raises(FaultError, match="no answer in time"):
             mock.faults.state()
-    assert not alive(mock.pid)
+    assert not exists(mock.pid)
 
 
 def test_it_goes_on_after_a_pause_of_its_process() -> None:

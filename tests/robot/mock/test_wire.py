@@ -8,7 +8,6 @@ import random
 import socket
 import struct
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -20,13 +19,7 @@ from robot.mock.ur.wire.controller import MAX_CLIENTS, PORTS
 from robot.mock.ur.wire.fields import INPUTS, OUTPUTS
 from robot.mock.ur.wire.rtde import BadPackage, package, packages
 from tests.robot.mock.wire_client import TIMEOUT, ControlClient, RtdeClient, control_script, dashboard
-
-
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not done():
-        assert time.monotonic() < deadline, f"never: {what}"
-        time.sleep(0.005)
+from tests.robot.waiting import until
 
 
 def streaming(client: RtdeClient, *names: str, frequency: float = 500.0) -> RtdeClient:

@@ -16,10 +16,8 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from calibration.poses.records import read_touches, touch_file, write_record
-from robot.cli import app
 from robot.errors import DeviceError
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
@@ -31,9 +29,9 @@ from tacsim.interface import Pose
 from tacsim.models.hardware import Placement
 from tacsim.models.sensor import SensorModel
 from tests.calibration.touches import BALL_RADIUS, made_touches, posed
+from tests.robot.cli.invoked import tacsim, told
 from tests.robot.procedures.ball_on_post import BallOnPost
 
-NARROW = {"COLUMNS": "200"}
 RIG = """
 name: toucher
 clock: wall
@@ -79,7 +77,7 @@ def test_a_file_of_touches_gives_the_lines_for_the_rig_file(tmp_path: Path) -> N
     touches, sensor, ball = made_touches(np.random.default_rng(0))
     write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
     words = ["calibrate", "touch", str(tmp_path / "touches.yaml"), "--arm", "upper", "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(app, words, env=NARROW)
+    done = tacsim(*words)
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "touch.json").read_text())
     lines = yaml.safe_load(done.stdout.partition("Write into the rig file:\n")[2].rpartition("\n" + str(tmp_path))[0])
@@ -93,7 +91,7 @@ def test_a_file_of_touches_gives_the_lines_for_the_rig_file(tmp_path: Path) -> N
     assert np.array(report["tool_from_sensor"]["covariance"]).shape == (6, 6)
     assert np.array(report["residuals"]).shape == (24, 3) and all(report["used"])
     assert "at best, by Cramer and Rao" in done.stdout
-    again = CliRunner().invoke(app, words, env=NARROW)
+    again = tacsim(*words)
     assert again.exit_code == 2  # nothing is overwritten
 
 
@@ -150,13 +148,9 @@ def test_a_damaged_or_foreign_file_is_refused_with_the_line(
     touches, _, _ = made_touches(np.random.default_rng(0), 8)
     path = write_record(tmp_path / "touches.yaml", touch_file(touches, BALL_RADIUS))
     path.write_text(damage(path.read_text()))
-    done = CliRunner().invoke(app, ["calibrate", "touch", str(path), "--out", str(tmp_path / "out")], env=NARROW)
+    done = tacsim("calibrate", "touch", path, "--out", tmp_path / "out")
     assert done.exit_code == 2 and re.search(said, told(done.stderr)), done.output
     assert not (tmp_path / "out").exists()
-
-
-def told(text: str) -> str:
-    return " ".join(text.replace("│", " ").split())
 
 
 def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
@@ -177,9 +171,9 @@ def test_what_cannot_be_ends_with_2_and_no_traceback(tmp_path: Path) -> None:
         ),
         (["--rig", "mock", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 m"], "allowed: 0.0005 to 0.05"),
     ):
-        done = CliRunner().invoke(app, ["calibrate", "touch", *words, "--out", str(tmp_path / "out")], env=NARROW)
+        done = tacsim("calibrate", "touch", *words, "--out", tmp_path / "out")
         assert done.exit_code == 2, (words, done.output)
-        assert said in " ".join(done.stderr.replace("│", " ").split()), (words, done.output)
+        assert said in told(done.stderr), (words, done.output)
         assert not (tmp_path / "out").exists()
 
 
@@ -195,7 +189,7 @@ def test_a_gel_without_depth_is_refused() -> None:
 def test_a_real_arm_moves_only_after_a_persons_word(tmp_path: Path) -> None:
     words = ["calibrate", "touch", "--rig", "ur5e", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"]
     calibrated = ["--set", "sensors.upper.model=ideal", "--set", "sensors.upper.corners=null"]
-    done = CliRunner().invoke(app, [*words, *calibrated, "--out", str(tmp_path / "out")], env=NARROW)
+    done = tacsim(*words, *calibrated, "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert "nobody confirmed (at a terminal); nothing was moved" in done.stderr
 
@@ -215,7 +209,7 @@ def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
         words = ["calibrate", "touch", "--rig", str(tmp_path / "toucher.yaml"), "--arm", "upper", "--sensor", "upper"]
         words += ["--ball-radius", "4 mm", "--touches", "7", "--tilt", "22 deg", "--out", str(tmp_path / "out")]
         with BallOnPost(host, camera, SensorModel(), true, base_from_ball, ball_radius) as post:
-            done = CliRunner().invoke(app, words, env=NARROW)
+            done = tacsim(*words)
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "touch.json").read_text())
     found = report["tool_from_sensor"]
@@ -229,7 +223,7 @@ def test_a_mock_arm_finds_where_its_sensor_sits(tmp_path: Path) -> None:
     assert len(read_touches(kept).touches) == len(report["used"]) >= 6
     assert f"without the arm: tacsim calibrate touch {kept}" in told(done.stderr)
     words = ["calibrate", "touch", str(kept), "--out", str(tmp_path / "again")]
-    again = CliRunner().invoke(app, words, env=NARROW)
+    again = tacsim(*words)
     assert again.exit_code == 0, again.output
     redone = json.loads((tmp_path / "again" / "touch.json").read_text())["tool_from_sensor"]
     np.testing.assert_allclose(redone["position"], found["position"], atol=1e-9)
@@ -256,7 +250,7 @@ def test_what_was_touched_is_kept_whatever_ends_it(ends: str, tmp_path: Path, mo
     monkeypatch.setattr("robot.procedures.ball_touches.record_ball_touches", some)
     monkeypatch.setattr("robot.open.open_rig", lambda *_, **__: nullcontext())
     words = ["calibrate", "touch", "--rig", "mock", "--arm", "upper", "--sensor", "upper", "--ball-radius", "4 mm"]
-    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")], env=NARROW)
+    done = tacsim(*words, "--out", tmp_path / "out")
     assert done.exit_code == (130 if ends == "stopped" else 1), done.output
     said = told(done.stderr)
     assert f"recorded: {tmp_path / 'out' / 'touches.yaml'}; to calibrate from it again" in said

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from calibration.poses.records import board_pose_file, write_record
-from robot.cli import app
 from robot.mock import MockCamera, MockState
 from robot.mock.fixtures import mock_host
 from robot.procedures.board_poses import BoardPosePlan, record_board_poses, schedule
@@ -23,9 +21,9 @@ from tacsim.interface import Pose
 from tests.calibration.boards import CHARUCO, LENS, facing, photograph
 from tests.calibration.poses.test_hand_eye import CAMERA, made_sights
 from tests.calibration.touches import posed
+from tests.robot.cli.invoked import tacsim, told
 from tests.robot.procedures.seen_arm import SeenArm
 
-WIDE = {"COLUMNS": "200"}
 RIG = """
 name: looker
 clock: wall
@@ -50,9 +48,9 @@ sensors:
 
 
 def run(*words: object) -> tuple[int, str, str]:
-    done = CliRunner().invoke(app, ["calibrate", "hand-eye", *map(str, words)], env=WIDE)
+    done = tacsim("calibrate", "hand-eye", *words)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done.exit_code, done.stdout, " ".join(done.stderr.replace("│", " ").split())
+    return done.exit_code, done.stdout, told(done.stderr)
 
 
 @pytest.mark.parametrize("fixed", [False, True])

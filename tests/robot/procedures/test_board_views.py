@@ -6,17 +6,14 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from calibration.lens.view import GelView, Lens
-from robot.cli import app
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
 from robot.procedures.board_views import ON_GEL, PROMPTS, BoardViewPlan, record_board_views
@@ -25,6 +22,7 @@ from tacsim.config import load
 from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
+from tests.robot.cli.invoked import START, tacsim, told
 
 Move = np.ndarray | Callable[[int], np.ndarray]
 EMPTY = np.full((480, 640, 3), 128, np.uint8)
@@ -122,7 +120,6 @@ clock: wall
 sensors:
   eye: {{ driver: camera, source: '{source}', width: 640, height: 480, fps: 20, max_age: 10 s }}
 """
-START = (sys.executable, "-c", "from robot.cli import main; main()")
 
 
 def lead(camera: MockCamera, words: list[str], moves: list[np.ndarray], stop_after: int = 99) -> tuple[int, list[str]]:
@@ -161,7 +158,7 @@ def test_the_command_calibrates_the_lens_and_then_the_gel(tmp_path: Path) -> Non
         np.testing.assert_allclose(lens.focal, LENS.focal, rtol=0.02)
         assert sorted(path.name for path in (out / "frames").iterdir()) == [f"view_0{k}.png" for k in range(1, 8)]
         again = ["calibrate", "lens", str(out / "frames"), *BOARD, "--out", str(tmp_path / "again")]
-        done = CliRunner().invoke(app, again, env={"COLUMNS": "200"})
+        done = tacsim(*again)
         assert done.exit_code == 0, done.output
         found = load(Lens, tmp_path / "again" / "lens.yaml")
         # OpenCV adds up in threads: the last digits differ from run to run.
@@ -207,9 +204,7 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
         (["--camera", "eye", *BOARD], "give rig and sensor"),
         (["--camera", "mock/lower", *BOARD], "has a mock camera that a simulation feeds"),
     ):
-        done = CliRunner().invoke(
-            app, ["calibrate", "lens", *words, "--out", str(tmp_path / "out")], env={"COLUMNS": "200"}
-        )
+        done = tacsim("calibrate", "lens", *words, "--out", tmp_path / "out")
         assert done.exit_code == 2, (words, done.output)
-        assert said in " ".join(done.stderr.replace("│", " ").split()), (words, done.output)
+        assert said in told(done.stderr), (words, done.output)
         assert not (tmp_path / "out").exists()

@@ -7,7 +7,6 @@ import pty
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,13 +15,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from calibration.bundle import FILE, read_bundle
 from calibration.errors import BadFrames
 from calibration.lens.view import view_of_corners
 from calibration.light.noise import measure_noise
-from robot.cli import app
 from robot.mock import MockCamera
 from robot.mock.fixtures import mock_host
 from robot.procedures.presses import NOISE_FRAMES, REFERENCE, BallPressPlan, record_presses
@@ -32,6 +29,7 @@ from tacsim.interface import EndOfEpisode, TactileFrame
 from tacsim.record.images import read_image
 from tests.calibration.dotted import draw, lattice_points
 from tests.calibration.presses import BALL, BALL_PX, COLUMNS, PITCH, ROWS, HiddenSensor
+from tests.robot.cli.invoked import START, tacsim, told
 
 SENSOR = HiddenSensor(3)
 EMPTY = SENSOR.empty()
@@ -202,7 +200,6 @@ sensors:
   finger: {{ driver: camera, source: '{source}', width: {width}, height: {height}, fps: 30, max_age: 10 s }}
 """
 QUESTION = ("[y/N]:", "[Y/n]:")
-START = (sys.executable, "-c", "from robot.cli import main; main()")
 
 
 @contextmanager
@@ -284,7 +281,7 @@ def test_the_command_makes_a_bundle_and_keeps_its_frames(answer: str | None, tmp
     assert np.abs(reference.astype(int) - EMPTY).mean() < 2.0  # JPEG halves the resolution of colour
     # from the frames, the same again
     words = ["calibrate", "sensor", str(out / "frames"), *lengths, "--out", str(tmp_path / "again")]
-    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    done = tacsim(*words)
     assert done.exit_code == 0, done.output
     again, _ = read_bundle(tmp_path / "again")
     assert again.forward == live.forward and again.inverse == live.inverse
@@ -328,12 +325,12 @@ def test_a_camera_that_looks_askew_is_led_through_its_view(tmp_path: Path) -> No
         assert residual.circle[2] * view.pixel_pitch == pytest.approx(true_radius * PITCH, rel=0.08)
     assert np.median([residual.angle for residual in calibration.residuals]) < 4.0
     again = ["calibrate", "sensor", str(out / "frames"), *options, "--out", str(tmp_path / "again")]
-    done = CliRunner().invoke(app, again, env={"COLUMNS": "200"})
+    done = tacsim(*again)
     assert done.exit_code == 0, done.output
     assert read_bundle(tmp_path / "again")[0].forward == calibration.forward
     small = view_of_corners(((0.0, 0.0), (159.0, 0.0), (159.0, 119.0), (0.0, 119.0)), view.size, (120, 160))
     (tmp_path / "view.yaml").write_text(yaml.safe_dump(small.model_dump(mode="json")))
-    refused = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "no")], env={"COLUMNS": "200"})
+    refused = tacsim(*words, "--out", tmp_path / "no")
     assert refused.exit_code == 2 and "the view was calibrated on 160 x 120 px" in " ".join(refused.stderr.split())
 
 
@@ -360,15 +357,13 @@ def test_what_cannot_be_ends_with_2(tmp_path: Path) -> None:
         ([*ball, *pitch], 2, "either a folder of frames, or --camera"),
         ([str(tmp_path / "frames"), "--camera", f"{rig}/finger", *ball, *pitch], 2, "either a folder of frames, or"),
         (["--camera", f"{rig}/finger", *pitch], 2, "give the ball's diameter (or its radius, not both)"),
-        (["--camera", f"{rig}/finger", *ball], 2, "give --pixel-pitch or --view: nothing is known"),
+        (["--camera", f"{rig}/finger", *ball], 2, "give --pixel-pitch or --view, or --kind"),
         (["--camera", "finger", *ball, *pitch], 2, "give rig and sensor"),
         (["--camera", f"{rig}/thumb", *ball, *pitch], 2, "'thumb' is no sensor with a camera; cameras: finger"),
         (["--camera", "mock/lower", *ball, *pitch], 2, "nobody can press its gel"),
         (["--camera", f"{rig}/finger", *ball, *pitch], 1, "no picture from http://127.0.0.1:9/"),
     ):
-        done = CliRunner().invoke(
-            app, ["calibrate", "sensor", *words, "--out", str(tmp_path / "out")], env={"COLUMNS": "200"}
-        )
+        done = tacsim("calibrate", "sensor", *words, "--out", tmp_path / "out")
         assert done.exit_code == code, (words, done.output)
-        assert said in " ".join(done.stderr.replace("│", " ").split()), (words, done.output)
+        assert said in told(done.stderr), (words, done.output)
         assert not (tmp_path / "out").exists()

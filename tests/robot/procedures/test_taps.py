@@ -7,16 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from calibration.poses.latency import Latency
-from robot.cli import app
 from robot.mock import MockCamera, MockState
 from robot.mock.fixtures import mock_host, rig_addresses
 from robot.procedures.session import CannotCalibrate
 from robot.procedures.taps import CONTACT_TIME, LIFTED_TIME, PAUSE, TapPlan, latency_entries, schedule, without_latency
 from tacsim.config import load_rig
 from tacsim.models.hardware import UrArmConfig
+from tests.robot.cli.invoked import tacsim
 from tests.robot.procedures.seen_arm import SeenArm
 
 WIDTH, HEIGHT = 64, 48
@@ -88,7 +87,7 @@ def test_what_is_known_already_does_not_hide_what_is_measured() -> None:
 def test_parts_that_cannot_tell_are_refused(rig: str, arm: str, sensor: str, words: str) -> None:
     with pytest.raises(CannotCalibrate, match=words):
         without_latency(load_rig(rig).config, arm, sensor)
-    done = CliRunner().invoke(app, ["calibrate", "latency", rig, "--arm", arm, "--sensor", sensor])
+    done = tacsim("calibrate", "latency", rig, "--arm", arm, "--sensor", sensor)
     assert done.exit_code == 2
 
 
@@ -129,7 +128,7 @@ def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
         camera.delay(DELAY)
         words = ["calibrate", "latency", str(tmp_path / "tapper.yaml"), "--arm", "upper", "--sensor", "upper"]
         with Hand(host, camera):
-            done = CliRunner().invoke(app, [*words, "--depth", "1 mm", "--taps", "5"], env={"COLUMNS": "200"})
+            done = tacsim(*words, "--depth", "1 mm", "--taps", "5")
     assert done.exit_code == 0, done.output
     said = done.stdout.split()
     found = float(said[said.index("is") + 1])
@@ -143,6 +142,6 @@ def test_a_delay_of_the_camera_is_found_and_told(tmp_path: Path) -> None:
 def test_the_mock_rig_taps_a_ball_in_closed_form() -> None:
     addresses = [word for override in rig_addresses() for word in ("--set", override)]
     words = ["calibrate", "latency", "mock", "--arm", "upper", "--sensor", "upper", "--taps", "4", *addresses]
-    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    done = tacsim(*words)
     assert done.exit_code == 0, done.output
     assert "sensors.upper is" in done.stdout

@@ -17,9 +17,9 @@ from tacsim import pose as se3
 from tacsim.config import load_rig
 from tacsim.interface import FloatArray, Pose
 from tacsim.models.hardware import Placement, Plane, UrArmConfig
-from tests.robot.arm.mocked import until
 from tests.robot.cli.lab import Lab, copy_of
 from tests.robot.cli.test_start import AWAY, fast
+from tests.robot.waiting import until
 
 KINEMATICS = Kinematics("ur5e")
 TURNED = np.array([0.5, -0.2, 0.1, 0.0, 0.1, 0.3])  # from the start to where the arm stands [rad]

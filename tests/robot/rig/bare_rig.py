@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,7 +30,6 @@ from tacsim.rig import Rig
 if find_spec("rtde_control") is None:
     pytest.skip("ur_rtde has no wheel for this Python and machine", allow_module_level=True)
 
-PATIENCE = 60.0  # for anything that has to happen [s]
 BARE = """
 name: bare
 clock: wall
@@ -151,13 +149,6 @@ def bare_file(folder: Path, first: int = 41) -> Path:
     file = folder / "bare.yaml"
     file.write_text(text)
     return file
-
-
-def until(done: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not done():
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE} s"
-        time.sleep(5e-3)
 
 
 class After:

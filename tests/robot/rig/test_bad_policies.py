@@ -20,7 +20,8 @@ from tacsim.interface import Action, Needs, Observation, Pose
 from tacsim.models.features import Features
 from tacsim.models.policy import ActionAxis, PolicySpec
 from tacsim.models.sensor import CanonicalGrid
-from tests.robot.rig.bare_rig import Opened, bare_file, opened, until
+from tests.robot.rig.bare_rig import Opened, bare_file, opened
+from tests.robot.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_pause")
 STEP = 0.2e-3  # of one arm along the world's z, away from the other [m]

@@ -144,6 +144,15 @@ def test_a_name_and_every_path_mean_the_same_model(finger: Path, lab: Path, said
     assert in_rig.model == model  # type: ignore[union-attr]
 
 
+def test_a_name_may_have_a_space(finger: Path, lab: Path) -> None:
+    (lab / "sensors" / "my finger").symlink_to(finger)
+    try:
+        assert load_sensor("my finger") == load_sensor("finger")
+        assert read_bundle(Path("my finger"))[0].serial == "gs-7"
+    finally:
+        (lab / "sensors" / "my finger").unlink()
+
+
 def test_a_rig_file_finds_the_sensors_beside_it(finger: Path, lab: Path, tmp_path: Path, monkeypatch) -> None:
     rig = lab / "rig.yaml"
     rig.write_text("extends: sim\nsensors: {upper: {driver: sim, arm: upper, model: finger}}\n", encoding="utf-8")
@@ -221,7 +230,7 @@ def test_what_is_recorded_of_a_rig_means_the_same_again(finger: Path, tmp_path: 
 
 def test_a_press_with_a_bundle_has_its_picture_and_gel(finger: Path, tmp_path: Path) -> None:
     small = ("--preset", "learn", "--radius", "4 mm", "--depth", "0.4 mm")
-    done = tacsim("press", "sphere", *small, "--model", "finger", "--out", str(tmp_path / "pressed"))
+    done = tacsim("press", "sphere", *small, "--model", "finger", "--out", tmp_path / "pressed")
     assert done.exit_code == 0, done.output
     assert "gel 16 x 12 mm in whole elements of 2 mm" in done.output
     picture = np.asarray(Image.open(tmp_path / "pressed" / "rgb.png")).astype(int)

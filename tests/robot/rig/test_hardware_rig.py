@@ -23,7 +23,8 @@ from robot.open import open_rig
 from robot.rig.commanded_arm import CommandedArm
 from robot.rig.reset import NotConfirmed
 from tacsim.interface import Action, ArmState, Pose
-from tests.robot.rig.bare_rig import Opened, bare_file, failing, opened, until
+from tests.robot.rig.bare_rig import Opened, bare_file, failing, opened
+from tests.robot.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_pause")
 SERVOJ = 11

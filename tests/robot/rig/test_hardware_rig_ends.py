@@ -17,21 +17,13 @@ from robot.camera.camera import StaleFrame
 from robot.deploy.control_loop import EpisodeFailed
 from robot.errors import DeviceError, DeviceNotConnectedError, LinkLost
 from robot.open import open_rig
-from tacsim.config import ConfigError, load_rig
+from tacsim.config import load_rig
 from tacsim.interface import Action, Pose
-from tests.robot.rig.bare_rig import Opened, bare_file, belongings, cameras_of, failing, needs_proc, opened, until
+from tests.robot.rig.bare_rig import Opened, bare_file, belongings, cameras_of, failing, needs_proc, opened
+from tests.robot.waiting import alive, until
 
 pytestmark = pytest.mark.usefixtures("no_pause")
 MOTIONS = {1, 2, 3, 4, 6, 9, 10, 11, 12, 18, 24, 25, 41, 45, 51, 52, 66}  # of the library: all that move an arm
-
-
-def test_a_rig_without_limits_is_refused_by_its_file(tmp_path: Path) -> None:
-    file = bare_file(tmp_path)
-    text = file.read_text()
-    start, end = text.index("    limits:"), text.index("    start:")
-    file.write_text(text[:start] + text[end:])
-    with pytest.raises(ConfigError, match=r"(?s)bare\.yaml:\d+.*limits"):
-        open_rig(file)
 
 
 @pytest.mark.parametrize(
@@ -115,14 +107,6 @@ def test_a_part_that_is_killed_ends_the_episode_in_clear_words(
     until(lambda: belongings() == before, "all is given back")
 
 
-def runs(pid: int) -> bool:
-    """False for a process that is gone, or that only nobody has asked after yet."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 @needs_proc
 @pytest.mark.deep
 def test_mocks_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
@@ -141,4 +125,4 @@ def test_mocks_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         ]
         assert len(family) == 3  # two workers and the controllers
         process.kill()
-    until(lambda: not any(runs(pid) for pid in family), "all mocks and workers have ended")
+    until(lambda: not any(alive(pid) for pid in family), "all mocks and workers have ended")

@@ -11,7 +11,8 @@ import pytest
 from robot.mock.fixtures import rig_addresses
 from tacsim.control.approach import NoTouch
 from tacsim.interface import Action, Pose
-from tests.robot.rig.bare_rig import Opened, failing, opened, until
+from tests.robot.rig.bare_rig import Opened, failing, opened
+from tests.robot.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_pause")
 SMALL = [f"canonical.{key}={value}" for key, value in (("rows", 32), ("columns", 32), ("pitch", "0.5 mm"))]

@@ -34,7 +34,7 @@ def record(folder: Path, markers: Markers | None) -> Path:
 def report(tmp_path: Path, frames: Path, *more: str) -> tuple[str, dict, str]:
     """Output of the run, summary.json, and the page."""
     settings = [word for each in (f"source={frames}", *more) for word in ("--set", f"sensors.finger.{each}")]
-    done = tacsim("run", "replay", *settings, "--out", str(tmp_path / "out"))
+    done = tacsim("run", "replay", *settings, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     return done.output, summary, (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -74,5 +74,5 @@ def test_a_replay_with_a_bundle_shows_its_heights_and_no_task(tmp_path: Path) ->
     assert "finger: flow" not in page
     for task in ("best distance", "final reward", "goal", "–"):
         assert task not in output and f">{task}" not in page
-    again = tacsim("replay", str(tmp_path / "out" / "episode.mcap"), "--out", str(tmp_path / "again"))
+    again = tacsim("replay", str(tmp_path / "out" / "episode.mcap"), "--out", tmp_path / "again")
     assert again.exit_code == 0 and "finger: height" in (tmp_path / "again" / "report.html").read_text(encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -71,10 +72,12 @@ class StubSensor:
 
     def __init__(self, log: list[object]) -> None:
         self._log = log
+        self.late = 0  # reads that still give a picture exposed before anything moved
 
     def read(self, timeout: float) -> TactileFrame:
         self._log.append("reference")
-        return TactileFrame(np.zeros((4, 4, 3), np.uint8), 0.0, 0)
+        self.late -= 1
+        return TactileFrame(np.zeros((4, 4, 3), np.uint8), 0.0 if self.late >= 0 else time.monotonic(), 0)
 
     def close(self) -> None: ...
 
@@ -94,10 +97,11 @@ class Scene:
 
     def __post_init__(self) -> None:
         self.lower, self.upper = StubArm("lower", LOWER, self.log), StubArm("upper", UPPER, self.log)
+        self.sensor = StubSensor(self.log)
         commanded = {"lower": CommandedArm(self.lower), "upper": CommandedArm(self.upper)}  # type: ignore[arg-type]
         self.reset = HardwareReset(
             arms=commanded if self.arms else {},
-            sensors={"finger": StubSensor(self.log)},
+            sensors={"finger": self.sensor},
             start={"lower": LOWER, "upper": UPPER},
             clock=self,
             config=PARAMS,
@@ -150,6 +154,22 @@ def test_forces_are_zeroed_when_what_is_felt_is_of_now_and_references_come_last(
     scene = Scene()
     scene.reset.clear(0)
     assert scene.log[4:] == ["wait", ("lower", "zero"), ("upper", "zero"), "wait", "reference"]
+
+
+def test_a_reference_is_exposed_after_the_arms_came_to_rest() -> None:
+    """A camera that was held up still has one of before; at that time an arm may not even have been connected."""
+    scene, before = Scene(), time.monotonic()
+    scene.sensor.late = 3
+    assert scene.reset.clear(0)["finger"].time >= before
+    assert scene.log[-5:] == ["wait", *["reference"] * 4]
+
+
+def test_a_camera_that_shows_nothing_new_ends_the_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resets, "PICTURE", 0.0)
+    scene = Scene()
+    scene.sensor.late = 10**9
+    with pytest.raises(TimeoutError, match="sensor 'finger': no picture since the arms came to rest"):
+        scene.reset.clear(0)
 
 
 def test_the_start_aside_is_of_the_seed_within_bounds_and_the_same_for_all_arms() -> None:

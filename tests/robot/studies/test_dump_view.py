@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from robot.cli import app
 from robot.studies import dump_view
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Indenter, Scene, Settling, Sphere
@@ -18,6 +17,7 @@ from tacsim.physics.failure import health
 from tacsim.physics.failure.dump import DumpError, dumps_in, read
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.world import make_world
+from tests.robot.cli.invoked import tacsim
 
 SMALL = Gel(size=(6e-3, 6e-3, 4e-3))
 CLAY = BodyMaterial(yield_stress=30e3)
@@ -26,10 +26,6 @@ SCENES = {
     "hybrid": Scene(body=Body(geometry=Box(size=(2e-3,) * 3), material=CLAY), gel=SMALL),
     "seed": Scene(physics="seed", body=Body(geometry=Box(size=(2e-3,) * 3), material=CLAY), gel=SMALL),
 }
-
-
-def tacsim(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200", "TERM": "dumb"})
 
 
 def diverge(scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from calibration.bundle import write_bundle
 from calibration.compare.compare import compare_frames
 from calibration.errors import BadFrames
 from calibration.frame_set import Frame, FrameSet
-from robot.cli import app
 from robot.studies.matched_press import _next_depth, _PressedGel, match_presses
 from tacsim.config import load_scene
 from tacsim.models.scene import Scene
@@ -22,6 +20,7 @@ from tacsim.models.sensor import CameraNoise, CanonicalGrid, SensorGeometry, Sen
 from tacsim.physics.failure.health import LaunchSpan, SimulationDiverged
 from tests.calibration.presses import HiddenSensor
 from tests.calibration.sources import calibrated, save
+from tests.robot.cli.invoked import tacsim
 
 SCENE = ("indenter.geometry.radius=2.5 mm", "gel.size=[12 mm, 12 mm, 8 mm]", "element_size=0.5 mm")
 DEPTHS, PLACES = (0.5e-3, 0.65e-3), ((90, 110), (170, 80))
@@ -45,7 +44,7 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
     words = ["compare", "press", "real", "--calibration-b", "bundle", "--out", "out"]
     for setting in SCENE:
         words += ["--set", setting]
-    result = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    result = tacsim(*words)
     assert result.exit_code == 0, result.output
     assert "still.png: not pressed: no ball's contact is seen" in " ".join(result.output.split())
     config = json.loads(Path("out/compare.json").read_text())
@@ -56,6 +55,39 @@ def test_a_scene_against_frames(frames: FrameSet, tmp_path: Path, monkeypatch: p
     assert overall["surface_centroid"]["mean"] < 0.15e-3
     assert [pair["a"] for pair in config["pairs"]] == ["press_0.png", "press_1.png", "still.png"]
     assert config["pairs"][2]["flags"] == ["simulated: no contact", "real: no contact"]
+
+
+def test_ball_and_gel_are_those_of_the_bundle_unless_given(frames: FrameSet, tmp_path: Path, monkeypatch) -> None:
+    """The calibration knows the ball of its presses, and how much gel its pictures show: 20.8 x 16 mm. A smaller gel
+    would carry the motion of its border on to the picture's. The thickness nobody knows."""
+    from robot.studies import matched_press
+
+    asked: list[Scene] = []
+
+    def stop(real: FrameSet, scene: Scene, *more: object) -> None:
+        asked.append(scene)
+        raise BadFrames("enough")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(matched_press, "match_presses", stop)
+    save(frames, Path("real"))
+    calibration, reference = calibrated(HiddenSensor(3))
+    Path("bundle").mkdir()
+    write_bundle(Path("bundle"), calibration, reference)
+    ball = calibration.provenance.ball_radius
+    for number, (settings, size, radius) in enumerate(
+        [
+            ((), (21e-3, 16e-3, 4e-3), ball),
+            (("indenter.geometry.radius=3 mm",), (21e-3, 16e-3, 4e-3), 3e-3),
+            (("gel.size=[12 mm, 12 mm, 8 mm]",), (12e-3, 12e-3, 8e-3), ball),
+        ]
+    ):
+        words = [word for setting in settings for word in ("--set", setting)]
+        result = tacsim("compare", "press", "real", "--calibration-b", "bundle", "--out", f"out{number}", *words)
+        assert "enough" in result.output
+        assert asked[-1].gel.size == pytest.approx(size)
+        assert asked[-1].indenter.geometry.radius == pytest.approx(radius)
+        assert f"a ball of {radius * 1e3:.4g} mm radius" in result.output and "gel" in result.output
 
 
 def test_what_cannot_be_pressed_is_refused(frames: FrameSet) -> None:

@@ -1,11 +1,14 @@
 """`tacsim press`: what its result says of edges, and the outline of a contact."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 from scipy import ndimage
 
-from robot.studies.press import PressMotion, PressResult, press, press_report
+from robot.studies.press import UNFELT, PressMotion, PressResult, press, press_report
 from tacsim.config import load_sensor
-from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Scene, Shape, Sphere
+from tacsim.models.scene import Box, Cylinder, Gel, Indenter, Mesh, Scene, Shape, Sphere
 
 SENSOR = load_sensor("ideal")
 
@@ -40,3 +43,34 @@ def test_the_contact_of_a_slid_cylinder_has_no_holes() -> None:
     holes = ndimage.binary_fill_holes(result.contact) & ~result.contact
     assert not holes.any()
     assert 1.8e-3 < result.contact_radius < 2.0e-3
+
+
+def test_a_press_whose_surface_folds_over_has_a_picture_and_says_so() -> None:
+    """A plate wider than the gel, half of it deep: the gel's rim rolls over, as that of rubber does."""
+    motion = PressMotion(2e-3)
+    scene, result = pressed("draft", motion, Box(size=(30e-3, 30e-3, 5e-3)))
+    told = press_report(scene, motion, result, SENSOR)
+    assert told["folded"] is True and told["settled"] and told["force"] == pytest.approx(198.9, rel=0.01)
+    inner = result.height[:, 20:-20]  # the rest is the rim
+    assert inner.min() > 1.9e-3 and inner.max() < 2.1e-3
+    assert np.isfinite(result.height).all() and result.contact[:, 20:-20].mean() > 0.9
+    assert np.median(result.image) == pytest.approx(128, abs=40)  # a flat face, lit as one
+
+
+def test_a_press_says_how_much_of_its_depth_the_gel_does_not_feel(tmp_path: Path) -> None:
+    """A wedge of 60 degrees 1 mm deep at draft: 0.40 N, and 0.48 N with elements of 0.25 mm. A box comes out right."""
+    import trimesh
+
+    wedge = trimesh.convex.convex_hull([(x, y, z) for x in (-3, 3) for y, z in ((0, 0), (-2.9, 5), (2.9, 5))])
+    wedge.export(tmp_path / "wedge.stl")
+    motion = PressMotion(1e-3)
+    for shape, wrong in ((Mesh(path=str(tmp_path / "wedge.stl")), True), (Box(size=(5e-3, 5e-3, 5e-3)), False)):
+        scene, result = pressed("draft", motion, shape)
+        told = press_report(scene, motion, result, SENSOR)["unfelt"]
+        assert (told > UNFELT) == wrong and 0.0 <= told < 0.25
+
+
+def test_a_press_that_does_not_fold_the_gel_says_so() -> None:
+    motion = PressMotion(0.2e-3)
+    scene, result = pressed("draft", motion, Sphere(radius=4e-3))
+    assert press_report(scene, motion, result, SENSOR)["folded"] is False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,6 +64,12 @@ def test_drawn_episodes_are_not_those_of_training() -> None:
     assert ends[0] != ends[1]
 
 
+def test_no_episode_is_played_twice() -> None:
+    """Else intervals would be told for more episodes than there are: of 200 drawn out of 200 only 132 differed."""
+    ends = evaluate(training(), ["scripted"], 8)[0].episodes
+    assert len({each.distance for each in ends}) == 8
+
+
 def test_a_policy_that_is_not_there_is_named_before_anything_runs() -> None:
     with pytest.raises(PolicyNotFound, match=r"nothing\.onnx"):
         evaluate(training(), ["teacher", "nothing.onnx"], 2)
@@ -91,3 +98,14 @@ def test_the_command_writes_a_table_and_a_file(tmp_path: Path) -> None:
     assert "teacher" in result.stdout and "scripted" in result.stdout
     assert len(json.loads(found.read_text())["scripted"]) == 4
     assert "exists already" in tacsim(*words).stderr
+
+
+def test_what_was_played_is_in_the_file_when_it_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(training: Any, policies: Any, episodes: int, seed: int, tell: Any, say: Any) -> None:
+        say(Judged("teacher", (Ended(1e-4, True, 2.0, 0.9),)))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("robot.train.evaluate.evaluate", stopped)
+    found = tmp_path / "a" / "found.json"
+    assert tacsim("evaluate", "squeeze", "--json", str(found)).exit_code == 130
+    assert [each["distance"] for each in json.loads(found.read_text())["teacher"]] == [1e-4]

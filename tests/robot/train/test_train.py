@@ -21,13 +21,18 @@ import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 
 from robot.deploy.onnx_policy import OnnxPolicy  # noqa: E402
+from robot.train.dagger import LEAST_SPREAD, act  # noqa: E402
 from robot.train.export import MOST_BYTES, ExportError, export  # noqa: E402
 from robot.train.network import CLIP, FeatureLayers, PolicyNetwork  # noqa: E402
 from robot.train.run_folder import RunError, RunFolder  # noqa: E402
 from robot.train.train import begin, environments, export_policy, new_actor, train  # noqa: E402
+from tacsim.config import ConfigError  # noqa: E402
+from tacsim.control.approach import NoTouch  # noqa: E402
 from tacsim.models.training import Training  # noqa: E402
+from tacsim.tasks import BadDraws, GoalOutOfReach  # noqa: E402
 from tests.robot.cli.invoked import START, environment, tacsim  # noqa: E402
 from tests.robot.train.short import training  # noqa: E402
+from tests.tacsim.gym.small import touch_nothing_slippery  # noqa: E402
 
 ALGORITHMS = ("dagger", "ppo", "sac")
 
@@ -73,6 +78,22 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end_bit_for_bit(algorithm: st
     assert len(json.loads((tmp_path / "cut/curve.json").read_text())) == 3
 
 
+def test_a_kill_right_after_the_last_checkpoint_leaves_a_whole_curve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, keep = begin(training(dagger={"rounds": 1, "epochs": 1}), tmp_path / "run"), RunFolder.keep
+
+    def kept_and_killed(*given: Any) -> None:
+        keep(*given)
+        raise Killed
+
+    monkeypatch.setattr(RunFolder, "keep", kept_and_killed)
+    with pytest.raises(Killed):
+        train(run)
+    train(run)
+    assert json.loads((run.folder / "curve.json").read_text()) == run.last()[2] != []
+
+
 def test_other_seeds_learn_something_else(tmp_path: Path) -> None:
     ends = []
     for seed in (0, 1):
@@ -92,7 +113,7 @@ def test_a_process_that_is_killed_leaves_a_run_that_goes_on(tmp_path: Path) -> N
             time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
         assert process.wait() in (-signal.SIGKILL, 0), process.stderr and process.stderr.read()
-    result = tacsim("train", "--resume", str(tmp_path / "run"))
+    result = tacsim("train", "--resume", tmp_path / "run")
     assert result.exit_code == 0, result.output
     whole = begin(training(), tmp_path / "whole")
     train(whole)
@@ -184,10 +205,10 @@ def test_the_command_trains_exports_and_goes_on(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "round 1: " in result.stdout
     assert RunFolder(run).settings.training.seed == 5
-    result = tacsim("export", "policy", str(run), "--out", str(tmp_path / "x.onnx"))
+    result = tacsim("export", "policy", str(run), "--out", tmp_path / "x.onnx")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "x.onnx").read_bytes() == (run / "policy.onnx").read_bytes()
-    result = tacsim("export", "policy", str(run), "--out", str(tmp_path / "x.onnx"))
+    result = tacsim("export", "policy", str(run), "--out", tmp_path / "x.onnx")
     assert result.exit_code == 2
     assert "exists already" in result.stderr
 
@@ -215,6 +236,60 @@ def test_what_cannot_be_is_said(
     assert result.exit_code == 2, result.output
     assert said in " ".join(result.output.split())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_bad_draw_is_told_counted_and_drawn_anew(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch_nothing_slippery(monkeypatch)
+    told: list[str] = []
+    drawn = {"draws": 12, "values": {"scene.friction.upper": {"choice": [0.4, 0.6]}}}
+    run = begin(training(randomise=drawn, algorithm=algorithm), tmp_path / "run")
+    assert train(run, warn=told.append).exists()
+    assert told == ["drawn anew: scene.friction.upper=0.6: nothing there"]
+    assert sum(row["refused"] for row in run.last()[2]) >= 1
+
+
+def test_too_many_bad_draws_end_a_training_and_keep_what_was_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = begin(training(), tmp_path / "run")
+
+    def none(*given: Any) -> Any:
+        raise NoTouch("nothing there")
+
+    def then_none(words: str, done: int, of: int) -> None:
+        if "round 2" in words:
+            monkeypatch.setattr("tacsim.sim.reset.SimReset.touch", none)
+
+    with pytest.raises(BadDraws, match=r"8 draws in a row cannot begin .*nothing there"):
+        train(run, then_none)
+    assert run.last()[0] == 1
+    assert export_policy(run, tmp_path / "kept.onnx") <= 1e-5
+    result = tacsim("train", "--resume", str(run.folder))
+    assert result.exit_code == 2 and "nothing there" in result.output, result.output
+    assert f"tacsim export policy {run.folder}" in result.output.replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "said"),
+    [
+        # the one draw can be: 2.7 mm, 3.1 mm high, 0.45; an end of its range cannot
+        ({"task.goal": {"uniform": ["1 mm", "3.5 mm"]}},
+         GoalOutOfReach, r"a limit: task.goal=3.5 mm: .*above the body"),
+        ({"scene.body.geometry.size": {"uniform": [["3 mm", "3 mm", "1.5 mm"], ["3.5 mm", "3.5 mm", "4 mm"]]}},
+         GoalOutOfReach, r"a limit: scene.body.geometry.size=\[3 mm, 3 mm, 1.5 mm\]: task.goal: 2 mm is above"),
+        ({"scene.friction.upper": {"uniform": [-0.1, 0.6]}},
+         ConfigError, r"(?s)friction.upper.*a limit: scene.friction"),
+    ],
+)  # fmt: skip
+def test_ranges_whose_ends_cannot_be_are_refused_before_a_training_begins(
+    values: dict[str, Any], error: type[Exception], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=said):
+        begin(training(randomise={"draws": 1, "seed": 3, "values": values}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def other_format(folder: Path) -> None:
@@ -271,6 +346,21 @@ def test_a_run_that_cannot_go_on_says_why(spoil: Any, said: str, done: Path, tmp
     assert said in " ".join(result.output.split())
     assert "unexpected" not in result.output
     assert not (folder / "ran").exists()
+
+
+def test_a_round_tells_how_far_off_the_student_is_before_it_learns_what_it_met(tmp_path: Path) -> None:
+    """A student whose steps of learning are nothing: the loss before a round is that of its last network."""
+    run = begin(training(dagger={"rounds": 3, "epochs": 1, "rate": 1e-12}), tmp_path / "run")
+    curve = []
+    train(run, say=lambda figures: curve.append(dict(figures)))
+    assert "unmet_loss" not in curve[0]  # in the first round the teacher acts
+    met = [dict(np.load(run.folder / f"round-{number:03d}.npz")) for number in range(3)]
+    actor = new_actor(run)
+    actor.load_state_dict(run.last()[1]["actor"])
+    for number in (1, 2):
+        wanted = np.concatenate([each["action"] for each in met[: number + 1]])
+        off = (act(actor, met[number]) - met[number]["action"]) / wanted.std(axis=0).clip(min=LEAST_SPREAD)
+        assert curve[number]["unmet_loss"] == pytest.approx(float(np.square(off).mean()), rel=1e-4)
 
 
 @pytest.fixture(scope="module")

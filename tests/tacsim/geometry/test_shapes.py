@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -106,16 +107,49 @@ def test_the_nearest_number_of_layers_is_taken() -> None:
         (
             Box(size=(1.3 * MM, 4 * MM, 4 * MM)),
             1 * MM,
-            r"1\.3 mm along x, but 1 layers .* 1 mm \(-23%, limit 10%\); use",
+            r"only 1\.3 mm along x, 1\.3 layers .* 1 mm apart; a body needs 3: choose a particle_spacing of 0\.4333 mm",
         ),
-        (Box(size=(4 * MM, 4 * MM, 0.4 * MM)), 1 * MM, r"only 0\.4 mm along z: no particle fits at a spacing of 1 mm"),
-        (Sphere(radius=0.1 * MM), 1 * MM, "no particle fits"),
+        (
+            Box(size=(4 * MM, 3.4 * MM, 4 * MM)),
+            1 * MM,
+            r"3\.4 mm along y, but 3 layers .* make 3 mm \(-12%, limit 10%\): choose a particle_spacing of 0\.85 mm",
+        ),
+        (Sphere(radius=0.1 * MM), 1 * MM, r"0\.2 layers .* particle_spacing of 0\.06667 mm, or a size .* times 1 mm"),
+        (Box(size=(0.1, 0.1, 0.1 * MM)), 1 * MM, r"0\.1 layers .* needs 3: choose a size"),  # finer: 27 million
         (Box(), 0.01 * MM, r"1,000,000,000 particles .* the limit is 5,000,000: use a larger spacing"),
     ],
 )
 def test_impossible_spacing_is_refused_with_advice(geometry: Shape, spacing: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         particles(geometry, spacing)
+
+
+@pytest.mark.parametrize("layers", [0.3, 1.0, 1.7, 2.0, 2.4, 2.5, 3.4, 4.49])
+@pytest.mark.parametrize("kind", ["box", "long box", "cylinder", "sphere", "mesh"])
+def test_the_advice_for_thin_bodies_works_when_it_is_followed(kind: str, layers: float, tmp_path: Path) -> None:
+    """The first spacing that is advised, and the thickness."""
+    spacing = 0.5 * MM
+
+    def shape(thickness: float) -> Shape:
+        match kind:
+            case "sphere":
+                return Sphere(radius=thickness / 2)
+            case "cylinder":
+                return Cylinder(radius=2 * MM, height=thickness)
+            case "mesh":
+                return stl(tmp_path, trimesh.creation.box((4, 3, thickness / MM)))
+        return Box(size=(4 * MM, (1.17 if kind == "long box" else 3) * max(thickness, MM), thickness))
+
+    thin = shape(layers * spacing)
+    with pytest.raises(ValueError, match="choose a particle_spacing of") as refused:
+        particles(thin, spacing)
+    advised = re.search(r"particle_spacing of ([\d.]+) mm, .* times ([\d.]+) mm, at least (\d)", str(refused.value))
+    assert advised is not None
+    found = particles(thin, float(advised[1]) * MM)
+    assert len(np.unique(np.round(found[:, 2] / MM, 9))) >= 3
+    assert float(advised[2]) * MM == pytest.approx(spacing)
+    if kind != "long box":
+        assert len(np.unique(np.round(particles(shape(int(advised[3]) * spacing), spacing)[:, 2] / MM, 9))) == 3
 
 
 def test_walls_thinner_than_the_spacing_are_refused(tmp_path: Path) -> None:

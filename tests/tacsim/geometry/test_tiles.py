@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from tacsim.geometry import tiles
 from tacsim.geometry.mesh import fingerprint, signed_distance_on_grid
 from tacsim.geometry.shapes import BAND, distance
-from tacsim.geometry.tiles import TILE, TiledDistance, tiled_distance
+from tacsim.geometry.tiles import TILE, TiledDistance, share_tiles, tiled_distance
 from tacsim.models.scene import Mesh
 
 SPACING = 0.1e-3
@@ -84,3 +85,58 @@ def test_the_latest_tiles_of_all_meshes_are_kept_and_others_are_laid_again_alike
 def test_a_grid_beyond_memory_is_refused(tiled: TiledDistance) -> None:
     with pytest.raises(ValueError, match=r"box\.stl: a grid of 3200 x 3200 x 3200 nodes 0\.1 mm apart .* 20,000,000"):
         tiled.values(np.zeros(3, int), np.full(3, 100))
+
+
+def test_a_tile_that_another_process_has_left_is_not_computed_again(
+    mesh: Mesh, tiled: TiledDistance, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    first, end = np.array([0, 0, 0]), np.array([2, 2, 1])
+    expected = tiled.values(first, end)
+    laid: list[int] = []
+    monkeypatch.setattr(tiles, "signed_distance_on_grid", lambda *a: (laid.append(1), signed_distance_on_grid(*a))[1])
+
+    def lays(of: TiledDistance = tiled) -> int:
+        monkeypatch.setattr(tiles, "_kept", {})  # as a process that begins
+        laid.clear()
+        assert np.array_equal(of.values(first, end), expected) or of is not tiled
+        return len(laid)
+
+    share_tiles(tmp_path / "shared")
+    try:
+        assert lays() == 4  # a folder that is not there costs time alone
+        (tmp_path / "shared").mkdir()
+        assert (lays(), lays()) == (4, 0)
+        elsewhere = tmp_path / "again.stl"
+        elsewhere.write_bytes(Path(mesh.path).read_bytes())
+        assert lays(tiled_distance(mesh.model_copy(update={"path": str(elsewhere)}), SPACING)) == 0
+        assert lays(tiled_distance(mesh.model_copy(update={"scale": 0.9e-3}), SPACING)) == 4
+        files = sorted((tmp_path / "shared").iterdir())
+        files[0].write_bytes(files[0].read_bytes()[:-1])  # cut short
+        monkeypatch.setattr(tiles, "SHARED", 8)
+        lays(), lays(tiled_distance(mesh.model_copy(update={"scale": 0.8e-3}), SPACING))
+        assert len(list((tmp_path / "shared").iterdir())) == 8
+    finally:
+        share_tiles(None)
+    assert lays() == 4
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0), (0, 90, 0), (0, 0, 30), (20, 10, 40), (4, -7, 0)])
+def test_the_lowest_point_over_a_rectangle_is_that_of_the_edges_there(
+    turn: tuple[float, float, float], tiled: TiledDistance, mesh: Mesh
+) -> None:
+    """By points along all edges; of a level edge it is the middle of what is over the rectangle."""
+    axes, place, half = Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), np.array([1e-3, 0, 4e-3]), 2.5e-3
+    found = tiled.lowest(axes, place, np.full(2, half))
+    assert found is not None
+    at = tiled.vertices @ axes.T + place
+    triangles = at[tiled._faces]
+    share = np.linspace(0, 1, 4001)[:, None, None]
+    points = np.concatenate(
+        [a + share * (b - a) for a, b in ((triangles[:, i], triangles[:, i - 1]) for i in range(3))]
+    )
+    points = points.reshape(-1, 3)
+    over = points[(np.abs(points[:, :2]) <= half).all(axis=1)]
+    assert found[2] == pytest.approx(over[:, 2].min(), abs=3e-6)
+    assert (np.abs(found[:2]) <= half + 1e-12).all()
+    assert abs(distance(mesh, ((found - place) @ axes)[None])[0]) < 1e-9
+    assert tiled.lowest(axes, place + [0.1, 0, 0], np.full(2, half)) is None

@@ -6,8 +6,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 
 import tacsim.gym.env  # registers
+import tacsim.sim.reset as resets
+from tacsim.control.approach import NoTouch
 
 SMALL = (
     *(f"sensors.{name}.model.geometry.{what}" for name in ("lower", "upper") for what in ("width=20", "height=16")),
@@ -33,6 +36,18 @@ def make(**options: Any) -> Any:
 def make_native(number: int, mode: str = "NextStep", **options: Any) -> Any:
     options = {"overrides": SMALL, "variants": VARIANTS, **options}
     return gymnasium.make_vec(NAME, number, autoreset_mode=mode, **options)
+
+
+def touch_nothing_slippery(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No gentle contact is found where the upper friction is above 0.5."""
+    found = resets.approach_force
+
+    def some(world: Any, touch_force: float) -> Any:
+        if world.scene.friction["upper"] > 0.5:
+            raise NoTouch("nothing there")
+        return found(world, touch_force)
+
+    monkeypatch.setattr(resets, "approach_force", some)
 
 
 def assert_equal(a: Any, b: Any, at: str = "") -> None:

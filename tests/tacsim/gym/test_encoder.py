@@ -179,6 +179,17 @@ def test_pressure_is_where_the_force_acts_since_reset() -> None:
     assert asked(pressed(2.5e-3, -2e-3, -1.0))["touch"] == pytest.approx([0.2, 0, 0, 0], abs=1e-7)
 
 
+def test_stepped_is_the_way_since_the_last_observation_along_the_axes_of_the_sensor_at_reset() -> None:
+    asked = encoder(touch=("stepped",), arms=("upper",))
+    assert asked.inputs["touch"].names == ("stepped_x_upper", "stepped_y_upper", "stepped_z_upper")
+    assert asked.begin(observation(z=10e-3))["touch"].tolist() == [0.0] * 3
+    down = asked(observation(z=9.5e-3))["touch"]
+    assert down == pytest.approx([0, 0, 1.0], abs=1e-5)  # of 0.5 mm, by a sensor that faces down
+    assert asked(observation(z=9.5e-3))["touch"] == pytest.approx([0, 0, 0], abs=1e-5)
+    asked.begin(observation(z=8e-3))
+    assert asked(observation(z=8.5e-3))["touch"] == pytest.approx([0, 0, -1.0], abs=1e-5)  # a new episode
+
+
 def test_without_contact_nothing_is_felt_and_all_is_finite() -> None:
     flat = np.zeros((8, 12), np.float32)
     seen = observation(height=flat, contact=flat > 0)

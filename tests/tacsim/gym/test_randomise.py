@@ -10,7 +10,8 @@ import pytest
 from tacsim.config import ConfigError, load_rig, names
 from tacsim.config.load import load
 from tacsim.models.randomisation import Randomisation
-from tests.tacsim.gym.small import assert_equal, make
+from tacsim.tasks import BadDraws, GoalOutOfReach
+from tests.tacsim.gym.small import assert_equal, make, make_native, touch_nothing_slippery
 
 DRAWN: dict[str, Any] = {
     "draws": 3,
@@ -64,3 +65,48 @@ def test_every_shipped_one_fits_its_task(name: str) -> None:
         rig = "mock" if name.endswith("-twin") else "sim"
         task = name.removesuffix("-twin")
         assert load_rig(rig, task=task, overrides=overrides).config.scene is not None
+
+
+# Of 12 draws some ask for a goal above the body (3 mm), and cannot begin.
+SOME_BAD = {"draws": 12, "values": {"task.goal": {"choice": ["2 mm", "2.2 mm", "3.3 mm"]}}}
+
+
+def test_a_draw_that_cannot_begin_is_told_and_drawn_anew() -> None:
+    env, began = make(variants=(), randomise=SOME_BAD), {}
+    for seed in range(12):
+        flat, info = env.reset(seed=seed)
+        assert info["distance"] < 1e-3 and "3.3" not in info["drawn"]
+        began[seed] = flat, info["drawn"], info.get("refused", "")
+    told = [refused for *_, refused in began.values() if refused]
+    assert told and all("task.goal=3.3 mm: task.goal: 3.3 mm is above the body" in each for each in told)
+    assert len(env.refused) == sum(each.count("above the body") for each in told)
+    for seed in reversed(range(12)):  # an episode is its seed's, whatever was refused before it
+        flat, info = env.reset(seed=seed)
+        assert_equal(flat, began[seed][0])
+        assert (info["drawn"], info.get("refused", "")) == began[seed][1:]
+    bad = next(number for number, goal in enumerate(Randomisation(**SOME_BAD).drawn()) if "3.3" in goal[0])
+    with pytest.raises(GoalOutOfReach):  # a variant that somebody chose is played or not
+        env.reset(options={"variant": bad})
+
+
+def test_bad_draws_end_nothing_in_a_batch() -> None:
+    envs = make_native(3, "SameStep", variants=(), randomise=SOME_BAD)
+    envs.reset(seed=0)
+    for _ in range(12):  # four episodes of each
+        envs.step(np.tile(PUSH, (3, 1)))
+    assert any(env.refused for env in envs.members)
+    envs.close()
+
+
+def test_too_many_bad_draws_in_a_row_are_an_error() -> None:
+    all_bad = {"draws": 4, "values": {"task.goal": {"uniform": ["3.2 mm", "3.4 mm"]}}}
+    env = make(variants=(), randomise=all_bad)
+    with pytest.raises(BadDraws, match=r"8 draws in a row .*task.goal=3\.\d+ mm: .*above the body.*narrow"):
+        env.reset(seed=0)
+
+
+def test_so_is_one_that_finds_no_gentle_contact(monkeypatch: pytest.MonkeyPatch) -> None:
+    touch_nothing_slippery(monkeypatch)
+    env = make(variants=(), randomise={"draws": 8, "values": {"scene.friction.upper": {"choice": [0.4, 0.6]}}})
+    drawn = [env.reset(seed=seed)[1]["drawn"] for seed in range(8)]
+    assert set(drawn) == {"scene.friction.upper=0.4"} and env.refused[0] == "scene.friction.upper=0.6: nothing there"

@@ -4,6 +4,8 @@ from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 
 from tacsim.models.photometric import (
+    DEPTH_TERMS,
+    DepthColour,
     PhotometricLight,
     PhotometricModel,
     clipped,
@@ -78,23 +80,6 @@ def test_the_renderer_uses_it_in_place_of_the_lights() -> None:
     assert phong.beyond == 0.0
 
 
-@pytest.mark.parametrize("width", [640, 320, 100])
-def test_the_picture_is_the_polynomial_at_every_pixel(width: int) -> None:
-    """Colours are computed where the surface has its table, not pixel by pixel."""
-    geometry = SensorGeometry(width=width, height=3 * width // 4, pixel_pitch=20e-3 / width)
-    calibrated = model(5, 2)
-    sensor = SensorModel(geometry=geometry, photometric=calibrated, texture=0.0)
-    surface = dent(slide=(0.3e-3, -0.2e-3))
-    seen = Renderer(sensor, GEL)(surface)
-    slopes = sample_surface(surface, image_grid(geometry)).gradient
-    base = np.array([0.42, 0.44, 0.46])
-    change, _ = PhotometricLight(calibrated).change(slopes, *places_in_image(width, 3 * width // 4))
-    wanted = 255.0 * np.clip(base + base * change, 0.0, 1.0)
-    assert np.abs(255.0 * base - wanted).max() > 20.0
-    assert np.abs(seen - wanted).max() < 1.5
-    assert np.abs(seen - wanted).mean() < 0.3  # rounding alone gives 0.25
-
-
 @pytest.mark.parametrize(("width", "spacing"), [(640, 1e-3), (640, 0.5e-3), (320, 0.5e-3), (160, 0.5e-3)])
 def test_light_is_within_half_a_grey_level_of_the_formula(width: int, spacing: float) -> None:
     """Of the polynomial written out term by term at every pixel in double precision, then blurred."""
@@ -144,3 +129,22 @@ def test_wrong_models_are_refused() -> None:
         PhotometricModel(degree=3, position=0, weights=((0.0, 0.0, 0.0),) * 3, steepest=1.0)
     with pytest.raises(ValidationError, match=r"needs lighting\.background"):
         SensorModel(photometric=model(1, 0), lighting=Lighting(background=None))
+
+
+def test_flat_gel_that_is_pressed_in_has_the_colour_of_its_depth() -> None:
+    """Closed form: a surface pressed in evenly, which has no slope, at three depths; beyond the deepest as there."""
+    weights = np.zeros((DEPTH_TERMS, 3))
+    weights[0], weights[1], weights[4] = (-0.2, 0.1, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, 0.1)  # w, w u, w^3
+    depth = DepthColour(deepest=1e-3 / (320 * 0.06e-3), weights=tuple(map(tuple, weights.tolist())))
+    light = model(3, 2).model_copy(update={"depth": depth})
+    geometry = SensorGeometry(width=320, height=240, pixel_pitch=0.06e-3)
+    render = Renderer(
+        SensorModel(geometry=geometry, lighting=Lighting(background=(0.5, 0.5, 0.5)), photometric=light, texture=0.0),
+        GEL,
+    )
+    u, _ = places_in_image(320, 240)
+    for millimetres in (0.0, 0.5, 1.0, 1.6):
+        pressed = make_surface(lambda x, y, h=millimetres: (x * 0, x * 0, x * 0 - h * 1e-3))
+        w = min(millimetres, 1.0)
+        wanted = 127.5 * (1 + np.stack([-0.2 * w + 0.1 * w * u, 0.1 * w + 0 * u, 0.1 * w**3 + 0 * u], axis=-1))
+        assert np.abs(render(pressed) - wanted).max() <= 0.6

@@ -54,6 +54,16 @@ def test_units_and_lists_come_through_and_each_element_is_drawn_by_itself() -> N
     assert Distribution(log_uniform=("1e-3 MPa", "2e-3 MPa")).draw(np.random.default_rng(0)).endswith(" MPa")
 
 
+@pytest.mark.parametrize("kind", ["uniform", "log_uniform"])
+def test_an_element_whose_bounds_are_one_number_is_that_number(kind: str) -> None:
+    """An error of poses aside, but not along z; a size of which one side stays."""
+    made = Distribution.model_validate({kind: (("1 mm", "2 mm"), ("4 mm", "2 mm"))})
+    first, second = made.draw(np.random.default_rng(0)).strip("[]").split(", ")
+    assert 1.0 < float(first.split()[0]) < 4.0
+    assert second == "2 mm"
+    assert made.ends() == ["[1 mm, 2 mm]", "[4 mm, 2 mm]"]
+
+
 def test_a_draw_depends_on_seed_number_and_key_alone() -> None:
     values = {"a.b": Distribution(uniform=(0.0, 1.0)), "c": Distribution(uniform=(0.0, 1.0))}
     one = Randomisation(draws=5, values=values).drawn()

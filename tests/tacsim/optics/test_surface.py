@@ -69,12 +69,14 @@ def test_stretch_beyond_the_fixed_point_is_still_exact() -> None:
     np.testing.assert_allclose(sample.gradient[..., 0], 0.02 / 2.5, rtol=1e-3)
 
 
-def test_fold_is_refused() -> None:
+def test_newton_finds_no_single_point_in_a_fold() -> None:
+    """The sheets of a folded surface are tested in test_fold.py."""
+
     def displace(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return -1.5 * (x - 2e-3) * np.exp(-(((x - 2e-3) ** 2 + y**2) / 2e-6)), 0 * x, 0 * x
 
     with pytest.raises(SurfaceFolded, match=r"folds over at \d+ points, first at x = .* mm"):
-        sample_surface(make_surface(displace), IMAGE)
+        material_points(make_surface(displace), IMAGE.points().reshape(-1, 2))
 
 
 def test_beyond_the_gel_nothing_is_seen() -> None:

@@ -33,7 +33,11 @@ def random_packages(rng: np.random.Generator, count: int, time: float) -> ArmPac
 
 
 def random_step(
-    index: int, image: tuple[int, int] = (24, 32), grid: tuple[int, int] = (6, 5), packages: bool = False
+    index: int,
+    image: tuple[int, int] = (24, 32),
+    grid: tuple[int, int] = (6, 5),
+    packages: bool = False,
+    body: bool = False,
 ) -> Step:
     """Sensor "lower" with everything, "upper" without flow, "side" without a surface; arms with and without joints."""
     rng = np.random.default_rng(index)
@@ -60,6 +64,7 @@ def random_step(
         info={"residual": float(rng.normal()), "worst": float("nan"), "most": float("inf"), "hits": 1.0},
         seconds=float(rng.uniform()),
         packages={"upper": random_packages(rng, 3 * index, time)} if packages else {},
+        body=rng.normal(size=(40 + index, 3)).astype(np.float32) if body else None,
     )
 
 

@@ -62,6 +62,18 @@ def test_episode_comes_back_bit_for_bit(tmp_path: Path, meta: EpisodeMeta, make_
     assert all(same(a, b) for a, b in zip(iter_steps(tmp_path / "e.mcap"), steps, strict=True))
 
 
+def test_particles_of_a_body_come_back_bit_for_bit(
+    tmp_path: Path, meta: EpisodeMeta, make_step: Callable[..., Step]
+) -> None:
+    steps = [make_step(k, body=k != 1) for k in range(3)]
+    record(tmp_path / "e.mcap", meta, steps)
+    episode = read_episode(tmp_path / "e.mcap")
+    assert all(same(read, written) for read, written in zip(episode.steps, steps, strict=True))
+    assert episode.steps[1].body is None
+    with pytest.raises(ValueError, match=r"must be \(n, 3\) float32, got \(4, 2\) float32"):
+        messages.encode_step(replace(steps[0], body=np.zeros((4, 2), np.float32)), 1e-3)
+
+
 @pytest.mark.parametrize("goal", [None, 7e-3, (0.1, 0.2, 0.3)])
 def test_facts_that_may_be_missing(tmp_path: Path, meta: EpisodeMeta, goal: float | tuple[float, ...] | None) -> None:
     config = replace(meta, goal=goal, task=None, attachments={}, versions={})

@@ -28,6 +28,7 @@ DRAWN = {
     "/upper/transform": "Transform3D:translation",
     "/lower/arm": "tacsim.Arm:message",
     "/upper/arm": "tacsim.Arm:message",
+    "/body": "Points3D:positions",
     "/upper/packages": "tacsim.ArmPackage:message",
     "/step": "tacsim.Step:message",
     **{f"/step/{name}": "tacsim.Scalar:message" for name in ("residual", "worst", "most", "hits")},
@@ -42,7 +43,7 @@ def test_every_topic_decodes(tmp_path: Path, meta: EpisodeMeta, make_step: Calla
 
     with Recorder(tmp_path / "e.mcap", meta) as recorder:
         for k in range(3):
-            assert recorder.write(make_step(k, packages=True)) and recorder.flush()
+            assert recorder.write(make_step(k, packages=True, body=True)) and recorder.flush()
     found: dict[str, dict[str, str]] = {}
     for chunk in McapReader(str(tmp_path / "e.mcap")).stream():
         columns = found.setdefault(str(chunk.entity_path), {})

@@ -142,6 +142,6 @@ def main(host: str, name: str) -> None:
 
 
 if __name__ == "__main__":
-    from tests.robot.mock.ur import cases, control_cases, other_cases  # noqa: F401  # they enter CASES
+    from tests.robot.mock.ur import arm_cases, cases, control_cases, other_cases  # noqa: F401  # they enter CASES
 
     cases.main(*sys.argv[1:])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from robot.mock import MockUR
-from tests.robot.mock.ur import control_cases, other_cases  # noqa: F401  # they enter CASES
+from tests.robot.mock.ur import arm_cases, control_cases, other_cases  # noqa: F401  # they enter CASES
 from tests.robot.mock.ur.cases import CASES, CLASSES, Verdict
 from tests.robot.mock.wire_client import wire_host
 
@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[4]
 PAGE = ROOT / "docs" / "mock.md"
 BEGIN, END = "<!-- calls of ur_rtde: written by tests/robot/mock/ur/test_calls.py -->\n", "<!-- end of calls -->"
 LIMIT = 120.0  # of one client process [s]
+QUICK = {"servo", "speeds", "questions", "motion", "load", "dashboard_commands", "dynamics", "refused_connections"}
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("rtde_control") is None, reason="ur_rtde has no wheel for this Python"
@@ -68,8 +69,9 @@ def called() -> Iterator[MockUR]:
         yield mock
 
 
-@pytest.mark.deep
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.deep) for name in CASES]
+)
 def test_call(called: MockUR, name: str) -> None:
     command = [sys.executable, "-m", "tests.robot.mock.ur.cases", called.host, name]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT, check=False)

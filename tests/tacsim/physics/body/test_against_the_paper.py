@@ -40,7 +40,7 @@ def scatter(
         env = ti.static(Environment(0, params, counts, partial))
         body = ti.static(Body(particles, masses, velocities))
         clear_masses(env, part, body)
-        particles_to_grid(env, part, body)
+        particles_to_grid(env, part, 0, body)
 
 
 @ti.kernel
@@ -52,7 +52,7 @@ def update(
     for part in range(PARTS):
         env = ti.static(Environment(0, params, counts, partial))
         body = ti.static(Body(particles, masses, velocities, changes))
-        grid_changes(env, part, 0, body)
+        grid_changes(env, part, body)
         grid_update(env, part, 0, drive, body)
 
 

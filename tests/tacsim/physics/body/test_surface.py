@@ -88,10 +88,12 @@ def squeezed(geometry: Box | Sphere, sampling: str, by: float) -> HybridWorld:
 
 
 @pytest.mark.parametrize(
-    ("geometry", "sampling", "limit"), [(CUBE, "lattice", 5 * UM), (CUBE, "random", 10 * UM), (BALL, "lattice", 7 * UM)]
+    ("geometry", "sampling", "limit"),
+    [(CUBE, "lattice", 5 * UM), (CUBE, "random", 10 * UM), (BALL, "lattice", 12 * UM)],
 )
 def test_the_print_does_not_show_the_particles(geometry: Box | Sphere, sampling: str, limit: float) -> None:
-    """With one radius for all particles these print 3, 50 and 70 um."""
+    """With one radius for all particles these print 3, 50 and 70 um. A ball's print is not flat itself: pressed at Mach
+    0.005 to a tolerance of 5e-4 it has 9.4 to 10.6 um."""
     world = squeezed(geometry, sampling, 2e-3)
     for name in world.sensors:
         assert print_roughness(world.surface(name)) < limit

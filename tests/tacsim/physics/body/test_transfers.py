@@ -10,7 +10,9 @@ from benchmarks.truth.clay import COURANT
 from tacsim.geometry.sampling import body_points
 from tacsim.models.scene import Body, BodyMaterial, Box
 from tacsim.physics.body.material import ELASTIC
-from tacsim.physics.body.plasticine import BodyParams, body_params
+from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, body_params
+from tacsim.physics.exec import layout
+from tacsim.physics.exec.lanes import NODES
 
 pytestmark = pytest.mark.cpu
 
@@ -106,3 +108,34 @@ def test_a_new_reference_changes_neither_state_nor_motion() -> None:
     c = body.state.c()
     assert c + c.swapaxes(1, 2) == pytest.approx(straining + straining.swapaxes(1, 2), abs=1e-6)
     assert c - c.swapaxes(1, 2) == pytest.approx(spinning - spinning.swapaxes(1, 2), abs=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 18, 19, 20, 21])  # 19: stencils end just where the grid does
+def test_the_grid_ends_where_nothing_has_mass(count: int) -> None:
+    """The filter of the accelerations takes it that nodes at the border have none; parts write into their slabs."""
+    params = body_params(ELASTIC_BODY, 0.5e-3)
+    line = params.spacing * (np.arange(count) + 0.1)
+    points = np.stack(np.meshgrid(line, line[:3], line, indexing="ij"), axis=-1).reshape(-1, 3)
+    body = BodyBlock(params, points, COURANT * params.cell)
+    body.fit(STENCIL_REACH * params.cell)
+    body.advance(1)  # raises for what is outside a slab
+    shape = tuple(body.counts[0, layout.GRID : layout.GRID + 3])
+    mass = np.zeros(shape)
+    for part, copy in enumerate(body.state.masses[0]):
+        low, high = body.counts[0, layout.SLAB + 2 * part : layout.SLAB + 2 * part + 2]
+        mass[low:high] += copy[: np.prod(shape) // NODES, 3::4].reshape(shape)[low:high]
+    assert mass.sum() == pytest.approx(len(points) * params.particle_mass, rel=1e-5)
+    assert mass[1:-1, 1:-1, 1:-1].sum() == mass.sum()
+    assert mass[2:-2].sum(axis=(1, 2)).all()  # and no plane is there in vain but one that rounding may need
+
+
+def test_what_is_known_of_the_places_on_the_grid_follows_them() -> None:
+    """Whoever has moved one: a launch asks anew."""
+    body = block(body_params(ELASTIC_BODY, 0.5e-3), 0.5e-3).state
+    before = body.laid(0)
+    assert body.laid(0) is before
+    body.reference(0)[3] += [1.0, 0.0, -2.0]
+    assert not np.array_equal(body.extents(0), before.extents)
+    np.testing.assert_allclose(
+        body.laid(0).centre - before.centre, np.array([1.0, 0.0, -2.0]) / len(body.x(0)), atol=1e-6
+    )

@@ -50,28 +50,30 @@ def test_one_of_three_moves_with_any_team(moving: int, size: int, monkeypatch: p
 
 
 @pytest.mark.parametrize(
-    ("taken", "done", "expected"),
+    ("taken", "done", "own", "expected"),
     [
-        (1, 0, 1),  # the first stage has begun
-        (PARTS, PARTS, PARTS),  # the first piece of the second stage
-        (PARTS, PARTS - 1, 2 * PARTS),  # another member has the last piece of the first, for too long: leave
-        (2 * PARTS, 2 * PARTS - 1, 2 * PARTS),  # nothing is left
+        ([1, 0, 0, 0], 0, 0, 1),  # the first stage has begun
+        ([1, 0, 0, 0], 0, 2, 2),  # own parts first
+        ([1, 0, 1, 1], 2, 2, 1),  # then what others have left
+        ([1, 1, 1, 1], PARTS, 2, PARTS + 2),  # the second stage
+        ([1, 1, 1, 1], PARTS - 1, 0, 2 * PARTS),  # another member has the last piece of the first, too long: leave
+        ([2, 2, 2, 2], 2 * PARTS - 1, 0, 2 * PARTS),  # nothing is left
     ],
 )
-def test_the_next_piece(taken: int, done: int, expected: int) -> None:
+def test_the_next_piece(taken: list[int], done: int, own: int, expected: int) -> None:
     sync, found = np.zeros((1, 16), np.int32), np.zeros(1, np.int32)
-    sync[0, [team.CLAIMED, team.DONE]] = taken, done
+    sync[0, team.CLAIMED : team.CLAIMED + PARTS], sync[0, team.DONE] = taken, done
     start()
-    ask(sync, found)
+    ask(sync, found, own)
     assert found[0] == expected
-    assert sync[0, team.CLAIMED] == taken + (expected < 2 * PARTS)
+    assert sync[0, team.CLAIMED : team.CLAIMED + PARTS].sum() == sum(taken) + (expected < 2 * PARTS)
 
 
 @ti.kernel
-def ask(sync: team.Sync, found: Found):
+def ask(sync: team.Sync, found: Found, own: ti.i32):
     ti.loop_config(serialize=True)
     for n in range(1):
-        found[n] = team.next_piece(sync, n, 2 * PARTS)
+        found[n] = team.next_piece(sync, n, own, 2)
 
 
 def test_teams_fit_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:

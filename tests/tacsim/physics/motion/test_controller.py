@@ -7,7 +7,15 @@ import pytest
 
 from tacsim.interface import Pose
 from tacsim.models.scene import Settling
-from tacsim.physics.motion.controller import ForceReading, move_and_settle, residual, run, still_to_come
+from tacsim.physics.motion.controller import (
+    LASTING,
+    ForceReading,
+    creep_to_come,
+    move_and_settle,
+    residual,
+    run,
+    still_to_come,
+)
 from tacsim.physics.motion.path import Path
 
 
@@ -46,3 +54,36 @@ def test_what_creeps_is_held_until_little_is_left_of_it() -> None:
 def test_what_swings_or_stands_has_nothing_still_to_come() -> None:
     assert still_to_come(reading(0.5), reading(0.51), reading(0.505)) == 0.0
     assert still_to_come(reading(0.5), reading(0.5), reading(0.5)) == 0.0
+
+
+def creeping(share: float, after: float) -> ForceReading:
+    """A force that falls with the logarithm of time, by `share` in each e-fold of it, `after` so many readings."""
+    return reading(0.5 - share * float(np.log(after)))
+
+
+@pytest.mark.parametrize("before", [1, 40])
+def test_of_a_creep_with_the_logarithm_of_time_is_told_what_is_to_come(before: int) -> None:
+    """Whenever it began: the motion alone would have it 10 readings older than the hold."""
+    held = [creeping(0.01, before + n) for n in range(1, 41)]
+    lost = 0.01 * np.log1p(LASTING / (before + 40))
+    told = creep_to_come(held, 40 + (10 if before > 10 else 1))
+    assert 0.95 * lost < told < 1.25 * lost
+
+
+def test_a_creep_that_turns_is_as_old_as_the_motion() -> None:
+    held = [reading(0.5 + 0.01 * change) for change in (0, 1, 0)]
+    assert creep_to_come(held, 20.0) == pytest.approx(0.01 * 20 * np.log1p(LASTING / 20))
+
+
+@pytest.mark.parametrize("creeps", [True, False])
+def test_what_creeps_with_the_logarithm_of_time_is_not_settled_before_its_time(creeps: bool) -> None:
+    """Each change is within the tolerance from the start, and so is what a geometric rest of them would be."""
+    path = replace(Path([Pose()], [Pose()], 0, 0.4), creeps=creeps)
+    times = iter(range(20, 1000))
+    stats = run(
+        move_and_settle(path, Settling(max_substeps=100_000), balanced=False),
+        lambda path, first, last: creeping(0.01, next(times)),
+    )
+    after = 19 + stats.hold // path.interval
+    assert stats.settled
+    assert (0.01 * np.log1p(LASTING / after) <= 1e-2) == creeps

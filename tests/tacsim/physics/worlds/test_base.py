@@ -135,7 +135,10 @@ def test_a_snapshot_that_does_not_fit_changes_nothing(world: World) -> None:
         assert state(world) == before
 
     for name, array in good.items():
-        refused(ValueError, f"'{name}' must have shape .*, found nothing", {k: a for k, a in good.items() if k != name})
+        if name != "grid_velocity":  # without it particles say how a body moves
+            refused(
+                ValueError, f"'{name}' must have shape .*, found nothing", {k: a for k, a in good.items() if k != name}
+            )
         refused(ValueError, f"'{name}' must have shape", {**good, name: np.zeros((2, *array.shape))})
         refused(ValueError, f"'{name}' must hold", {**good, name: array.astype(complex)})
     for numbers in (np.full_like(good["poses"], np.nan), np.zeros_like(good["poses"])):

@@ -1,18 +1,36 @@
 """Bodies led to and fro."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tacsim.interface import Pose
-from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Scene, lame
+from tacsim.models.scene import Body, BodyMaterial, Box, Cylinder, Preset, Scene, Settling, lame
 from tacsim.physics.failure.diagnosis import particle_volumes
+from tacsim.physics.move import MoveStats
 from tacsim.physics.worlds.hybrid import HybridWorld
 
+CYLINDER = Body(geometry=Cylinder(radius=5e-3, height=10e-3), material=BodyMaterial(yield_stress=30e3))
 CUBE = Body(geometry=Box(size=(6e-3, 6e-3, 5e-3)), material=BodyMaterial(yield_stress=30e3))
 
 
 def shifted(world: HybridWorld, by: dict[str, np.ndarray]) -> dict[str, Pose]:
     return {name: Pose(world.pose(name).position + d, world.pose(name).quaternion) for name, d in by.items()}
+
+
+def closed(world: HybridWorld, by: float) -> MoveStats:
+    """Leads the sensors of a world with CYLINDER to where they are `by` [m] nearer to one another than at first touch,
+    and settles."""
+    apart = float((world.pose("upper").position - world.pose("lower").position)[2])
+    step = np.array([0.0, 0.0, (apart - 10e-3 + by) / 2])
+    return world.move(shifted(world, {"lower": step, "upper": -step}))
+
+
+def close(world: HybridWorld, by: float) -> float:
+    """The force on the lower sensor [N] after `closed`."""
+    closed(world, by)
+    return float(-world.wrench("lower")[2])
 
 
 @pytest.mark.deep
@@ -64,20 +82,73 @@ def test_a_body_under_more_tension_than_it_can_bear_is_told() -> None:
 
 
 @pytest.mark.deep
-@pytest.mark.xfail(strict=True, reason="gel and body lag on the way there, and the body yields to it: 1.8 % are lost")
 def test_the_first_settled_cycles_take_nothing() -> None:
     """Axisymmetric finite elements (quadratic, multiplicative Hencky plasticity, implicit, h 0.5 mm) of this cylinder
-    between discs of gel, 2.0 to 2.3 mm and back: 2.934, 2.933, 2.933 N."""
-    world = HybridWorld(Scene(body=CUBE.model_copy(update={"geometry": Cylinder(radius=5e-3, height=10e-3)})))
-    lower, upper = (world.pose(name) for name in world.sensors)
-
-    def close(by: float) -> float:
-        way = np.array([0.0, 0.0, by / 2 + 0.1e-3])
-        world.move({"lower": Pose(way), "upper": Pose(upper.position - way, upper.quaternion)})
-        return -world.wrench("lower")[2]
-
-    assert not lower.position.any()
-    close(0.1e-3)
-    forces = [close(by) for by in [2.0e-3, 2.3e-3] * 12][1::2]
+    between discs of gel, 2.0 to 2.3 mm and back: 2.934, 2.933, 2.933 N. Lost are 0.9 %; with velocities that went over
+    particles in each substep it was 1.8 %."""
+    world = HybridWorld(Scene(body=CYLINDER))
+    close(world, 0.1e-3)
+    forces = [close(world, by) for by in [2.0e-3, 2.3e-3] * 12][1::2]
     assert forces[0] == pytest.approx(2.934, rel=0.03)
     assert forces[-1] == pytest.approx(forces[0], rel=0.01)
+
+
+@pytest.mark.deep
+def test_cycles_from_rest_to_rest_take_nothing() -> None:
+    """What cycles take at the default tolerance is mostly what had not come to rest when they turned: 6.5 % in twelve
+    at `learn`, before holds knew of creep. To a residual of 1e-4, what is still to come included, at half the speed,
+    0.12 % in these six, and 2.93 N, as finite elements have."""
+    settling = Settling(mach=0.02, tolerance=1e-4, max_substeps=10_000)
+    world = HybridWorld(Scene(preset="learn", body=CYLINDER, settling=settling))
+    close(world, 0.1e-3)
+    forces = [close(world, by) for by in [2.0e-3, 2.3e-3] * 6][1::2]
+    assert forces == pytest.approx([forces[0]] * 6, rel=0.005)
+
+
+def test_a_hold_is_the_same_however_it_is_cut_into_launches() -> None:
+    """Nodes of the body's grid keep their velocities from launch to launch. Taken from particles in the first substep
+    of each launch, a part of them is lost: after these 64 substeps the body has then flowed 2.6 % less in launches of
+    4, 14 % less in launches of one."""
+
+    def flowed(each: int) -> float:
+        world = HybridWorld(Scene(preset="learn", body=CYLINDER))
+        start = list(world._poses.values())
+        by = np.array([0.0, 0.0, 1.5e-3])
+        end = [Pose(pose.position + sign * by, pose.quaternion) for pose, sign in zip(start, (1, -1), strict=True)]
+        path = world.plan(start, end)
+        world._advance(path, 0, path.substeps)
+        rest, before = replace(path, start=end, substeps=0), world.snapshot()["flow"].mean()
+        for _ in range(64 // each):
+            world._advance(rest, 0, each)
+        return float(world.snapshot()["flow"].mean() - before)
+
+    assert flowed(4) == pytest.approx(flowed(64), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("preset", "by"),
+    [
+        *(("learn", by) for by in (1e-3, 2e-3, 3e-3)),
+        *(("draft", by) for by in (2e-3, 3e-3)),
+        pytest.param("standard", 3e-3, marks=pytest.mark.deep),
+    ],
+)
+def test_a_settled_force_stays_while_it_is_held(preset: Preset, by: float) -> None:
+    """A force that is settled within 1 % has 1 % to lose, however long the sensors then stand still. Held only until
+    forces hardly changed from reading to reading, learn lost 1.0, 6.3 and 9.1 % of it, draft 0.7 and 1.6 %."""
+    world = HybridWorld(Scene(preset=preset, body=CYLINDER))
+    stats = closed(world, by)
+    assert stats.settled and stats.residual <= 0.01
+    settled = -world.wrench("lower")[2]
+    mach = world.scene.peak_mach
+    world.scene = world.scene.model_copy(update={"settling": Settling(mach=mach, tolerance=1e-9, max_substeps=800)})
+    assert not world.move({}).settled
+    assert -world.wrench("lower")[2] == pytest.approx(settled, rel=0.01)
+
+
+def test_what_still_creeps_when_the_hold_must_end_is_not_settled() -> None:
+    """3 mm at `learn` come to rest in some 860 substeps of hold; after 100 they have 3 % to lose."""
+    world = HybridWorld(Scene(preset="learn", body=CYLINDER, settling=Settling(max_substeps=100)))
+    stats = closed(world, 3.0e-3)
+    assert not stats.settled
+    assert stats.residual > 0.01

@@ -117,6 +117,7 @@ def all_outcomes(folder: Path) -> dict[str, Any]:
     for name, array, entry, value in (("race", "velocity", (-1, 2), 20.0), ("invert", "gel_displacement", last, -6.0)):
         before = first.snapshot()
         first.arrays()[array][entry] += value
+        first._state.particles.forget_grid(0)  # so that what particles know counts
         here = list(first._poses.values())
         prepared = first.prepare(Launch(first.plan(here, here), 0, 1))
         first._state.advance({0: prepared.drive})

@@ -23,7 +23,8 @@ from tacsim.physics.failure import diagnosis
 from tacsim.physics.failure.health import SimulationDiverged
 from tacsim.physics.worlds.batch import Batch
 from tacsim.physics.worlds.fem import FemWorld
-from tacsim.physics.worlds.hybrid import HybridState, HybridWorld
+from tacsim.physics.worlds.hybrid import HybridWorld
+from tacsim.physics.worlds.hybrid_state import HybridState
 from tacsim.physics.worlds.press import PressWorld
 
 SECONDS = 600  # for the process; a first run compiles

@@ -95,3 +95,34 @@ def test_a_blade_that_sinks_between_the_contact_points_in_part_is_an_error(tmp_p
         SimulationDiverged, match=r"mm deep in the gel, and no contact point more than 0.* such as 0\.5 mm"
     ):
         move(w, (0, 0, -1.1e-3))
+
+
+@pytest.mark.parametrize("long", [11.0, 30.0])
+def test_a_blade_that_ends_at_the_gels_rim_or_beside_it_is_an_error_too(long: float, tmp_path: Path) -> None:
+    """A wedge of 33 degrees, 1 mm deep: elements of 1 mm give 55 % of its force with elements of 0.25 mm."""
+    import trimesh
+
+    half = long / 2
+    blade = trimesh.convex.convex_hull([(x, y, z) for x in (-half, half) for y, z in ((0, 0), (-1.5, 5), (1.5, 5))])
+    blade.export(tmp_path / "blade.stl")
+    gel = Gel(size=(12e-3, 12e-3, 4e-3))
+    w = world(Mesh(path=str(tmp_path / "blade.stl")), preset="draft", gel=gel, tolerance=1e-2)
+    with pytest.raises(SimulationDiverged, match=r"mm deep in the gel, and no contact point more than 0\.0"):
+        move(w, (0, 0, -1.1e-3))
+
+
+@pytest.mark.parametrize("size", [(30, 30, 3), (30, 2, 3)])
+def test_what_is_flat_and_wider_than_the_gel_is_none(size: tuple[float, float, float], tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.box(size).export(tmp_path / "bar.stl")
+    deep(Mesh(path=str(tmp_path / "bar.stl")), "draft", Rotation.identity(), 1e-3)
+
+
+def test_a_turned_knife_of_which_the_gel_feels_less_than_three_quarters_is_an_error() -> None:
+    """Across the mesh, 1.5 mm deep, its force is 0.34 N; with elements of 0.25 mm it is 0.58 N."""
+    w = world(Box(size=(0.3e-3, 6e-3, 5e-3)), preset="standard", gel=Gel(size=(12e-3, 12e-3, 4e-3)), tolerance=1e-2)
+    turn = Rotation.from_euler("z", 30, degrees=True).as_quat()
+    w.move({"indenter": Pose(np.array([0, 0, 2.6e-3]), turn)})
+    with pytest.raises(SimulationDiverged, match=r"mm deep in the gel, and no contact point more than 0\.1"):
+        w.move({"indenter": Pose(np.array([0, 0, 1.0e-3]), turn)})

@@ -8,11 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from tacsim.interface import Pose
 from tacsim.models.scene import Body, BodyMaterial, Box, Gel, Scene
-from tacsim.physics.contact.gel_overlap import gel_overlap
 from tacsim.physics.exec.layout import HOUSING_FORCE
 from tacsim.physics.failure.health import SimulationDiverged
-from tacsim.physics.gel.gel import gel_params
-from tacsim.physics.worlds import hybrid
+from tacsim.physics.worlds import hybrid, hybrid_kernels
 from tacsim.physics.worlds.hybrid import HybridWorld
 
 CLAY = BodyMaterial(yield_stress=30e3)
@@ -90,16 +88,16 @@ def test_short_squeezes_end_where_slow_ones_do(by: float) -> None:
     assert -fast.wrench("lower")[2] == pytest.approx(-slow.wrench("lower")[2], rel=0.01)
 
 
-def test_a_smaller_tolerance_makes_the_whole_path_more_exact() -> None:
-    """60 % of a 5 mm cube, where the speed costs most; the slow limit is 2.588 N at Mach 0.001."""
+def test_a_deep_squeeze_ends_near_the_slow_limit() -> None:
+    """60 % of a 5 mm cube, where the speed costs most; the slow limit is 2.496 N, at Mach 0.001 to a residual of 3e-5.
+    With velocities that go over particles in each substep it was 2.504, and these ended at 2.645 and 2.564."""
     forces = []
     for tolerance in (1e-2, 2e-3):
         w = world(settling={"tolerance": tolerance, "max_substeps": 100_000})
         for by in (2 * hybrid.CLEARANCE + 0.1e-3, 3e-3):
             assert w.move({**shift(w, "lower", (0, 0, by / 2)), **shift(w, "upper", (0, 0, -by / 2))}).settled
         forces.append(-w.wrench("lower")[2])
-    assert forces == pytest.approx([2.588, 2.588], rel=0.08)
-    assert abs(forces[1] - 2.588) < 0.5 * abs(forces[0] - 2.588)
+    assert forces == pytest.approx([2.496, 2.496], rel=0.025)
 
 
 def test_a_twisted_body_turns_as_far_as_in_the_slow_limit_and_soon_rests() -> None:
@@ -147,7 +145,9 @@ def test_a_body_without_yield_answers_like_one_that_never_reaches_it() -> None:
     states, forces = [], []
     for material in (BodyMaterial(), BodyMaterial(yield_stress=1e12)):
         w = world(CUBE.model_copy(update={"material": material}))
-        w.yields = True  # else the first is driven faster
+        w.yields = True  # else the first is driven faster, and damped more while it is held
+        w._scaled = w._scaled_inertia(5.0)
+        w._use_inertia(w._scaled)
         squeeze(w, 1.0e-3)
         states.append(w.snapshot())
         forces.append(w.wrench("lower")[2])
@@ -284,11 +284,13 @@ def test_bitwise_repeatable_and_restorable() -> None:
 @pytest.mark.cpu
 def test_nothing_is_recompiled_for_a_second_scene() -> None:
     world().move({})
-    compiled = len(hybrid.substeps._primal.compiled_kernels) if hasattr(hybrid.substeps, "_primal") else None
+    compiled = (
+        len(hybrid_kernels.substeps._primal.compiled_kernels) if hasattr(hybrid_kernels.substeps, "_primal") else None
+    )
     world(Body(geometry=Box(size=(4e-3, 4e-3, 4e-3)), material=CLAY)).move({})
     if compiled is None:
         pytest.skip("this Taichi does not show its compiled kernels")
-    assert len(hybrid.substeps._primal.compiled_kernels) == compiled
+    assert len(hybrid_kernels.substeps._primal.compiled_kernels) == compiled
 
 
 def test_a_nan_is_reported_and_rolled_back() -> None:
@@ -390,20 +392,3 @@ def test_gels_in_one_another_are_told_and_too_deep_refused() -> None:
         w.move(shift(w, "upper", (0, 0, -gap - 1.6e-3)))
     assert refused.value.refine == 1  # no smaller step would help
     assert all(a.tobytes() == before[name].tobytes() for name, a in w.snapshot().items())
-
-
-def test_overlap_of_gels_is_that_of_their_deformed_surfaces() -> None:
-    params = gel_params(Gel(size=(10e-3, 8e-3, 4e-3)), 1e-3)
-    tops = np.zeros((2, 11, 9, 3), np.float32)
-    turned = Rotation.from_euler("zx", [30, 180], degrees=True).as_matrix()
-    rotations = np.stack([np.eye(3), turned])
-
-    def found(x: float, z: float) -> float:
-        return gel_overlap(params, tops, rotations, np.array([[1.0, 2.0, 3.0], [1.0 + x, 2.0, 3.0 + z]]))
-
-    assert found(0.0, 0.01) == 0.0 and found(0.0, -0.3) == pytest.approx(0.3)
-    assert found(20.0, -0.3) == 0.0  # beside one another
-    tops[0, ..., 2] = -0.2
-    assert found(0.0, -0.3) == pytest.approx(0.1)
-    tops[1, 3, 4, 2] = 0.25  # a bump
-    assert found(0.0, -0.1) == pytest.approx(0.15)

@@ -183,12 +183,6 @@ def test_path_with_blend_does_not_stop_and_without_does() -> None:
     assert speeds[0.02][0] > 0.095 and speeds[0.02][1] == pytest.approx(0.02 / (2 * math.sqrt(2)), abs=2e-4)
 
 
-def test_unknown_line_in_a_path_ends_the_program() -> None:
-    bench = Bench(control_script(path=["movec(p[0,0,0,0,0,0])"]))
-    bench.call(45)
-    assert "movec" in bench.machine.stop_reason
-
-
 def test_asynchronous_word_counts_operations(bench: Bench) -> None:
     def word() -> tuple[int, bool]:
         value = bench.machine.out_int[2]
@@ -247,49 +241,12 @@ def test_commands_of_newer_controllers_do_nothing_on_older_ones() -> None:
     assert not any(bench.machine.out_double)
 
 
-def test_questions(bench: Bench) -> None:
-    arm, tcp = bench.arm, [0, 0, 0.1, 0, 0, 0]
-    flange = arm.frame.copy()
-    bench.call(29, tcp)
-    bench.call(40)
-    np.testing.assert_allclose(bench.answer, tcp, atol=1e-12)
-    bench.call(43)
-    np.testing.assert_allclose(matrix(bench.answer), flange @ matrix(tcp), atol=1e-9)
-    bench.call(58)
-    np.testing.assert_allclose(matrix(bench.answer), flange, atol=1e-9)
-    bench.call(44, [*arm.q, *tcp])
-    np.testing.assert_allclose(matrix(bench.answer), flange @ matrix(tcp), atol=1e-9)
-    bench.call(46, pose(flange @ matrix(tcp)))
-    np.testing.assert_allclose(bench.answer, arm.q, atol=1e-8)
-    bench.call(39, [0.1, 0, 0, 0, 0, math.pi / 2, 0.2, 0, 0, 0, 0, 0])
-    np.testing.assert_allclose(bench.answer, [0.1, 0.2, 0, 0, 0, math.pi / 2], atol=1e-12)
-    bench.call(37, [7.0, 0, 0, 0, 0, 0])
-    assert bench.integer == 0
-    bench.call(47)
-    assert bench.integer == 1
-    bench.call(70)
-    found = np.array([*bench.machine.out_double[:24], *bench.machine.out_double[36:48]]).reshape(6, 6).T
-    np.testing.assert_allclose(found, arm.kinematics.jacobian(arm.q, arm.tool), atol=1e-12)
-    bench.machine.load.wrench = np.array([0.0, 0, 10, 0, 0, 0])
-    bench.tick()
-    bench.call(38)
-    np.testing.assert_allclose(bench.answer, -10 * found[2], atol=1e-9)
-
-
 def test_payload_is_read_back_and_a_zero_centre_keeps_the_old(bench: Bench) -> None:
     bench.call(65, [1.2, 0, 0, 0.05, 1, 2, 3, 4, 5, 6])
     assert bench.machine.load.told == Mass(1.2, (0, 0, 0.05))
     assert bench.machine.load.inertia.tolist() == [1, 2, 3, 4, 5, 6]
     bench.call(17, [0.7, 0, 0, 0])
     assert bench.machine.load.told == Mass(0.7, (0, 0, 0.05))
-
-
-def test_jog_in_tool_axes(bench: Bench) -> None:
-    bench.call(41, [0, 0, 0.02, 0, 0, 0, 1, 0.5, 0, 0, 0, 0, 0, 0])
-    bench.tick(200)
-    np.testing.assert_allclose(bench.arm.target_twist[:3], 0.02 * bench.arm.frame[:3, 2], atol=1e-5)
-    bench.call(42)
-    assert not bench.arm.target_qd.any()
 
 
 def test_what_is_no_program_disturbs_nobody(bench: Bench) -> None:

@@ -144,17 +144,3 @@ def test_freedrive_gives_way_along_its_free_axes_only(bench: Bench) -> None:
     bench.call(53)
     bench.until(lambda: bench.arm.rests)
     assert bench.machine.status_bits & 4 == 0
-
-
-def test_end_of_a_joint_range_is_a_protective_stop(bench: Bench) -> None:
-    bench.call(9, [0, 0, 0, 0, 0, 3.0, 10.0, 0])
-    bench.until(lambda: bench.machine.safety is Safety.PROTECTIVE_STOP)
-    assert "end of its range" in bench.machine.stop_reason
-    bench.until(lambda: bench.arm.rests)
-    assert bench.arm.q[5] < 2 * math.pi + 0.3
-
-
-def test_a_joint_too_fast_is_a_protective_stop(bench: Bench) -> None:
-    bench.call(9, [4.0, 0, 0, 0, 0, 0, 20.0, 0])
-    bench.until(lambda: bench.machine.safety is Safety.PROTECTIVE_STOP, limit=1)
-    assert "too fast" in bench.machine.stop_reason

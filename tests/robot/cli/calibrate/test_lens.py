@@ -9,27 +9,21 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from calibration.bundle import read_bundle, write_bundle
 from calibration.lens.view import GelView, Lens
-from robot.cli import app
 from tacsim.config import load, load_rig
 from tacsim.record.images import encode_png, read_image
 from tests.calibration.boards import DOTS, LENS, facing, photograph, tilted
 from tests.calibration.presses import BALL, COLUMNS, PITCH, ROWS, HiddenSensor
 from tests.calibration.test_bundle import PICTURE, calibration
+from tests.robot.cli.invoked import tacsim, told
 
-WIDE = {"COLUMNS": "200"}
 BOARD = ["--board", "dots:9x7:2.5 mm"]
 
 
-def told(output: str) -> str:
-    return " ".join(output.replace("│", " ").split())
-
-
 def run(*words: object) -> tuple[int, str, str]:
-    done = CliRunner().invoke(app, ["calibrate", *map(str, words)], env=WIDE)
+    done = tacsim("calibrate", *words)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return done.exit_code, done.stdout, told(done.stderr)
 
@@ -93,7 +87,7 @@ def test_a_sensor_seen_askew_is_calibrated_through_its_view(tmp_path: Path) -> N
     # Compared with its own frames, whose pictures are the camera's: through the view, and on the gel.
     bundles = ["--calibration-a", str(tmp_path / "bundle"), "--calibration-b", str(tmp_path / "bundle")]
     words = ["compare", str(frames), str(frames), *bundles, "--out", str(tmp_path / "compared")]
-    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    done = tacsim(*words)
     assert done.exit_code == 0, done.output
     overall = json.loads((tmp_path / "compared" / "compare.json").read_text())["overall"]
     assert overall["contact_iou"]["mean"] == pytest.approx(1.0)
@@ -147,7 +141,7 @@ sensors:
 
 
 def doctor(rig: Path) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["doctor", "--rig", str(rig)], env=WIDE)
+    done = tacsim("doctor", "--rig", rig)
     return done.exit_code, told(done.output)
 
 
@@ -185,5 +179,5 @@ def test_a_wrong_calibration_is_told_with_exit_code_2(camera: str, words: str, t
     rig.write_text(RIG.replace("CAMERA", camera).replace("width: 160", "width: 320"))
     code, said = doctor(rig)
     assert code == 2 and re.search(words, said), said
-    done = CliRunner().invoke(app, ["run", str(rig), "--out", str(tmp_path / "o")], env=WIDE)
+    done = tacsim("run", rig, "--out", tmp_path / "o")
     assert done.exit_code == 2 and re.search(words, told(done.output)), done.output

@@ -1,0 +1,105 @@
+"""Left-out presses in the mask of the literature: inside circles that a person clicked, which took no part in any fit.
+
+The circle of a left-out press is the clicked one, moved and scaled as those of the other presses ask for; light and
+thickness of the gel are theirs, too. So nothing of the press that is scored is known but where somebody saw it.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.cases.real import balls
+from benchmarks.cases.real.balls import BallSet
+from benchmarks.cases.real.labels import BadData
+from calibration.errors import BadFrames
+from calibration.light.calibrator import calibrate_light
+from calibration.light.dent import MAX_RIM_RATIO, ContactCircle, dent_gradient, dent_height
+from calibration.light.fit import LightFit
+from calibration.light.labels import BLUR
+from calibration.light.press import BallPress, press_at, smooth, untouched_mean
+from calibration.light.refinement import RIM_BLUR
+from calibration.light.shadows import DentShade
+from tacsim.models.photometric import PhotometricLight, places_in_image
+
+FOLDS = 5
+WIDEST = (
+    0.95 * MAX_RIM_RATIO
+)  # contact radius over ball radius; clicked circles reach into the skirt, some beyond the ball
+
+
+def clicked_errors(folder: Path, of: BallSet) -> list[float]:
+    """Mean |error| of each left-out press inside its clicked circle [grey levels]; one that no calibration would take
+    there (saturated, a second contact) is missing. Raises BadData."""
+    reference, frames = balls.read_balls(folder, of)
+    clicked, ball, found = read_circles(folder, of), of.ball_radius / of.pixel_pitch, []
+    missing = [name for name, _ in frames if name not in clicked]
+    if missing:
+        raise BadData(f"{of.name}: no circle of {', '.join(missing)}")
+    for fold in range(FOLDS):
+        train = [frame for k, frame in enumerate(frames) if k % FOLDS != fold]
+        try:
+            fit = calibrate_light(reference, train, ball)
+        except BadFrames as error:
+            raise BadData(f"{of.name}: {error}") from None
+        for name, image in frames[fold::FOLDS]:
+            circle = corrected(clicked[name], fit, clicked, ball)
+            try:
+                press = press_at(name, image, reference, untouched_mean(reference), circle)
+            except BadFrames:
+                continue
+            found.append(_error(press, clicked[name], fit, ball))
+    return found
+
+
+def corrected(circle: ContactCircle, fit: LightFit, clicked: Mapping[str, ContactCircle], ball: float) -> ContactCircle:
+    """A clicked circle moved and scaled by what the presses of `fit` were, in the median."""
+    pairs = [(press.circle, clicked[press.name]) for press in fit.presses]
+    x, y = (float(np.median([getattr(a, axis) - getattr(b, axis) for a, b in pairs])) for axis in "xy")
+    scale = float(np.median([found.radius / seen.radius for found, seen in pairs]))
+    return ContactCircle(circle.x + x, circle.y + y, min(circle.radius * scale, WIDEST * ball))
+
+
+def _error(press: BallPress, inside: ContactCircle, fit: LightFit, ball: float) -> float:
+    assert fit.forward is not None
+    rows, columns = press.shape
+    mean = untouched_mean(fit.reference)
+    v, u = np.mgrid[:rows, :columns].astype(np.float64)
+    light, places = PhotometricLight(fit.forward), places_in_image(columns, rows)
+    slopes = dent_gradient(u, v, press.circle, fit.thickness, ball, RIM_BLUR).astype(np.float32)
+    change = light.change(slopes, *places)[0].astype(np.float64)
+    if fit.forward.depth is not None:
+        height = dent_height(u, v, press.circle, fit.thickness, ball) / columns
+        change += light.depth(height.astype(np.float32), *places)
+    if fit.forward.shadows is not None:
+        shade = DentShade(fit.forward.shadows.lamps, press.shape)
+        dark = shade.terms(u.ravel(), v.ravel(), press.circle, fit.thickness, ball)
+        change += (dark @ np.array(fit.forward.shadows.weights)).reshape(change.shape)
+    still = fit.reference + press.drift
+    drawn = np.clip(still + smooth(change, BLUR) * mean, 0.0, 255.0) - still
+    where = replace(press, circle=inside).distance() < inside.radius
+    return float(np.abs(drawn - press.change * mean)[where].mean())
+
+
+def has_circles(of: BallSet) -> bool:
+    return bool(of.circles or of.archive)
+
+
+def read_circles(folder: Path, of: BallSet) -> dict[str, ContactCircle]:
+    """The clicked circle of each frame [px]: of a table beside the frames, whose first columns are name, x, y, radius,
+    or of the archive. Raises BadData."""
+    try:
+        if of.archive:
+            with np.load(next(path for name in of.archive for path in folder.rglob(name)), allow_pickle=False) as found:
+                both = zip(found["contact_centre_px"], found["contact_radius_px"], strict=True)
+                return {f"press {k}": ContactCircle(float(x), float(y), float(r)) for k, ((x, y), r) in enumerate(both)}
+        home = next(path.parent for pattern in of.frames for path in sorted(folder.rglob(pattern)))
+        with (home / of.circles).open(encoding="utf-8", newline="") as file:
+            _, *rows = csv.reader(file)
+        return {name: ContactCircle(float(x), float(y), float(r)) for name, x, y, r, *_ in rows}
+    except (OSError, StopIteration, KeyError, ValueError) as error:
+        raise BadData(f"{of.name}: no clicked circles ({error})") from None

@@ -1,0 +1,196 @@
+"""What calibrations know of presses that took no part, sensor by sensor: `python -m benchmarks.held_out DIR`.
+
+DIR holds the public frames that `references/balls.yaml` names. Prints the table of docs/calibrate.md, a minute a set;
+`--only NAME` measures one. `--spread 50` prints another: how far contact radii differ between calibrations by random
+subsets of the presses, a quarter of an hour a set. `--clicked` prints that of docs/compare.md, in both masks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from time import process_time
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from benchmarks.cases.real import balls
+from benchmarks.cases.real.balls import BallSet
+from benchmarks.cases.real.clicked import clicked_errors, has_circles
+from benchmarks.cases.real.labels import BadData, Image, read_picture
+from calibration.errors import BadFrames
+from calibration.height.darkness import DarknessSlopes
+from calibration.light.calibrator import calibrate_light
+from calibration.light.dent import dent_height
+from calibration.light.fit import LightFit
+from calibration.normaliser import normaliser_for_calibration
+from tacsim.interface import TactileFrame
+from tacsim.models.sensor import CanonicalGrid
+
+# Contact MAE, correlation, normals before shadows were known and slopes were those of a surface (decision 10)
+BEFORE = {
+    "THUsight": (6.24, 0.988, 3.0),
+    "Taxim GelSight": (5.00, 0.983, 8.0),
+    "FOTS GelSight": (2.90, 0.991, 7.6),
+    "DIGIT": (8.68, 0.965, 10.8),
+}
+KINDS = (("contact MAE [grey levels]", "error", 2), ("correlation", "correlation", 3), ("normals [deg]", "angle", 1))
+TIMES = 9  # that a picture is normalised for its time
+# A set of one press: nothing can be left out
+DARK, DARK_BALL, DARK_PITCH = "9dtact_sensor_1", 4e-3, 0.05102e-3  # its folder; ball radius, pixel pitch [m]
+DARK_BEFORE = "-1.4 to 2.2 mm"  # heights that were found of a dent of 2.2 mm
+SUBSETS = (5, 8, 15)  # presses
+ANOTHER = 0.05  # of a radius: so far off is another solution, not the same one less exactly
+
+
+def rows_of(folder: Path, of: BallSet) -> list[str]:
+    """Of one set, a row a figure. Raises BadData."""
+    fit, _, cpu = balls.calibrated(folder, of)
+    reference, frames = balls.read_balls(folder, of)
+    picture = picture_time(fit, of, reference, frames[0][1])
+    presses = fit.predictions
+    return [
+        row(
+            f"{of.name}, {len(presses)} presses",
+            what,
+            f"{BEFORE[of.name][k]:.{digits}f}" if of.name in BEFORE else "",
+            f"{np.mean([getattr(press, name) for press in presses]):.{digits}f}",
+            f"{cpu:.1f} s, {1e3 * picture:.1f} ms",
+        )
+        for k, (what, name, digits) in enumerate(KINDS)
+    ]
+
+
+def picture_time(fit: LightFit, of: BallSet, reference: Image, image: Image) -> float:
+    """Processor time of a picture from camera to observation [s], median."""
+    calibration = fit.to_calibration("bench", of.ball_radius, of.pixel_pitch)
+    normalise = normaliser_for_calibration(calibration, CanonicalGrid(), reference)
+    normalise.take_reference(TactileFrame(image=reference, time=0.0, index=0, surface=None))
+    taken = []
+    for number in range(TIMES):
+        begun = process_time()
+        normalise(TactileFrame(image=image, time=0.0, index=1 + number, surface=None), 0.0)
+        taken.append(process_time() - begun)
+    return float(np.median(taken))
+
+
+def dark_row(home: Path) -> str:
+    """Of the one press of a sensor whose light tells depth by darkness. Raises BadFrames, BadData."""
+    reference = read_picture(home / "depth_calibration_ref.png")
+    begun = process_time()
+    fit = calibrate_light(
+        reference, [("press", read_picture(home / "depth_calibration_sample.png"))], DARK_BALL / DARK_PITCH
+    )
+    cpu = process_time() - begun
+    if fit.darkness is None:
+        return row("9DTact", "height [mm]", DARK_BEFORE, "its light was taken for one that tells direction", "")
+    (press,) = fit.presses
+    depth, _ = DarknessSlopes(fit.darkness, press.shape, 1.0).depth(press.change.astype(np.float32))
+    v, u = np.mgrid[: press.shape[0], : press.shape[1]].astype(np.float64)
+    off = depth - dent_height(u, v, press.circle, fit.thickness, DARK_BALL / DARK_PITCH)
+    off = off[press.distance() < press.circle.radius]
+    found = f"{1e3 * DARK_PITCH * np.sqrt(np.mean(off**2)):.3f} mm rms (on the press itself: the set has one)"
+    return row("9DTact, 1 press", "height in contact", DARK_BEFORE, found, f"{cpu:.1f} s")
+
+
+@dataclass(frozen=True, slots=True)
+class Subset:
+    """A calibration by some of the presses of a set."""
+
+    scale: float  # of its contact radii, against those of the same presses by all: mean logarithm of their ratio
+    said: float  # standard deviation of that scale, as it tells by itself
+    shadows: bool  # it found some
+
+
+def subsets_of(folder: Path, of: BallSet, presses: int, count: int) -> list[Subset]:
+    """Calibrations by random subsets; one that is refused is missing. Raises BadData."""
+    fit, _, _ = balls.calibrated(folder, of)
+    radii = {press.name: press.circle.radius for press in fit.presses}
+    reference, frames = balls.read_balls(folder, of)
+    rng = np.random.default_rng(presses)
+    found = []
+    for _ in range(count):
+        chosen = sorted(rng.choice(len(frames), presses, replace=False))
+        try:
+            part = calibrate_light(reference, [frames[i] for i in chosen], of.ball_radius / of.pixel_pitch)
+        except BadFrames:
+            continue
+        scale = [np.log(press.circle.radius / radii[press.name]) for press in part.presses if press.name in radii]
+        if scale:
+            shadows = part.forward is not None and part.forward.shadows is not None
+            found.append(Subset(float(np.mean(scale)), part.radius_uncertainty, shadows))
+    return found
+
+
+def spread_row(folder: Path, of: BallSet, presses: int, count: int) -> str:
+    """Of one set and size of subsets. Raises BadData."""
+    subsets = subsets_of(folder, of, presses, count)
+    fit, _, _ = balls.calibrated(folder, of)
+    name, cells = f"{of.name}, {len(fit.presses)} presses", [str(presses), f"{len(subsets)} of {count}"]
+    if len(subsets) < 2:
+        return row(name, *cells, *["-"] * 6)
+    scales = np.array([subset.scale for subset in subsets])
+    return row(
+        name,
+        *cells,
+        f"{scales.mean():+.1%}",
+        f"{scales.std(ddof=1):.1%}",
+        f"{scales[np.argmax(np.abs(scales))]:+.1%}",
+        f"{np.mean(np.abs(scales) > ANOTHER):.0%}",
+        f"{np.median([subset.said for subset in subsets]):.1%}",
+        f"{np.mean([subset.shadows for subset in subsets]):.0%}",
+    )
+
+
+def clicked_row(folder: Path, of: BallSet) -> str:
+    """Of one set, contact MAE [grey levels] in both masks. Raises BadData."""
+    fit, _, _ = balls.calibrated(folder, of)
+    errors = clicked_errors(folder, of)
+    refined = float(np.mean([press.error for press in fit.predictions]))
+    return row(f"{of.name}, {len(fit.predictions)} presses", f"{refined:.2f}", f"{np.mean(errors):.2f} ({len(errors)})")
+
+
+def row(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def main(
+    folder: Path,
+    only: Annotated[str, typer.Option(help="Measure this set alone.")] = "",
+    spread: Annotated[int, typer.Option(min=0, help="Calibrate by so many random subsets of each set instead.")] = 0,
+    presses: Annotated[list[int], typer.Option(min=1, help="In a subset.")] = list(SUBSETS),  # noqa: B006
+    clicked: Annotated[bool, typer.Option(help="Contact MAE in circles that a person clicked, too.")] = False,
+) -> None:
+    """Prints the table of what is known of left-out presses, or of how far contact radii differ between subsets."""
+    there = [of for of in balls.read_sets(folder) if only in of.name and balls.is_there(folder, of)]
+    if spread:
+        heads = "sensor", "in a subset", "subsets", "radii, mean", "sd", "worst", f"beyond {ANOTHER:.0%}", "said ±"
+        typer.echo(row(*heads, "with shadows"))
+        typer.echo(row(*["---"] * 9))
+        for of in there:
+            for size in presses:
+                if size < len(balls.read_balls(folder, of)[1]):
+                    typer.echo(spread_row(folder, of, size, spread))
+        return
+    if clicked:
+        typer.echo(row("set", "within 1.5 refined radii", "inside the clicked circle (presses)"))
+        typer.echo(row(*["---"] * 3))
+        for of in there:
+            if has_circles(of):
+                typer.echo(clicked_row(folder, of))
+        return
+    typer.echo(row("sensor", "held-out figure", "before", "now", "CPU: calibration, a picture"))
+    typer.echo(row(*["---"] * 5))
+    for of in there:
+        typer.echo("\n".join(rows_of(folder, of)))
+    for home in folder.rglob(DARK):
+        if only in "9DTact":
+            typer.echo(dark_row(home))
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(main)
+    except (BadData, BadFrames) as error:
+        raise SystemExit(str(error)) from None

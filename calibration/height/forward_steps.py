@@ -1,0 +1,111 @@
+"""Slopes bettered by the forward model of the light: what a pixel's colour alone cannot tell, its surroundings do.
+
+The inverse of a light takes every pixel for itself. It cannot know that a pixel lies in the shade of another, nor which
+of two slopes of nearly one colour fits a surface. Both are known once there is a surface, so it is sought as
+
+    min over height h, slopes g of  sum over pixels, channels rho(c - light(g) - rest(h)) + STIFFNESS |g - grad h|^2
+
+for the seen change of colour c, of which rest(h) is what depth and cast shadows change: in turn a Gauss-Newton step in
+g, pixel by pixel, and the h whose slopes are nearest to it (Poisson's equation; half-quadratic splitting, Geman and
+Yang 1995). It starts from the inverse's height. rho is Cauchy's: a channel that no slope explains, being saturated or
+dirty, counts little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.height.integration import slopes_of
+from calibration.height.slope_polynomial import EXTRAPOLATION
+from tacsim.models.photometric import PhotometricLight, PhotometricModel
+from tacsim.models.shadows import horizon
+
+Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+STEPS = 3
+STIFFNESS = 0.4  # (error of colour that is usual / error of slope that is usual)^2
+DOUBTED = 0.2  # error of colour from which on a channel counts little [-]
+TOUCHED = 0.1  # relative change of colour, below which a pixel keeps the inverse's slope: little to gain there
+DELTA = 0.02  # step of finite differences of colour by slope [-]
+ROW = 256  # pixels that are evaluated at a time
+
+
+class ForwardSteps:
+    """The steps for one sensor, on the pixels of one view."""
+
+    def __init__(self, model: PhotometricModel, u: Float32, v: Float32, pitch: float, width: float) -> None:
+        """u, v (H, W): places of the pixels, -1/2..1/2 across the sensor's own picture; `pitch`: distance of two pixels
+        of the view, `width` of that picture, in one unit."""
+        self._light, self._model = PhotometricLight(model), model
+        self._u, self._v = u.ravel(), v.ravel()
+        self._pitch = pitch
+        self._scale = np.float32(1.0 / width)
+        self._pixel = np.float32(width / pitch)  # pixels of the view in a picture's width
+        # rows over columns of the sensor's picture: what makes of v a place in its widths
+        steps = float(u[0, -1] - u[0, 0]) / (u.shape[1] - 1), float(v[-1, 0] - v[0, 0]) / (v.shape[0] - 1)
+        self._flat = np.float32(steps[0] / steps[1])
+        self._corner = u[0, 0], v[0, 0] * self._flat
+
+    def __call__(
+        self, change: Float32, height: Float32, hidden: Mask, integrate: Callable[[Float32], Float32]
+    ) -> Float32:
+        """The better height (H, W) for relative changes (3, H, W); pixels that are `hidden` (H, W) tell nothing.
+        `integrate`: slopes (H, W, 2) -> height, in the unit of `pitch`."""
+        seen = np.flatnonzero((np.abs(change).max(axis=0) > TOUCHED) & ~hidden)
+        if not len(seen):
+            return height
+        rows = np.resize(seen, (-(-len(seen) // ROW), ROW))  # the last row is filled up with pixels of the first
+        colour = [plane.ravel()[rows] for plane in change]
+        place = self._u[rows], self._v[rows]
+        for _ in range(STEPS):
+            slopes = np.stack(slopes_of(height, self._pitch), axis=-1)
+            flat = slopes.reshape(-1, 2)
+            flat[rows] = self._step(flat[rows], colour, place, self._rest(height, rows, place))
+            height = integrate(slopes)
+        return height
+
+    def _step(
+        self, slope: Float32, colour: list[Float32], place: tuple[Float32, Float32], rest: Float32 | None
+    ) -> Float32:
+        """(..., 2) slopes after a Gauss-Newton step from those of the surface."""
+        here = self._light.change(slope, *place)[0]
+        delta = np.eye(2, dtype=np.float32) * np.float32(DELTA)
+        by_x, by_y = ((self._light.change(slope + step, *place)[0] - here) / np.float32(DELTA) for step in delta)
+        if rest is not None:
+            here = here + rest
+        xx = yy = np.full_like(colour[0], STIFFNESS)
+        xy = right_x = right_y = np.zeros_like(colour[0])
+        for channel, seen in enumerate(colour):
+            error, x, y = seen - here[..., channel], by_x[..., channel], by_y[..., channel]
+            weight = 1 / (1 + (error / np.float32(DOUBTED)) ** 2)
+            xx, xy, yy = xx + weight * x * x, xy + weight * x * y, yy + weight * y * y
+            right_x, right_y = right_x + weight * x * error, right_y + weight * y * error
+        step = np.stack([yy * right_x - xy * right_y, xx * right_y - xy * right_x], axis=-1)
+        better = slope + step / (xx * yy - xy * xy)[..., None]
+        steepness = np.hypot(better[..., 0], better[..., 1])
+        least = np.minimum(1, EXTRAPOLATION * self._model.steepest / np.maximum(steepness, 1e-9))
+        return np.asarray(better * least[..., None], dtype=np.float32)
+
+    def _rest(self, height: Float32, rows: NDArray[np.intp], place: tuple[Float32, Float32]) -> Float32 | None:
+        """(..., 3) change of colour of pixels `rows` (...) at places u, v by what a surface of this height (H, W) does
+        beside its slopes: its depth, and what it hides from the lamps."""
+        import cv2
+
+        relative = height * self._scale
+        deep = None if self._model.depth is None else self._light.depth(relative.ravel()[rows], *place)
+        if self._model.shadows is None:
+            return deep
+        u, v = place
+
+        def height_at(x: Float32, y: Float32) -> Float32:
+            at = (x - self._corner[0]) * self._pixel, (y - self._corner[1]) * self._pixel
+            seen = cv2.remap(relative, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            return np.asarray(seen, dtype=np.float32)
+
+        horizons = [horizon(height_at, u, v * self._flat, lamp) for lamp in self._model.shadows.lamps]
+        shade = self._light.shadow(horizons, u, v)
+        return shade if deep is None else deep + shade

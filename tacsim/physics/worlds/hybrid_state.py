@@ -1,0 +1,141 @@
+"""Arrays of two gels round a plasticine body, of several environments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacsim.compute.runtime import start
+from tacsim.geometry.sampling import body_points
+from tacsim.geometry.shapes import extent, volume
+from tacsim.models.scene import Scene
+from tacsim.physics.body.moments import Moments, moments_of
+from tacsim.physics.body.plasticine import STENCIL_REACH, BodyParams, BodyState, body_params, centre_of
+from tacsim.physics.body.surface import tangent_planes
+from tacsim.physics.contact.contact import ContactHistory
+from tacsim.physics.exec.lanes import ON_DEVICE, PARTS
+from tacsim.physics.exec.layout import COUNTS, ELEMENTS, NUMBERS, PARAMS
+from tacsim.physics.exec.team import run_team
+from tacsim.physics.gel.gel import GelState, common_lattice, gel_params
+from tacsim.physics.units import MM
+from tacsim.physics.worlds.fem import FemState, stack_drives
+from tacsim.physics.worlds.hybrid_kernels import substeps
+
+if TYPE_CHECKING:
+    from tacsim.physics.worlds.device_state import DeviceHybrid
+
+CLEARANCE = 0.1e-3  # gap between gels and body at construction [m]
+
+
+class HybridState(FemState):
+    """Arrays of E environments that one launch of `substeps` advances; each environment is a HybridWorld.
+
+    Environments share the gels' lattice; each has its own body, materials, friction and settling.
+    """
+
+    device: DeviceHybrid | None = None
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Raises ValueError for gels that are not cut alike."""
+        start()
+        self.gel = [gel_params(scene.gel, scene.element) for scene in scenes]
+        self._gels = GelState(common_lattice(self.gel), len(scenes), 2)
+        placed = [_body_at_start(scene) for scene in scenes]
+        self.body = [body for body, _, _ in placed]
+        self._particles = BodyState([points for _, points, _ in placed], [planes for _, _, planes in placed])
+        # of the contact law [mm]
+        self._contact_history = np.zeros((len(scenes), 2, max(self._particles.counts), ContactHistory.n), np.float32)
+        self.params = np.zeros((len(scenes), PARAMS), np.float32)
+        self.counts = np.zeros((len(scenes), COUNTS), np.int32)
+        self.counts[:, ELEMENTS : ELEMENTS + 3] = self.gel[0].elements
+        self.partial = np.zeros((len(scenes), PARTS, NUMBERS), np.float32)
+        if ON_DEVICE:
+            from tacsim.physics.worlds.device_state import DeviceHybrid
+
+            numbers = self.params, self.counts, self.partial
+            self.device = DeviceHybrid(self._gels, numbers, self._particles, lambda: self._contact_history)
+
+    @property
+    def particles(self) -> BodyState:
+        self._bring_back()
+        return self._particles
+
+    @property
+    def contact_history(self) -> np.ndarray:
+        self._bring_back()
+        return self._contact_history
+
+    def extents(self, index: int) -> np.ndarray:
+        """See `BodyState.extents`; what follows is likewise of one environment, wherever its arrays are."""
+        return self._particles.extents(index) if self.device is None else self.device.survey(index).extents
+
+    def fit(self, index: int, cell: float, extents: np.ndarray) -> None:
+        """Lays its grid. Raises MemoryError."""
+        # a node at its border has no mass: the cells round each that has are all there (tacsim.physics.body.mass)
+        room = len(self._particles.velocities[0])
+        self._particles.fit(index, cell, STENCIL_REACH * cell, self.params, self.counts, extents)
+        if self.device is not None and len(self._particles.velocities[0]) > room:
+            self.device.bring_back()  # what has just grown is sent again
+
+    def grid_kept(self, index: int) -> tuple[int, int, int]:
+        """See `BodyState.grid_kept`."""
+        return self._particles.grid_kept(index)
+
+    def moments(self, index: int) -> Moments:
+        return moments_of(self._particles, index) if self.device is None else self.device.moments(index)
+
+    def centre(self, index: int) -> np.ndarray:
+        """Of the particles (3,) [mm]."""
+        return centre_of(self._particles.x(index)) if self.device is None else self.device.moments(index).centre
+
+    def outside(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [mm] and tangent planes [1/mm] of the particles, (n, 3) both."""
+        if self.device is not None:
+            return self.device.outside(index)
+        return self._particles.x(index), self._particles.plane(index)
+
+    @property
+    def most_nodes(self) -> int:
+        """Of a grid, see `BodyState.most`."""
+        return self._particles.most
+
+    def place(self, index: int, scene: Scene) -> None:
+        """One environment as it is at the construction of another scene. Raises ValueError for gels cut otherwise."""
+        gel = gel_params(scene.gel, scene.element)
+        common_lattice([*self.gel, gel])
+        body, points, planes = _body_at_start(scene)
+        self.gel[index], self.body[index] = gel, body
+        self.gels.u[index], self.gels.v[index] = 0.0, 0.0
+        self.particles.place(index, points, planes)
+        missing = max(self.particles.counts) - self.contact_history.shape[2]
+        if missing > 0:
+            self._contact_history = np.pad(self.contact_history, ((0, 0), (0, 0), (0, missing), (0, 0)))
+        self.contact_history[index], self.params[index], self.partial[index] = 0.0, 0.0, 0.0
+        self.counts[index] = 0
+        self.counts[index, ELEMENTS : ELEMENTS + 3] = gel.elements
+
+    def advance(self, drives: Mapping[int, np.ndarray]) -> None:
+        drive = stack_drives(drives, self.counts)
+        if self.device is not None:
+            self.device.run(drive)
+        else:
+            self._gels.refresh()
+            run_team(
+                substeps, drive, self._gels.arguments(), self._particles.arguments(),
+                self._particles.changes.reshape(-1), self._contact_history, self.params,
+                self.counts, self.partial, active=list(drives),
+            )  # fmt: skip
+        for index in drives:
+            self._particles.keep_grid(index, self.counts)
+
+
+def _body_at_start(scene: Scene) -> tuple[BodyParams, np.ndarray, np.ndarray]:
+    """A scene's body: parameters, particles at construction (n, 3) [mm], their tangent planes (n, 3) [1/mm]."""
+    assert scene.body is not None
+    height = float(extent(scene.body.geometry)[2])
+    points = body_points(scene.body, scene.spacing)
+    body = body_params(scene.body.material, scene.spacing, volume=volume(scene.body.geometry) / len(points))
+    planes = tangent_planes(scene.body.geometry, points, scene.spacing) / MM
+    return body, (points + [0.0, 0.0, height / 2 + CLEARANCE]) * MM, planes

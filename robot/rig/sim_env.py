@@ -16,7 +16,7 @@ from tacsim.gym.features import FeatureEncoder
 from tacsim.gym.vector import Member, SharedBatch, TacsimVectorEnv
 from tacsim.models.features import Features
 from tacsim.models.hardware import Placement
-from tacsim.models.rig import RigConfig, SimSensorConfig
+from tacsim.models.rig import RigConfig, SimSensorConfig, WrenchNoise
 from tacsim.models.sensor import Lighting
 from tacsim.sim.stage import StatePool, require_same_gels
 from tacsim.tasks import make_task
@@ -87,7 +87,7 @@ def _variants(episodes: Episodes) -> list[Variant]:
         if _unchanging(config) != kept:
             raise ValueError(
                 f"variant {number} may change nothing but scene, task, light, texture, noise and delay of the sensors, "
-                "error and delay of the arms; make another environment for it"
+                "error, noise and delay of the arms; make another environment for it"
             )
         assert first.scene is not None and first.task is not None and config.scene is not None
         assert config.task is not None
@@ -123,5 +123,5 @@ def _unchanging(config: RigConfig) -> RigConfig:
         assert isinstance(sensor, SimSensorConfig)
         sensors[name] = sensor.model_copy(update={"model": sensor.model.model_copy(update=look), "delay": 0})
     for name, arm in config.arms.items():
-        arms[name] = arm.model_copy(update={"error": Placement(), "delay": 0})
+        arms[name] = arm.model_copy(update={"error": Placement(), "noise": WrenchNoise(), "delay": 0})
     return config.model_copy(update={"scene": None, "task": None, "sensors": sensors, "arms": arms})

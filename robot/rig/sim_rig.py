@@ -26,6 +26,7 @@ from tacsim.sim.clock import SimClock
 from tacsim.sim.reset import SimReset
 from tacsim.sim.sensor import SimSensor
 from tacsim.sim.stage import Stage, StatePool
+from tacsim.sim.wrench_noise import wrench_noise_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +40,14 @@ class Simulation:
     arms: Mapping[str, SimArm]
 
     def wear(self, config: RigConfig) -> None:
-        """From the next episode on light, texture, noise and delay of the sensors, and error and delay of the arms, are
-        those of `config`; all else is that of the rig they were made with."""
+        """From the next episode on light, texture, noise and delay of the sensors, and error, noise and delay of the
+        arms, are those of `config`; all else is that of the rig they were made with."""
         for name, sensor in config.sensors.items():
             assert isinstance(sensor, SimSensorConfig)
             self.sensors[name].wear(*_pictures(sensor.model, name, self.stage.scene), sensor.delay)
         for name, arm in config.arms.items():
             assert isinstance(arm, SimArmConfig)
-            self.arms[name].believe(_error(arm), arm.delay)
+            self.arms[name].believe(_error(arm), arm.delay, wrench_noise_source(arm.noise, name))
 
 
 def open_sim(config: RigConfig) -> Rig:
@@ -90,7 +91,8 @@ def simulate(
         turn_rate = arm.turn_rate if limits is None else min(arm.turn_rate, limits.turn_rate)
         apart = [(frames[other], distance) for other, distance in config.kept_out(name).items()]
         longest, turn = speed * config.period, turn_rate * config.period
-        arms[name] = SimArm(world, clock, frames[name], longest, turn, limits, apart, _error(arm), arm.delay)
+        noise = wrench_noise_source(arm.noise, name)
+        arms[name] = SimArm(world, clock, frames[name], longest, turn, limits, apart, _error(arm), arm.delay, noise)
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
     rig = Rig(

@@ -89,6 +89,8 @@ class FeatureEncoder:
         self._start: Mapping[str, Pose] = {}
         self._pressed: dict[str, FloatArray] = {}  # where the normal force acted first
         self._before: Mapping[str, Pose] = {}  # poses of the last observation
+        self._sums: FloatArray | float = 0.0  # of what is remembered, since the episode began
+        self._count = 0
         self._frames: deque[Arrays] = deque(maxlen=features.frames)
 
     @property
@@ -109,13 +111,8 @@ class FeatureEncoder:
         if wanted.flow:
             found["flow"] = [part for name in wanted.sensors for part in _named("flow", name)]
         if wanted.touch:
-            owners = {kind: wanted.sensors if kind in _OF_SENSORS else wanted.arms for kind in wanted.touch}
-            found["touch"] = [
-                part
-                for kind, names in owners.items()
-                for name in names[kind == "between" :]
-                for part in _named(kind, name)
-            ]
+            found["touch"] = self._parts(wanted.touch)
+            found["touch"] += [(f"{name} mean", scale) for name, scale in self._parts(wanted.remembered)]
         ages = [f" -{age}" if age else "" for age in reversed(range(wanted.frames))]
         return {
             key: Numbers(
@@ -124,6 +121,14 @@ class FeatureEncoder:
             )
             for key, parts in found.items()
         }
+
+    def _parts(self, quantities: Sequence[Quantity]) -> list[tuple[str, float]]:
+        """Name and scale of all that `touch` says of them."""
+        wanted = self.features
+        owners = {kind: wanted.sensors if kind in _OF_SENSORS else wanted.arms for kind in quantities}
+        return [
+            part for kind, names in owners.items() for name in names[kind == "between" :] for part in _named(kind, name)
+        ]
 
     def begin(self, observation: Observation, goal: float | Sequence[float] | None = None) -> Arrays:
         """The first observation of an episode; frames before it are taken to be like it.
@@ -136,6 +141,7 @@ class FeatureEncoder:
             self._goal = {"goal": np.atleast_1d(np.asarray(goal, np.float32) / np.float32(SCALES["goal"]))}
         self._start = {name: observation.arms[name].pose for name in self.features.arms}
         self._pressed, self._before = {}, self._start
+        self._sums, self._count = 0.0, 0
         self._frames.extend([self._encode(observation)] * self.features.frames)
         return self._stacked()
 
@@ -157,7 +163,14 @@ class FeatureEncoder:
             arrays["flow"] = np.concatenate([_flow(touch).transpose(2, 0, 1) / SCALES["flow"] for touch in touches])
         if wanted.touch:
             arms = {name: observation.arms[name] for name in wanted.arms}
-            arrays["touch"] = np.concatenate([self._numbers(quantity, touches, arms) for quantity in wanted.touch])
+            told: dict[str, FloatArray] = {
+                quantity: self._numbers(quantity, touches, arms) for quantity in wanted.touch
+            }
+            if wanted.remembered:
+                self._sums = self._sums + np.concatenate([told[quantity] for quantity in wanted.remembered])
+                self._count += 1
+                told["means"] = self._sums / self._count
+            arrays["touch"] = np.concatenate(list(told.values()))
             self._before = {name: arm.pose for name, arm in arms.items()}
         return {key: value.astype(np.float32) for key, value in arrays.items()}
 

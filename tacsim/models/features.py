@@ -31,6 +31,7 @@ class Features(Config):
     grid: MapGrid = MapGrid()
     flow: bool = False  # tactile flow of each sensor, on the lattice of its markers
     touch: tuple[Quantity, ...] = ("area", "depth", "centroid", "wrench", "moved", "between")
+    remembered: tuple[Quantity, ...] = ()  # of these the means since the episode began are seen, too
     goal: bool = True  # that of the task
     frames: Annotated[int, Field(ge=1, le=16)] = 1  # the last observations, oldest first
 
@@ -41,6 +42,7 @@ class Features(Config):
             "arms": self.arms,
             "maps": self.maps,
             "touch": self.touch,
+            "remembered": self.remembered,
         }.items():
             if len(set(listed)) < len(listed):
                 raise ValueError(f"{name} names something twice: {', '.join(listed)}")
@@ -48,6 +50,9 @@ class Features(Config):
             raise ValueError("maps and flow are those of sensors: name some, or leave both out")
         if "between" in self.touch and len(self.arms) < 2:
             raise ValueError("touch 'between' is of two arms and more: name them, or leave it out")
+        unseen = [name for name in self.remembered if name not in self.touch]
+        if unseen:
+            raise ValueError(f"remembered is of what touch names; add {', '.join(unseen)} to touch, or leave it out")
         if not (self.maps or self.flow or self.touch):
             raise ValueError("a policy that sees nothing: choose maps, flow or touch")
         return self

@@ -24,6 +24,16 @@ from tacsim.models.sensor import CanonicalGrid, SensorModel
 Delay = Annotated[int, Field(ge=0, le=20)]
 
 
+class WrenchNoise(Config):
+    """Of an arm's force sensor, independent along each axis of the wrench that it reports."""
+
+    force: Annotated[Force, Field(ge=0)] = 0.0  # standard deviation of one reading [N]
+    torque: Annotated[float, Field(ge=0)] = 0.0  # the same [N m]
+    # The zero wanders from where it is at reset (a random walk): its standard deviation after a minute, in those above.
+    drift: Annotated[float, Field(ge=0)] = 0.0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
 class SimArmConfig(Config):
     """A simulated arm: reaches every commanded pose exactly, within the motion that one control period allows."""
 
@@ -35,6 +45,7 @@ class SimArmConfig(Config):
     limits: ArmLimits | None = None
     # Where the arm believes its sensor to be, seen from where it is: what a calibration leaves of error.
     error: Placement = Placement()
+    noise: WrenchNoise = WrenchNoise()
     delay: Delay = 0  # its states are those of so many control periods ago
 
 

@@ -12,6 +12,7 @@ from tacsim.limits import LimitExceeded, clip_to_region, exceeds_wrench, limit_s
 from tacsim.models.hardware import ArmLimits
 from tacsim.physics.world import World
 from tacsim.sim.clock import Delayed, SimClock
+from tacsim.sim.wrench_noise import WrenchNoiseSource
 
 
 class SimArm:
@@ -24,6 +25,7 @@ class SimArm:
         keep_out: frames to stay away from, and how far [m]; targets are shortened at these spheres.
         error: where it believes its frame to be, seen from where it is; None: it knows.
         delay: its states are those of so many periods ago.
+        noise: of its force sensor, in what it tells; its guard feels the force itself. None: no noise.
     """
 
     def __init__(
@@ -37,16 +39,17 @@ class SimArm:
         keep_out: Iterable[tuple[str, float]] = (),
         error: Pose | None = None,
         delay: int = 0,
+        noise: WrenchNoiseSource | None = None,
     ) -> None:
         self._world, self._clock, self._frame = world, clock, frame
         self._max_step, self._max_turn = max_step, max_turn
         self._limits, self._keep_out = limits, tuple(keep_out)
         self._region = None if limits is None else limits.region
-        self.believe(error, delay)
+        self.believe(error, delay, noise)
 
-    def believe(self, error: Pose | None, delay: int) -> None:
-        """Another error and delay, from the next episode on."""
-        self._error, self._past = error, Delayed[ArmState](delay)
+    def believe(self, error: Pose | None, delay: int, noise: WrenchNoiseSource | None = None) -> None:
+        """Another error, delay and noise, from the next episode on."""
+        self._error, self._past, self._noise = error, Delayed[ArmState](delay), noise
 
     def state(self, at: float | None = None) -> ArmState:
         """The state now, or `delay` periods ago. Simulated pictures and arms are of one instant, so `at` makes no
@@ -55,10 +58,14 @@ class SimArm:
 
     def _state(self) -> ArmState:
         wrench = self._wrench()
+        if self._error is not None:
+            wrench = se3.transform_wrench(se3.inverse(self._error), wrench)
+        if self._noise is not None:
+            wrench = wrench + self._noise(self._clock.periods, self._clock.period, self._clock.episode)
         return ArmState(
             pose=self._believed(),
             twist=self._clock.velocities.get(self._frame, np.zeros(6)).copy(),
-            wrench=wrench if self._error is None else se3.transform_wrench(se3.inverse(self._error), wrench),
+            wrench=wrench,
             joints=None,
             time=self._clock.now(),
         )

@@ -53,6 +53,8 @@ class SimClock:
         self._limited: dict[str, bool] = {}  # by frame: a guard changed the last command
         self._before: dict[str, Pose] = {}  # where the frames were that move in this period
         self._time = 0.0
+        self.periods = 0  # since time zero
+        self.episode = 0  # the seed of the noise
         self.version = 0
         self.stats: MoveStats | None = None  # of the last motion
         # (6,) by frame: mean of the last period, world axes [m/s, rad/s]
@@ -102,11 +104,13 @@ class SimClock:
             frame: se3.difference(old, self._world.pose(frame)) / self.period for frame, old in self._before.items()
         }
         self._time += self.period
+        self.periods += 1
         self.version += 1
 
-    def restart(self, stats: MoveStats | None = None) -> None:
-        """Time zero, in a world whose state was restored."""
+    def restart(self, stats: MoveStats | None = None, episode: int | None = None) -> None:
+        """Time zero, in a world whose state was restored. `episode`: of another one, the seed of its noise."""
         self._time, self._targets, self._limited, self.velocities, self.stats = 0.0, {}, {}, {}, stats
+        self.periods, self.episode = 0, self.episode if episode is None else episode
         self.version += 1
 
     def diagnostics(self) -> Mapping[str, float]:

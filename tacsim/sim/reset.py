@@ -56,7 +56,7 @@ class SimReset:
             shift = np.append(self._offset, 0.0)
             poses = {name: stage.pose(name) for name in stage.sensors}
             stage.place({name: Pose(pose.position + shift, pose.quaternion) for name, pose in poses.items()})
-        self._clock.restart()
+        self._clock.restart(episode=seed)
         for sensor in self._sensors.values():
             sensor.restart(seed)
         return {name: sensor.read(0.0) for name, sensor in self._sensors.items()}

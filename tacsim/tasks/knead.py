@@ -17,7 +17,8 @@ from tacsim.tasks.solids import Solid, centred, chamfer, earth_movers, iou, spre
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
 
-OF_YIELD = 0.65  # best pressure of the scripted policy, over the yield stress: softer clay is rolled at less
+OF_YIELD = 0.9  # most pressure of the teacher, over the yield stress: clay that is pressed harder is flattened
+IN_STEPS = 30.0  # of the teacher: it takes so large a part of the height that is left in each control step
 THERE = 0.2  # of max_step: so near to where it goes, the scripted policy turns
 AIMS = (1.0, -1.0, 0.0)  # of a stroke: to one side, to the other, to the middle
 GOLDEN_ANGLE = np.pi * (3.0 - 5.0**0.5)  # no two strokes of a ball's go one way
@@ -105,10 +106,9 @@ class Knead(Task):
         return ScriptedKnead(self, through)
 
     def teacher(self) -> Policy:
-        """As the scripted policy, but it knows how hard the clay is, and presses accordingly."""
         body = self.config.scene.body
         yields = None if body is None else body.material.yield_stress
-        return ScriptedKnead(self, False) if yields is None else ScriptedKnead(self, False, OF_YIELD * yields)
+        return ScriptedKnead(self, False) if yields is None else KneadTeacher(self, False, OF_YIELD * yields)
 
 
 class ScriptedKnead:
@@ -142,11 +142,7 @@ class ScriptedKnead:
         lower, upper = observation.arms["lower"], observation.arms["upper"]
         if self._start is None:
             self._start = np.array(upper.pose.position)
-        longest = self._task.config.max_step
-        force = -0.5 * float(lower.wrench[2] + upper.wrench[2])
-        closer = float(np.clip(self.gain * (self._force - force), -longest, longest))
-        if not self._through and estimated_height(observation) <= self._task.goal[2]:
-            closer = -0.2 * longest
+        closer = self._closer(observation)
         beside = self._beside(upper.pose.position[:2] - self._start[:2])
         return Action(
             {
@@ -154,6 +150,18 @@ class ScriptedKnead:
                 "upper": Pose(upper.pose.position + [*beside, -closer], upper.pose.quaternion),
             }
         )
+
+    def _closer(self, observation: Observation) -> float:
+        """How far each sensor goes towards the other [m]."""
+        if not self._through and estimated_height(observation) <= self._task.goal[2]:
+            return -0.2 * self._task.config.max_step
+        return self._by_force(observation)
+
+    def _by_force(self, observation: Observation) -> float:
+        """As `_closer`, to the force that it holds."""
+        longest = self._task.config.max_step
+        force = -0.5 * float(observation.arms["lower"].wrench[2] + observation.arms["upper"].wrench[2])
+        return float(np.clip(self.gain * (self._force - force), -longest, longest))
 
     def _beside(self, now: FloatArray) -> FloatArray:
         """(2,) step of the upper sensor, `now` so far beside where it began [m]: to one side, to the other, and through
@@ -171,3 +179,12 @@ class ScriptedKnead:
         """(2,) where the first half of this stroke goes, unit vector."""
         turn = 0.5 * np.pi if self._task.config.shape == "rod" else GOLDEN_ANGLE * self._strokes
         return np.array([np.cos(turn), np.sin(turn)])
+
+
+class KneadTeacher(ScriptedKnead):
+    """Knows how much clay there is and how hard it is. It closes the slower, the nearer the height is to the solid's,
+    and stays there. `pressure` is only a limit."""
+
+    def _closer(self, observation: Observation) -> float:
+        left = estimated_height(observation) - self._task.goal[2]
+        return min(self._by_force(observation), 0.5 * left / IN_STEPS)

@@ -48,8 +48,20 @@ def test_they_are_those_of_the_flat_observation_and_the_goal_of_the_episode() ->
         assert seen["maps"][2] == pytest.approx(1e3 * means, abs=1e-6)
 
 
+def test_what_is_remembered_is_the_mean_since_the_episode_began() -> None:
+    env = make(features={"maps": [], "touch": ["depth", "wrench"], "remembered": ["wrench"]})
+    for seed in (1, 2):
+        shown = [env.reset(seed=seed)[0]["touch"]]
+        for push in (1.0, 0.5, 0.2):
+            shown.append(env.step(np.array([push, -push], np.float32))[0]["touch"])
+        told, means = np.array(shown)[:, 4:16], np.array(shown)[:, 16:]
+        assert np.ptp(told, axis=0).max() > 1e-3  # forces change
+        assert means == pytest.approx(np.cumsum(told, axis=0) / np.arange(1, 5)[:, None], abs=1e-6)
+    env.close()
+
+
 def test_a_batch_shows_what_each_alone_shows() -> None:
-    pictured = {**FEATURES, "maps": ["height", "picture"]}
+    pictured = {**FEATURES, "maps": ["height", "picture"], "remembered": ["depth", "between"]}
     batch, alone = make_native(2, features=pictured), make(features=pictured)
     seen, _ = batch.reset(seed=[3, 4])
     for index, seed in enumerate((3, 4)):

@@ -21,6 +21,7 @@ DRAWN: dict[str, Any] = {
         "sensors.lower.model.lighting.shininess": {"uniform": [2, 30]},
         "sensors.upper.model.texture": {"choice": ["2 um", "20 um"]},
         "arms.upper.error.position": {"uniform": [["-1 mm", "-1 mm", "-0.2 mm"], ["1 mm", "1 mm", "0.2 mm"]]},
+        "arms.lower.noise.force": {"uniform": ["10 mN", "50 mN"]},
         "arms.lower.delay": {"choice": [0, 1]},
     },
 }

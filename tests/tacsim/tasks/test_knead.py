@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -11,7 +12,7 @@ from scipy.stats import spearmanr
 
 from robot.open import open_rig
 from tacsim.config import load_rig
-from tacsim.interface import FloatArray, Truth
+from tacsim.interface import ArmState, FloatArray, Pose, Truth
 from tacsim.models.rig import KneadConfig
 from tacsim.models.scene import Body, BodyMaterial, Box, Indenter, Scene
 from tacsim.tasks import judge, make_task
@@ -124,14 +125,33 @@ def test_the_scripted_policy_turns_where_the_sensor_stands_not_by_the_clock() ->
         assert np.ptp(way, axis=0) == pytest.approx([0, np.pi * diameter], abs=2 * 0.2 * task.config.max_step)
 
 
-def test_the_teacher_presses_as_the_clay_can_bear() -> None:
-    """0.65 of the yield stress over the face of a cube of the body's volume, here 8 mm; elastic: as the scripted."""
-    for yields, newtons in ((10e3, 0.65 * 10e3 * 64e-6), (None, 12e3 * 64e-6)):
-        material = BodyMaterial(yield_stress=yields)
-        body = Body(geometry=Box(size=(8e-3, 8e-3, 8e-3)), material=material)
-        teacher = make_task(KneadConfig(kind="knead", scene=Scene(body=body))).teacher()
-        assert isinstance(teacher, ScriptedKnead)
-        assert teacher._force == pytest.approx(newtons)
+def taught(height: float, force: float, yields: float | None) -> float:
+    """How far the teacher of a cube of 8 mm closes each sensor [m], which feel that height [m] and force [N]."""
+    body = Body(geometry=Box(size=(8e-3, 8e-3, 8e-3)), material=BodyMaterial(yield_stress=yields))
+    teacher = make_task(KneadConfig(kind="knead", scene=Scene(body=body))).teacher()
+    teacher.reset()
+    depth, wrench = 0.2e-3, np.array([0.0, 0.0, -force, 0.0, 0.0, 0.0])
+    arms = {
+        name: ArmState(Pose(np.array([0.0, 0.0, z])), np.zeros(6), wrench, None, 0.0)
+        for name, z in (("lower", 0.0), ("upper", height - 2 * depth))
+    }
+    touch = SimpleNamespace(height=np.full((2, 2), depth), valid=np.ones((2, 2), np.bool_))
+    seen = SimpleNamespace(arms=arms, tactile=dict.fromkeys(arms, touch))
+    pose = teacher(seen).tool["lower"]  # type: ignore[arg-type]
+    assert pose is not None
+    return float(pose.position[2])
+
+
+def test_the_teacher_closes_by_what_is_left_of_the_height_and_no_more_than_the_clay_can_bear() -> None:
+    goal = (2 * 512e-9 / np.pi) ** (1 / 3)
+    assert taught(goal + 1.2e-3, 0.0, 20e3) == pytest.approx(0.02e-3)
+    assert taught(goal + 0.3e-3, 0.0, 20e3) == pytest.approx(0.005e-3)
+    assert taught(goal, 0.0, 20e3) == pytest.approx(0.0, abs=1e-12)
+    assert taught(goal - 0.3e-3, 0.0, 20e3) == pytest.approx(-0.005e-3)
+    most = 0.9 * 20e3 * 64e-6
+    assert taught(goal + 1.2e-3, most - 0.1, 20e3) == pytest.approx(0.05e-3 * 0.1)
+    assert taught(goal + 1.2e-3, most + 0.1, 20e3) == pytest.approx(-0.05e-3 * 0.1)
+    assert taught(goal + 1.2e-3, 12e3 * 64e-6, None) == pytest.approx(0.0)  # elastic: as the scripted policy
 
 
 def test_its_environment_measures_at_the_end() -> None:

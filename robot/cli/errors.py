@@ -14,6 +14,8 @@ from tacsim.models.text import printable
 
 OURS = {"tacsim", "calibration", "robot"}
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130  # exit codes: bad configuration or usage, failure, Ctrl-C
+# What was named cannot be read or written there, whatever is done
+NO_PLACE = (FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 UNTRUSTED = 3  # all was done, but the result is not to be trusted
 
 
@@ -75,9 +77,13 @@ def explain(error: Exception) -> tuple[str, int]:
         parts = [explain(part) for part in error.exceptions if isinstance(part, Exception)]
         return "\n".join([error.message, *(message for message, _ in parts)]), FAILED
     if isinstance(error, OSError):
+        code = UNUSABLE if isinstance(error, NO_PLACE) else FAILED
         named = isinstance(error.filename, str | bytes | os.PathLike)
         where = f"{printable(os.fsdecode(error.filename))}: " if named else ""
-        return f"{where}{error.strerror or str(error) or type(error).__name__}", FAILED
+        why = error.strerror or str(error) or type(error).__name__
+        if isinstance(error, FileExistsError):
+            why = "exists already; nothing is overwritten, name another"
+        return f"{where}{why}", code
     if type(error).__module__.partition(".")[0] in OURS:
         return str(error) or type(error).__name__, FAILED
     return f"unexpected {type(error).__name__}: {error}\nRun again with --debug for the traceback.", FAILED

@@ -19,9 +19,7 @@ from tacsim.compute.front_end import quicken, without_module_search
 
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-if (
-    not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys()
-):  # Taichi ends the process without both
+if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():  # Taichi ends the process without both
     os.environ["XDG_CACHE_HOME"] = str(Path("~/.cache").expanduser())
 
 with (

@@ -16,10 +16,17 @@ from rich.text import Text
 
 from tacsim.models.text import escaped, printable
 
+NARROWEST = 60  # columns: in fewer a table loses its values; the terminal breaks its lines instead
+
 
 class SafeConsole(Console):
     """A console that shows control characters instead of obeying them. What a command prints may hold names and texts
     of files, recordings and devices, which must not move the cursor, change colours or turn the writing round."""
+
+    @property
+    def options(self) -> ConsoleOptions:
+        found = super().options
+        return found.update_width(max(found.max_width, NARROWEST))
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for segment in super().render(renderable, options):

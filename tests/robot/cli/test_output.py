@@ -109,3 +109,13 @@ def test_the_help_of_every_option_says_its_units() -> None:
         if Text.from_markup(words).plain != words.replace("\\[", "[")
     ]
     assert lost == []
+
+
+@pytest.mark.parametrize("columns", [1, 20])
+def test_a_narrow_terminal_loses_nothing(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    table = Table(show_header=False, min_width=60)
+    table.add_row("peak force |Fz|", "0.59 N (upper, step 1)")
+    shown = io.StringIO()
+    SafeConsole(file=shown).print(table)
+    assert "0.59 N (upper, step 1)" in shown.getvalue()

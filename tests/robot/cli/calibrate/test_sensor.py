@@ -101,6 +101,7 @@ def test_the_command_ends_in_a_verdict(folder: Path, tmp_path: Path) -> None:
         (("--ball-radius", "2.92 mm", "--pixel-pitch", "6e-5"), "has no unit"),
         (("--ball-radius", "2.92 m", "--pixel-pitch", "0.06 mm"), "allowed"),
         (("--ball-radius", "3 mm", "--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm"), "not both"),
+        (("--ball-radius", "nan", "--pixel-pitch", "0.06 mm"), "allowed: a number with its unit"),
         (("--ball-diameter", "6 mm", "--kind", "minni"), "known: mini,"),
         (("--ball-diameter", "6 mm", "--kind", "other"), "--pixel-pitch or --view"),
         (("--ball-diameter", "6 mm", "--pixel-pitch", "0.06 mm", "--depth", "press_9.png=1 mm"), "press_0.png"),

@@ -64,7 +64,7 @@ def test_a_folder_that_appears_meanwhile_is_left_alone(
     monkeypatch.setattr(calibrator, "calibrate_light", somebody_is_faster)
     lengths = ["--ball-radius", f"{BALL * 1e3} mm", "--pixel-pitch", f"{PITCH * 1e3} mm"]
     ran = tacsim("calibrate", "sensor", folder, *lengths, "--out", out)
-    assert ran.exit_code == 1 and "File exists" in ran.output
+    assert ran.exit_code == 2 and "exists already; nothing is overwritten" in ran.output
     assert [path.name for path in out.iterdir()] == ["calibration.yaml"]
     assert (out / "calibration.yaml").read_text(encoding="utf-8") == "another's"
 

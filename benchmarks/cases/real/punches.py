@@ -106,7 +106,7 @@ class PunchRenderer:
         middle."""
         import cv2
 
-        from tacsim.physics.oracle.layer import layer_contact
+        from benchmarks.truth.layer import layer_contact
 
         material = GelMaterial()
         gap = np.where(face.mask((BOX, BOX), BOX // 2, BOX // 2, self._pitch, scale), 0.0, 1.0)
